@@ -15,6 +15,7 @@ from kiteline_agent.runtime.options import (
 )
 from kiteline_core import config as configuration
 from kiteline_hw.links.kinds import MAVLINK_FORMS, link_forms
+from kiteline_hw.links.sealing import sealing_of
 from kiteline_hw.ports import LinkError, SourceError
 from kiteline_hw.sources.kinds import source_forms
 from kiteline_hw.system import process
@@ -33,6 +34,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         )
     if not a.source:
         p.error("a SOURCE is required")
+    sealing = sealing_of(a.link, "agent", a.agent, a.key, insecure=a.insecure)
+    a.key = sealing.key
+    process.print_lines(sealing.lines)
     kept = process.kept_folder(f"agent{a.agent}")
     options = options_of(a, Path(a.log) / kept.name if a.log else kept)
     fly_live(options, None, process.StopSignal(), numbers_in(kept))

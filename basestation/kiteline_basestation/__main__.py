@@ -14,6 +14,7 @@ from kiteline_basestation.store.checksums import StoreError
 from kiteline_codec.schema import WireError
 from kiteline_core import config as configuration
 from kiteline_hw.links.kinds import link_forms
+from kiteline_hw.links.sealing import sealing_of
 from kiteline_hw.ports import LinkError, SourceError
 from kiteline_hw.system import process
 from kiteline_hw.system.start_numbers import numbers_in
@@ -33,8 +34,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         process.exit_now(
             process.run_child(options.link, partial(fly_lockstep, options), partial(fly_live, options), expected)
         )
-    if not a.link:
-        p.error("a --link is needed, such as zenoh:tcp/0.0.0.0:7447")
+    sealing = sealing_of(a.link, "base", 0, a.key, insecure=a.insecure)
+    a.key = sealing.key
+    process.print_lines(sealing.lines)
     # Time since a fixed date: a base on another machine, without this one's files, still begins a later session.
     least = max(0, int(time.time()) - _EPOCH_S) // _UNIT_S << _DRAWN_BITS | secrets.randbelow(1 << _DRAWN_BITS)
     start = numbers_in(process.kept_folder("base")).next(max(1, least))

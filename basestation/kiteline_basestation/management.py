@@ -250,6 +250,8 @@ VERBS: dict[str, tuple[_Verb, tuple[str, ...]]] = {
     "delete": (MapManager._delete, ("map",)),
 }
 
+READING = frozenset({"list", "get"})  # verbs that change nothing
+
 
 def _parsed(text: str) -> SubmapId | None:
     """The submap of AGENT.BOOT.NUMBER; None for any other text."""

@@ -29,6 +29,7 @@ from kiteline_codec.channel import settled
 from kiteline_codec.sync.resumption import agent_session, order_of
 from kiteline_codec.transport.framing import StreamFramer
 from kiteline_codec.transport.seal import Direction, Opener, Sealer, suite_for
+from kiteline_codec.transport.seal_watch import SealWatch
 from kiteline_core.frame import ImuBatch, OdometryBatch
 from kiteline_hw.links.kinds import link_traits
 from kiteline_hw.links.open import open_link
@@ -80,7 +81,9 @@ def fly_live(
         session = agent_session(options.order, options.boot)
         if key is not None:
             sealer = Sealer(key, options.agent, session, Direction.UP, suite_for(link_traits(options.link)))
-            link = SealedLink(link, options.agent, sealer, Opener({options.agent: key}, Direction.DOWN))
+        watch = SealWatch(Direction.UP, None if key is None else Opener({options.agent: key}, Direction.DOWN))
+        end, doubled = link, False
+        link = SealedLink(link, options.agent, sealer, watch)
         if options.cpu_percent > 0.0:
             stack.enter_context(CpuQuota(options.cpu_percent)).add(os.getpid())
         if parent is not None:
@@ -130,6 +133,10 @@ def fly_live(
             if controller is not None:
                 push_obstacles(controller, runtime.agent, runtime.output, around, now_ns)
             process.notify("WATCHDOG=1")
+            process.print_lines(watch.lines())
+            if not doubled and getattr(end, "doubled", False):
+                doubled = True
+                process.print_lines([f"another agent has number {options.agent} too: give each its own --agent N"])
             if parent is None:
                 found = [] if controller is None else [f.line for f in controller.take_findings()]
                 process.print_lines(
@@ -193,7 +200,8 @@ def _key_of(options: AgentOptions) -> bytes | None:
     keys = read_keys(Path(options.key))
     if options.agent not in keys:
         raise LinkError(
-            f"{options.key} has no key for agent {options.agent}; `kiteline keys new {options.agent}` makes one"
+            f"{options.key} has no key for agent {options.agent}: run `kiteline keys pair {options.agent}` at the base, "
+            f"and here the command that it shows, with --file {options.key}"
         )
     return keys[options.agent]
 

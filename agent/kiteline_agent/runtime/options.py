@@ -178,7 +178,9 @@ def parser(forms: str = "") -> argparse.ArgumentParser:
     )  # fmt: skip
     p.add_argument("--cpu", metavar="PERCENT", type=float, default=0.0, help="limit to so much of one core")
     p.add_argument("--up-bytes", metavar="N", type=int, default=0, help="B/s that may be sent, headers included")
-    p.add_argument("--key", metavar="FILE", default="", help="seal packets; take none but sealed ones")
+    p.add_argument("--key", metavar="FILE", default="", help="seal packets; take none but sealed ones "
+                   "(default: the file of `kiteline keys pair`)")  # fmt: skip
+    p.add_argument("--insecure", action="store_true", help="use an IP link without seals")
     p.add_argument("--profile", choices=("wifi", "radio"), default="", help="default: as the link allows")
     p.add_argument("--mono", action="store_true", help="the left camera alone")
     p.add_argument("--no-imu", action="store_true", help="without inertial samples")

@@ -4,29 +4,25 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-from kiteline_basestation.management import Command
 from kiteline_basestation.runtime.base_runtime import BaseRuntime, report_restored
 from kiteline_basestation.runtime.options import BaseOptions, coded_channels
+from kiteline_basestation.runtime.questions import Questions
+from kiteline_basestation.runtime.seals import BaseSeals
 from kiteline_basestation.runtime.terminal import TerminalReporter
 from kiteline_basestation.runtime.warm import WARMING
 from kiteline_basestation.runtime.worker import Worker
 from kiteline_basestation.station import Station
 from kiteline_codec.channel import CodedChannel
 from kiteline_codec.transport.framing import StreamFramer
-from kiteline_codec.transport.seal import Direction, Opener, Sealer, suite_for
+from kiteline_codec.transport.seal import Sealer
 from kiteline_core.ids import AgentId
 from kiteline_hw.links.kinds import link_traits
 from kiteline_hw.links.open import open_link
-from kiteline_hw.links.sealed_link import SealedHub
-from kiteline_hw.links.zenoh_link import ZenohHub
-from kiteline_hw.links.zenoh_queries import QueryServer
 from kiteline_hw.ports import LinkHub
 from kiteline_hw.system import kernel_cache, process
 from kiteline_hw.system.clock import MonotonicClock
-from kiteline_hw.system.key_store import read_keys
 from kiteline_hw.system.long_work import StoppedError, long_work, starting
 from kiteline_hw.system.memory import return_large_arrays
 
@@ -52,8 +48,8 @@ def fly_live(options: BaseOptions, parent: process.Parent | None, stop: process.
     with contextlib.ExitStack() as stack:
         link = open_link(options.link, "base", framer=StreamFramer, required=False)
         stack.callback(link.close)
-        sealers: dict[int, Sealer] = {}
-        hub = _sealed(options, link, sealers) if options.key else link
+        seals = BaseSeals(options, link)
+        hub = seals.hub
         page = _open_page(options, clock.now_ns(), stack)
         worker = Worker()
         stack.callback(worker.close)
@@ -67,7 +63,7 @@ def fly_live(options: BaseOptions, parent: process.Parent | None, stop: process.
         except StoppedError:
             return True
         report_restored(restored, parent)
-        queries = _open_queries(options, link, stack)
+        questions = Questions(options, link, stack)
         if parent is not None:
             parent.send_event("ready")
         terminal = TerminalReporter(base.station) if parent is None and not options.quiet else None
@@ -79,17 +75,13 @@ def fly_live(options: BaseOptions, parent: process.Parent | None, stop: process.
             now_ns = clock.now_ns()
             packets = {agent: received for agent, end in hub.links().items() if (received := end.receive())}
             done = worker.done(now_ns)
-            if worker.notes:
-                process.print_lines(worker.notes)
-                worker.notes.clear()
-            commands = [Command(q.number, q.verb, q.text) for q in queries.questions()] if queries else []
+            process.print_lines([*worker.take_notes(), *seals.lines(now_ns)])
+            commands = questions.commands()
             if packets or done or commands or now_ns - stepped_ns >= _STEP_NS:
                 output = base.step(packets, done, now_ns, commands)
-                for answer in output.answers:
-                    if queries is not None:
-                        queries.answer(answer.id, answer.ok, answer.text)
+                questions.answer(output.answers)
                 stepped_ns = now_ns
-                _raise_boots(sealers, base.station)
+                _raise_boots(seals.sealers, base.station)
                 _send(hub, base.outgoing(now_ns))
                 base.compare_digests(hub.alive())
                 if parent is None:
@@ -113,39 +105,12 @@ def fly_live(options: BaseOptions, parent: process.Parent | None, stop: process.
     return all(closed)
 
 
-def _sealed(options: BaseOptions, hub: LinkHub, sealers: dict[int, Sealer]) -> LinkHub:
-    """The hub with sealed packets; packets of agents without a key are dropped. Raises LinkError.
-
-    sealers: gets those that are made, by agent.
-    """
-    keys, suite = read_keys(Path(options.key)), suite_for(link_traits(options.link))
-
-    def sealer(agent: int) -> Sealer | None:
-        if agent in keys:
-            sealers[agent] = Sealer(keys[agent], agent, options.session, Direction.DOWN, suite)
-        return sealers.get(agent)
-
-    return SealedHub(hub, sealer, Opener(keys, Direction.UP))
-
-
 def _raise_boots(sealers: Mapping[int, Sealer], station: Station) -> None:
     """Let seals follow sessions that rose, as an agent knew a later one of another base."""
     for agent, sealer in sealers.items():
         channel = station.channels.get(AgentId(agent))
         if isinstance(channel, CodedChannel):
             sealer.raise_to(channel.endpoint.session)
-
-
-def _open_queries(options: BaseOptions, hub: LinkHub, stack: contextlib.ExitStack) -> QueryServer | None:
-    """Server for `kiteline maps`: on --maps, else on the agents' link if that is Zenoh and not sealed."""
-    if options.maps:
-        server = QueryServer("maps", endpoint=options.maps.removeprefix("zenoh:"))
-    elif isinstance(hub, ZenohHub) and not options.key:
-        server = QueryServer("maps", session=hub.session)
-    else:
-        return None
-    stack.callback(server.close)
-    return server
 
 
 def _open_page(options: BaseOptions, now_ns: int, stack: contextlib.ExitStack) -> StatusPage | None:

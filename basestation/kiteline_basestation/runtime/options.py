@@ -14,6 +14,7 @@ from kiteline_codec.transport.seal import seal_bytes, suite_for
 from kiteline_core import config as configuration
 from kiteline_core.ids import AgentId
 
+DEFAULT_LINK = "zenoh:tcp/127.0.0.1:7447"
 LOG_STEM = "session"  # of the names of logs of `kiteline base --log`
 LOG_MIB = 4000  # MiB of logs by default: days of flights, as they hold no images
 
@@ -62,7 +63,7 @@ def parser(link_forms: str = "") -> argparse.ArgumentParser:
         "and sends corrections back.",
         epilog=f"LINK is {link_forms}. The address 0.0.0.0 listens on all interfaces.",
     )
-    p.add_argument("--link", metavar="LINK", default="", help="link to the agents")
+    p.add_argument("--link", metavar="LINK", default=DEFAULT_LINK, help="link to the agents (default: %(default)s)")
     p.add_argument("--store", metavar="DIR", default="", help="save the map here, and resume from it")
     p.add_argument("--import", dest="imports", metavar="LOG", nargs="+", default=[], action="extend",
                    help="add agents' logs, for what no link carried; or maps: a store, a base's log")  # fmt: skip
@@ -75,7 +76,9 @@ def parser(link_forms: str = "") -> argparse.ArgumentParser:
                    help="MiB that the logs of all starts may take: the oldest are deleted, also while the base runs "
                    "(default: %(default)s; 0: no limit)")  # fmt: skip
     p.add_argument("--down-bytes", metavar="N", type=int, default=0, help="B/s to each agent, headers included")
-    p.add_argument("--key", metavar="FILE", default="", help="seal packets; drop those of agents without a key in it")
+    p.add_argument("--key", metavar="FILE", default="", help="seal packets; drop those of agents without a key in it "
+                   "(default, beyond this machine: a file that is made at the first start)")  # fmt: skip
+    p.add_argument("--insecure", action="store_true", help="serve anyone who reaches the link, without seals")
     p.add_argument("--profile", choices=("wifi", "radio"), default="", help="default: as the link allows")
     p.add_argument("--quiet", action="store_true", help="print no status messages")
     p.add_argument("--spec", metavar="JSON", default="", help=argparse.SUPPRESS)

@@ -112,6 +112,11 @@ class Worker:
         """True if no job is running or waiting."""
         return self._running is None and not self._queue and not self._aside
 
+    def take_notes(self) -> list[str]:
+        """What happened since the last call."""
+        notes, self.notes = self.notes, []
+        return notes
+
     def _finished(self, done: JobDone | str, cpu_ms: float) -> list[JobDone]:
         """Take in what became of the running job."""
         job, self._running = self._running, None

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
 
 KEY_BYTES = 32
+EARLIER_BOOT = "earlier boot"
 WINDOW_PACKETS = 1024  # a packet further behind the newest one is refused; no link reorders so much
 _MAX_AGENT = 63
 _MAX_BOOT = (1 << 48) - 1
@@ -172,6 +173,7 @@ class Opener:
     def __init__(self, keys: Mapping[int, bytes], direction: Direction, boots: Mapping[int, int] | None = None) -> None:
         """keys: by agent. boots: by agent, from an earlier start of this process; packets of lower ones are refused."""
         self.counters = SealCounters()
+        self.refusal = ""  # why the last packet that was refused was: a name of a counter, or EARLIER_BOOT
         self._direction = direction
         self._keys = {(a, s): _derived(key, s, direction) for a, key in keys.items() for s in Suite}
         self._writers = {a: _Writer((boots or {}).get(a, 0) - 1) for a in keys}
@@ -203,6 +205,8 @@ class Opener:
         writer = self._writers[agent]
         if not writer.is_new(boot, counter):
             self._refuse("replayed", agent)
+            if boot < writer.boot or writer.packets is None:
+                self.refusal = EARLIER_BOOT
             return None
         if salt:
             key = self._salted.get((agent, salt)) or _salted(key, salt)
@@ -231,7 +235,13 @@ class Opener:
         except InvalidTag:
             return None
 
+    def set_key(self, agent: int, key: bytes) -> None:
+        """Open an agent's packets with another key from now on."""
+        self._keys |= {(agent, s): _derived(key, s, self._direction) for s in Suite}
+        self._writers[agent] = _Writer(-1)
+
     def _refuse(self, why: str, agent: int) -> None:
+        self.refusal = why
         setattr(self.counters, why, getattr(self.counters, why) + 1)
         by = self.counters.by_agent
         by[agent] = by.get(agent, 0) + 1

@@ -8,16 +8,19 @@ rather than waited for.
 from __future__ import annotations
 
 import contextlib
+import secrets
 import threading
 import time
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import zenoh
 
 from kiteline_hw.links.ends import LinkOptions
 from kiteline_hw.links.queued_link import MOST_PACKET_BYTES, LinkCounters, QueuedLink
-from kiteline_hw.links.zenoh_session import MOST_MESSAGE_BYTES, close_session, direct, open_session
+from kiteline_hw.links.zenoh_access import Instances, access_of_base
+from kiteline_hw.links.zenoh_session import close_session, direct, open_session
 from kiteline_hw.ports import ByteLink, LinkError
 from kiteline_hw.system.closing import Closing
 
@@ -88,6 +91,11 @@ class _PeerLink(QueuedLink):
             self.clear_outbox()
 
 
+def _note_instance(instances: Instances, sample: Any) -> None:
+    """Note an agent's token of its own."""
+    instances.note(str(sample.key_expr).rsplit("/", 1)[-1], here=sample.kind == zenoh.SampleKind.PUT)
+
+
 class ZenohLink(_PeerLink):
     """A drone's ByteLink. Connects and reconnects in the background; the constructor does not wait for a base."""
 
@@ -101,6 +109,8 @@ class ZenohLink(_PeerLink):
         self._session: zenoh.Session | None = None
         self._session_lock = threading.Lock()
         self._declared: list[Any] = []  # Zenoh withdraws a declaration whose object is garbage collected
+        self._instance = secrets.token_hex(8)
+        self._instances = Instances()
         self._thread = threading.Thread(target=self._run, name="zenoh-send", daemon=True)
         self._thread.start()
 
@@ -108,6 +118,11 @@ class ZenohLink(_PeerLink):
     def connected(self) -> bool:
         """True if a base is known to listen."""
         return self.alive and not self._closed.is_set()
+
+    @property
+    def doubled(self) -> bool:
+        """True if another agent has the same number."""
+        return self._instances.several
 
     def _run(self) -> None:
         while not self._closed.is_set():
@@ -157,6 +172,10 @@ class ZenohLink(_PeerLink):
         self._declared = [
             session.declare_subscriber(f"{key}/down", on_packet),
             session.liveliness().declare_token(f"{key}/alive"),
+            session.liveliness().declare_token(f"{key}/alive/{self._instance}"),
+            session.liveliness().declare_subscriber(
+                f"{key}/alive/*", _guarded(self.counters, partial(_note_instance, self._instances)), history=True
+            ),
             session.liveliness().declare_subscriber(f"{self._prefix}/base", on_base, history=True),
         ]
         return _publisher(session, f"{key}/up")
@@ -179,6 +198,7 @@ class _AgentLink(_PeerLink):
     def __init__(self, wake: threading.Condition, publisher: zenoh.Publisher) -> None:
         super().__init__(wake)
         self.publisher = publisher
+        self.instances = Instances()
 
     def close(self) -> None:
         """Stop sending to this agent; the hub stays open."""
@@ -195,13 +215,16 @@ class ZenohHub(Closing):
         self._links: dict[int, _AgentLink] = {}
         self._closed = threading.Event()
         self.counters = LinkCounters()
-        self.session = open_session(endpoint, "base", most_message_bytes=MOST_MESSAGE_BYTES)
+        self.session = open_session(endpoint, "base", access=access_of_base(prefix))
         on_packet, on_agent = _guarded(self.counters, self._on_packet), _guarded(self.counters, self._on_agent)
         try:
             liveliness = self.session.liveliness()
             self._declared: list[Any] = [
                 self.session.declare_subscriber(f"{prefix}/*/up", on_packet),
                 liveliness.declare_subscriber(f"{prefix}/*/alive", on_agent, history=True),
+                liveliness.declare_subscriber(
+                    f"{prefix}/*/alive/*", _guarded(self.counters, self._on_instance), history=True
+                ),
                 liveliness.declare_token(f"{prefix}/base"),
             ]
         except zenoh.ZError as error:
@@ -226,6 +249,15 @@ class ZenohHub(Closing):
         link = self._link(sample.key_expr)
         link.alive = True
         link.deliver(sample.payload.to_bytes())
+
+    def _on_instance(self, sample: Any) -> None:
+        key = str(sample.key_expr)
+        _note_instance(self._link(key.rsplit("/", 1)[0]).instances, sample)
+
+    def doubles(self) -> frozenset[int]:
+        """Numbers that two agents or more have."""
+        with self._lock:
+            return frozenset(agent for agent, link in self._links.items() if link.instances.several)
 
     def _on_agent(self, sample: Any) -> None:
         self._link(sample.key_expr).on_liveliness(sample)

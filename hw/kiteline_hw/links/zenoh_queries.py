@@ -16,9 +16,11 @@ from typing import Any
 
 import zenoh
 
-from kiteline_hw.links.zenoh_session import MOST_MESSAGE_BYTES, close_session, direct, open_session
+from kiteline_hw.links.zenoh_access import access_of_base
+from kiteline_hw.links.zenoh_session import close_session, direct, open_session
 from kiteline_hw.ports import LinkError
 
+_GROUP = "kiteline/1/{}"
 _RETRY_S = 0.1  # s between two requests that nobody answered
 _MAX_WAITING = 64  # requests in the queue; more are refused
 _MOST_BYTES = 1 << 16  # of a request
@@ -35,7 +37,7 @@ class Question:
 
 def prefix(service: str, group: str = "default") -> str:
     """The key of a service, without its verb."""
-    return f"kiteline/1/{group}/{service}"
+    return f"{_GROUP.format(group)}/{service}"
 
 
 class QueryServer:
@@ -43,7 +45,7 @@ class QueryServer:
 
     def __init__(self, service: str, session: zenoh.Session | None = None, endpoint: str = "") -> None:
         self._own_session = (
-            open_session(endpoint, "base", most_message_bytes=MOST_MESSAGE_BYTES) if session is None else None
+            open_session(endpoint, "base", access=access_of_base(_GROUP.format("default"))) if session is None else None
         )
         self._arrived: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._open: dict[int, Any] = {}

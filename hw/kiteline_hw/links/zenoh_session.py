@@ -18,8 +18,8 @@ import zenoh
 
 from kiteline_hw.ports import LinkError
 
-MAX_SESSIONS = 96  # with one process: 64 agents, and programs that ask for maps
-MOST_MESSAGE_BYTES = 1 << 18  # that a base takes in: four of the longest packets
+_MAX_SESSIONS = 96  # with one process: 64 agents, and programs that ask for maps
+_MOST_MESSAGE_BYTES = 1 << 18  # that a base takes in: four of the longest packets
 CLOSE_TIMEOUT_S = 1.5  # s; a frozen peer can stall a close for much longer: then the session is abandoned
 CONNECT_TIMEOUT_MS = 4000  # ms of one attempt to connect: two round trips with 900 ms of delay each way
 _RETRY_S = 0.1  # s between two attempts to connect
@@ -28,8 +28,10 @@ _ROUTER = "router/"  # before a locator: a Zenoh router listens there, and both 
 Role = Literal["client", "base"]
 
 
-def session_config(endpoint: str, role: Role, lease_ms: int, most_message_bytes: int | None = None) -> zenoh.Config:
-    """The configuration of a session. most_message_bytes: of a message that comes in. Raises LinkError.
+def session_config(endpoint: str, role: Role, lease_ms: int, access: dict[str, Any] | None = None) -> zenoh.Config:
+    """The configuration of a session. access: what clients may do at a base, whose memory is bounded then, too.
+
+    Raises LinkError.
 
     endpoint: a Zenoh locator such as tcp/127.0.0.1:7447 at which the base listens, or router/ and a router's locator.
     The file named by the environment variable ZENOH_CONFIG is read first (certificates, access control).
@@ -51,9 +53,11 @@ def session_config(endpoint: str, role: Role, lease_ms: int, most_message_bytes:
         "transport/shared_memory/enabled": False,
         "transport/link/tx/lease": lease_ms,
     }
-    if most_message_bytes is not None:
-        options["transport/link/rx/max_message_size"] = most_message_bytes
-        options["transport/unicast/max_sessions"] = MAX_SESSIONS
+    if access is not None and role == "base":
+        options["transport/link/rx/max_message_size"] = _MOST_MESSAGE_BYTES
+        options["transport/unicast/max_sessions"] = _MAX_SESSIONS
+        if config.get_json("access_control/enabled") == "false":  # a ZENOH_CONFIG that has its own is kept
+            options["access_control"] = access
     try:
         for name, value in options.items():
             config.insert_json5(name, json.dumps(value))
@@ -67,7 +71,7 @@ def open_session(
     role: Role,
     *,
     lease_ms: int = 2000,
-    most_message_bytes: int | None = None,
+    access: dict[str, Any] | None = None,
     connect_timeout_s: float = 10.0,
     give_up: threading.Event | None = None,
 ) -> zenoh.Session:
@@ -75,7 +79,7 @@ def open_session(
 
     Blocks: never call it in a tracking loop.
     """
-    config = session_config(endpoint, role, lease_ms, most_message_bytes)
+    config = session_config(endpoint, role, lease_ms, access)
     deadline_s = time.monotonic() + connect_timeout_s
     while True:
         try:

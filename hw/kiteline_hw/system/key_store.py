@@ -1,17 +1,39 @@
-"""Keys of agents in a file readable by its owner only: per line an agent's number and 64 hexadecimal digits."""
+"""Keys in a file readable by its owner only: per line an agent's number, or `maps`, and 64 hexadecimal digits.
+
+The key of an agent seals its packets; that of `maps` gives the right to change maps. A pairing code is a key in sixteen
+letters and digits (Crockford's base 32), for a person to type on the agent; keys are made of it by scrypt (RFC 7914).
+"""
 
 from __future__ import annotations
 
+import hashlib
 import os
 import secrets
 import stat
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from kiteline_hw.ports import LinkError
 
 KEY_BYTES = 32
+MAPS = "maps"
 _MAX_AGENT = 63
-_HEAD = "# kiteline keys: agent, secret. Give an agent its own line, the base station all lines; show them to nobody.\n"
+_HEAD = (
+    "# kiteline keys: agent, secret. Give an agent its own line, the base station all lines; show them to nobody.\n"
+    "# maps: the right to change maps.\n"
+)
+_DIGITS = "0123456789ABCDEFGHJKMNPQRSTVWXYZ"
+_ALIKE = str.maketrans("OIL", "011")  # letters that are read as digits
+_CODE_DIGITS = 16  # 75 random bits, and five that find a slip
+_SCRYPT_COST = 1 << 15  # 32 MiB and a tenth of a second a guess
+
+
+@dataclass(slots=True)
+class Keys:
+    """The content of a key file. maps: None if there is none."""
+
+    agents: dict[int, bytes] = field(default_factory=dict)
+    maps: bytes | None = None
 
 
 def default_path() -> Path:
@@ -20,7 +42,12 @@ def default_path() -> Path:
 
 
 def read_keys(path: Path) -> dict[int, bytes]:
-    """Keys by agent. Raises LinkError if the file is missing, malformed, or readable by others."""
+    """Keys of agents. Raises LinkError if the file is missing, malformed, or readable by others."""
+    return read_file(path).agents
+
+
+def read_file(path: Path) -> Keys:
+    """All keys of a file. Raises LinkError if it is missing, malformed, or readable by others."""
     try:
         text = path.read_text(encoding="ascii")
         mode = path.stat().st_mode
@@ -28,44 +55,103 @@ def read_keys(path: Path) -> dict[int, bytes]:
         raise LinkError(f"cannot read keys from {path}: {error}; `kiteline keys new` makes one") from error
     if mode & (stat.S_IRWXG | stat.S_IRWXO):
         raise LinkError(f"keys in {path} may be read by others (mode {mode & 0o777:o}): chmod 600 {path}")
-    keys: dict[int, bytes] = {}
+    keys = Keys()
     for number, line in enumerate(text.splitlines(), 1):
         words = line.split("#")[0].split()
         if not words:
             continue
         try:
-            agent, key = int(words[0]), bytes.fromhex(words[1])
-            if len(words) != 2 or not 0 <= agent <= _MAX_AGENT or len(key) != KEY_BYTES or agent in keys:
+            key = bytes.fromhex(words[1])
+            if len(words) != 2 or len(key) != KEY_BYTES:
+                raise ValueError
+            if words[0] == MAPS and keys.maps is None:
+                keys.maps = key
+                continue
+            agent = int(words[0])
+            if not 0 <= agent <= _MAX_AGENT or agent in keys.agents:
                 raise ValueError
         except (ValueError, IndexError):
             raise LinkError(
-                f"{path}, line {number}: expected an agent's number (0 to {_MAX_AGENT}, each once) and "
+                f"{path}, line {number}: expected an agent's number (0 to {_MAX_AGENT}, each once), or {MAPS}, and "
                 f"{2 * KEY_BYTES} hexadecimal digits"
             ) from None
-        keys[agent] = key
+        keys.agents[agent] = key
     return keys
+
+
+def first_keys(path: Path) -> bool:
+    """Make a file with a key for each agent and for maps, unless there is one. Returns whether it was made."""
+    if path.exists():
+        return False
+    agents = {agent: secrets.token_bytes(KEY_BYTES) for agent in range(_MAX_AGENT + 1)}
+    _write(path, Keys(agents, secrets.token_bytes(KEY_BYTES)))
+    return True
 
 
 def new_key(path: Path, agent: int, *, replace: bool = False) -> bytes:
     """Create a key for an agent and store it. Raises LinkError if it has one and `replace` is not set."""
+    keys = read_file(path) if path.exists() else Keys()
+    if agent in keys.agents and not replace:
+        raise LinkError(f"agent {agent} has a key in {path} already; --replace makes a new one")
+    return _store(path, agent, secrets.token_bytes(KEY_BYTES), keys)
+
+
+def new_maps_key(path: Path, *, replace: bool = False) -> bytes:
+    """Create the key of the right to change maps. Raises LinkError if there is one and `replace` is not set."""
+    keys = read_file(path) if path.exists() else Keys()
+    if keys.maps is not None and not replace:
+        raise LinkError(f"{path} has a key for {MAPS} already; --replace makes a new one")
+    keys.maps = secrets.token_bytes(KEY_BYTES)
+    _write(path, keys)
+    return keys.maps
+
+
+def new_code() -> str:
+    """A new pairing code."""
+    digits = "".join(secrets.choice(_DIGITS) for _ in range(_CODE_DIGITS - 1))
+    digits += _check_digit(digits)
+    return "-".join(digits[i : i + 4] for i in range(0, _CODE_DIGITS, 4))
+
+
+def pair(path: Path, agent: int, code: str) -> bytes:
+    """Store the key of a pairing code as that of an agent, in place of an older one. Raises LinkError."""
+    digits = code.upper().replace("-", "").replace(" ", "").translate(_ALIKE)
+    if len(digits) != _CODE_DIGITS or set(digits) - set(_DIGITS) or _check_digit(digits[:-1]) != digits[-1]:
+        raise LinkError(f"{code[:40]!r} is no pairing code: expected the 16 letters and digits that the base shows")
+    key = hashlib.scrypt(
+        digits.encode(), salt=f"kiteline-pair {agent}".encode(), n=_SCRYPT_COST, r=8, p=1,
+        maxmem=2 * 128 * 8 * _SCRYPT_COST, dklen=KEY_BYTES,
+    )  # fmt: skip
+    return _store(path, agent, key, read_file(path) if path.exists() else Keys())
+
+
+def _check_digit(digits: str) -> str:
+    """Of the digits before it: it finds 31 of 32 slips."""
+    return _DIGITS[hashlib.blake2b(digits.encode()).digest()[0] & 31]
+
+
+def _store(path: Path, agent: int, key: bytes, keys: Keys) -> bytes:
     if not 0 <= agent <= _MAX_AGENT:
         raise LinkError(f"agent number {agent}: expected 0 to {_MAX_AGENT}")
-    keys = read_keys(path) if path.exists() else {}
-    if agent in keys and not replace:
-        raise LinkError(f"agent {agent} has a key in {path} already; --replace makes a new one")
-    keys[agent] = secrets.token_bytes(KEY_BYTES)
+    keys.agents[agent] = key
     _write(path, keys)
-    return keys[agent]
+    return key
 
 
-def _write(path: Path, keys: dict[int, bytes]) -> None:
-    """Replace the file atomically; it never exists with another mode or half written."""
-    path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+def _write(path: Path, keys: Keys) -> None:
+    """Replace the file atomically; it never exists with another mode or half written. Raises LinkError."""
+    lines = [f"{agent} {keys.agents[agent].hex()}\n" for agent in sorted(keys.agents)]
+    if keys.maps is not None:
+        lines.append(f"{MAPS} {keys.maps.hex()}\n")
     new = path.with_name(path.name + ".new")
-    new.unlink(missing_ok=True)
-    fd = os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-    with os.fdopen(fd, "w", encoding="ascii") as out:
-        out.write(_HEAD + "".join(f"{agent} {keys[agent].hex()}\n" for agent in sorted(keys)))
-        out.flush()
-        os.fsync(out.fileno())
-    os.replace(new, path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+        new.unlink(missing_ok=True)
+        fd = os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+        with os.fdopen(fd, "w", encoding="ascii") as out:
+            out.write(_HEAD + "".join(lines))
+            out.flush()
+            os.fsync(out.fileno())
+        os.replace(new, path)
+    except OSError as error:
+        raise LinkError(f"cannot write keys to {path}: {error.strerror or error}; name another file") from error

@@ -1,4 +1,4 @@
-"""`kiteline keys`: make and show the keys that seal packets between agents and base."""
+"""`kiteline keys`: pair agents with a base; make and show the keys that seal packets between them."""
 
 from __future__ import annotations
 
@@ -6,23 +6,26 @@ import argparse
 from pathlib import Path
 
 from kiteline_codec.transport.seal import fingerprint
-from kiteline_hw.system.key_store import default_path, new_key, read_keys
+from kiteline_hw.system.key_store import MAPS, default_path, new_code, new_key, new_maps_key, pair, read_file
 
 
 def parser() -> argparse.ArgumentParser:
     """The arguments of `kiteline keys`."""
     p = argparse.ArgumentParser(
         prog="kiteline keys",
-        description="Keys of agents. With --key FILE, agent and base accept only packets sealed with one of them.",
-        epilog="Make keys on the base: `kiteline keys new 3`. Copy that agent's line to a file on the agent.",
+        description="Keys of agents: base and agent accept only packets sealed with one of them.",
+        epilog="`kiteline keys pair 3` at the base shows a code; type it at agent 3: `kiteline keys pair 3 CODE`.",
     )
     p.add_argument("--file", metavar="F", type=Path, default=None, help=f"default: {default_path()}")
     commands = p.add_subparsers(dest="command", required=True)
-    new = commands.add_parser("new", help="make a key for an agent")
-    new.add_argument("agent", metavar="AGENT", type=int, help="number of the agent, 0 to 63")
+    paired = commands.add_parser("pair", help="pair an agent with a base: without CODE at the base, with it there")
+    paired.add_argument("agent", metavar="AGENT", type=int, help="number of the agent, 0 to 63")
+    paired.add_argument("code", metavar="CODE", nargs="?", default="", help="as the base shows it")
+    new = commands.add_parser("new", help="make a key for an agent, or for the right to change maps")
+    new.add_argument("agent", metavar="AGENT", help=f"number of the agent, 0 to 63, or {MAPS}")
     new.add_argument("--replace", action="store_true", help="replace the key it has; the old one is void then")
     show = commands.add_parser("show", help="list agents with the fingerprints of their keys")
-    show.add_argument("--secret", metavar="AGENT", type=int, default=None, help="print this agent's line of the file")
+    show.add_argument("--secret", metavar="AGENT", default=None, help="print this agent's line of the file")
     return p
 
 
@@ -31,16 +34,45 @@ def main(argv: list[str]) -> int:
     p = parser()
     a = p.parse_args(argv)
     path = a.file or default_path()
+    if a.command == "pair":
+        _pair(path, a.agent, a.code, f"--file {a.file} " if a.file else "")
+        return 0
     if a.command == "new":
-        key = new_key(path, a.agent, replace=a.replace)
-        print(f"agent {a.agent}  {fingerprint(key)}  in {path}")
+        if a.agent == MAPS:
+            key = new_maps_key(path, replace=a.replace)
+        else:
+            key = new_key(path, _agent(p, a.agent), replace=a.replace)
+        print(f"{_name(a.agent)}  {fingerprint(key)}  in {path}")
         return 0
-    keys = read_keys(path)
+    keys = read_file(path)
+    named = {str(agent): keys.agents[agent] for agent in sorted(keys.agents)}
+    if keys.maps is not None:
+        named[MAPS] = keys.maps
     if a.secret is not None:
-        if a.secret not in keys:
-            p.error(f"agent {a.secret} has no key in {path}; there are: {', '.join(map(str, sorted(keys))) or 'none'}")
-        print(f"{a.secret} {keys[a.secret].hex()}")
+        if a.secret not in named:
+            p.error(f"{_name(a.secret)} has no key in {path}; there are: {', '.join(named) or 'none'}")
+        print(f"{a.secret} {named[a.secret].hex()}")
         return 0
-    for agent in sorted(keys):
-        print(f"agent {agent}  {fingerprint(keys[agent])}")
+    for name, key in named.items():
+        print(f"{_name(name)}  {fingerprint(key)}")
     return 0
+
+
+def _pair(path: Path, agent: int, code: str, file: str) -> None:
+    """Store the key of a code, or of a new code that is shown."""
+    shown = code or new_code()
+    key = pair(path, agent, shown)
+    print(f"agent {agent}  {fingerprint(key)}  in {path}")
+    if not code:
+        print(f"at agent {agent}: kiteline keys pair {agent} {shown}")
+        print("a base that runs takes the new key within a second; show the code to nobody else")
+
+
+def _agent(p: argparse.ArgumentParser, text: str) -> int:
+    if not text.isdecimal():
+        p.error(f"{text!r} is no agent's number, 0 to 63, and not {MAPS}")
+    return int(text)
+
+
+def _name(text: str) -> str:
+    return text if text == MAPS else f"agent {text}"

@@ -7,12 +7,16 @@ from __future__ import annotations
 
 import argparse
 import json
+import secrets
 import sys
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from kiteline_codec.transport.signed_question import sign
 from kiteline_hw.links.zenoh_queries import ask
+from kiteline_hw.system.key_store import default_path, read_file
 
 _DEFAULT = "tcp/127.0.0.1:7447"
 
@@ -25,6 +29,8 @@ def parser() -> argparse.ArgumentParser:
         epilog="Other programs send the same queries over Zenoh: docs/how-to/manage-maps.md.",
     )
     p.add_argument("--base", metavar="ENDPOINT", default=_DEFAULT, help="where the base listens (default: %(default)s)")
+    p.add_argument("--key", metavar="FILE", type=Path, default=None,
+                   help=f"keys with the right to change maps (default: {default_path()}, if there is one)")  # fmt: skip
     p.add_argument("--json", action="store_true", help="print the reply as JSON")
     verbs = p.add_subparsers(dest="verb", required=True, metavar="VERB")
     verbs.add_parser("list", help="all maps")
@@ -105,7 +111,12 @@ def main(argv: list[str]) -> int:
     a = parser().parse_args(argv)
     if hasattr(a, "store"):
         return _of_store(a)
-    ok, text = ask(a.base.removeprefix("zenoh:"), "maps", a.verb, json.dumps(query(a)))
+    path: Path = a.key or default_path()
+    key = read_file(path).maps if a.key is not None or path.exists() else None
+    question = json.dumps(query(a))
+    if key is not None:
+        question = sign(key, a.verb, question, int(time.time()), secrets.token_hex(16))
+    ok, text = ask(a.base.removeprefix("zenoh:"), "maps", a.verb, question)
     if a.json:
         print(text)
     elif ok:

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from kiteline_codec.transport.seal import Direction, Opener, Sealer, Suite
+from kiteline_codec.transport.seal_watch import SealWatch
 from kiteline_hw.links.ends import OneLinkHub
 from kiteline_hw.links.sealed_link import SealedHub, SealedLink
 from kiteline_hw.ports import LinkError
@@ -39,10 +40,13 @@ def test_sealed_packets_both_ways(tmp_path: Path) -> None:
     keys = read_keys(path)
     down, up = Wire(), Wire()
     hub = SealedHub(
-        OneLinkHub(down, 1), lambda a: Sealer(keys[a], a, 9, Direction.DOWN, Suite.TAGGED), Opener(keys, Direction.UP)
+        OneLinkHub(down, 1),
+        lambda a: Sealer(keys[a], a, 9, Direction.DOWN, Suite.TAGGED),
+        SealWatch(Direction.DOWN, Opener(keys, Direction.UP)),
     )
     agent = SealedLink(
-        up, 1, Sealer(keys[1], 1, 4, Direction.UP, Suite.TAGGED), Opener({1: keys[1]}, Direction.DOWN)
+        up, 1, Sealer(keys[1], 1, 4, Direction.UP, Suite.TAGGED),
+        SealWatch(Direction.UP, Opener({1: keys[1]}, Direction.DOWN)),
     )  # fmt: skip
     assert agent.send(b"up")
     other = Sealer(keys[2], 2, 4, Direction.UP, Suite.TAGGED)
@@ -55,7 +59,7 @@ def test_sealed_packets_both_ways(tmp_path: Path) -> None:
 
 
 def test_an_agent_without_a_key_is_left_out(tmp_path: Path) -> None:
-    hub = SealedHub(OneLinkHub(Wire(), 7), lambda a: None, Opener({}, Direction.UP))
+    hub = SealedHub(OneLinkHub(Wire(), 7), lambda a: None, SealWatch(Direction.DOWN, Opener({}, Direction.UP)))
     assert hub.links() == {}
     hub.close()
 

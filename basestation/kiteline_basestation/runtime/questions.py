@@ -1,0 +1,70 @@
+"""Questions of other programs to a base: who may ask what, and on which endpoint."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from kiteline_basestation.management import READING, Answer, Command
+from kiteline_basestation.runtime.options import BaseOptions
+from kiteline_codec.schema import WireError
+from kiteline_codec.transport.signed_question import QuestionGuard, unsigned
+from kiteline_hw.links.sealing import is_loopback
+from kiteline_hw.links.zenoh_link import ZenohHub
+from kiteline_hw.links.zenoh_queries import QueryServer
+from kiteline_hw.ports import LinkHub
+from kiteline_hw.system.key_store import read_file
+
+_MEND = (
+    "this base takes {what} only with the right to change maps: `kiteline maps --key FILE`, with the file of its keys "
+    "or one with its line `maps` (`kiteline keys new maps` makes one)"
+)
+
+
+class Questions:
+    """Answers `kiteline maps` on --maps, else on the agents' link if that is Zenoh. Without keys anyone may ask; with
+    them a change needs a signature, and reading does too, except on a --maps endpoint of this machine.
+    """
+
+    def __init__(self, options: BaseOptions, hub: LinkHub, stack: contextlib.ExitStack) -> None:
+        """Raises LinkError."""
+        self._server: QueryServer | None = None
+        if options.maps:
+            self._server = QueryServer("maps", endpoint=options.maps.removeprefix("zenoh:"))
+        elif isinstance(hub, ZenohHub):
+            self._server = QueryServer("maps", session=hub.session)
+        if self._server is not None:
+            stack.callback(self._server.close)
+        self._guard = QuestionGuard(read_file(Path(options.key)).maps) if options.key else None
+        self._reading_free = bool(options.maps) and is_loopback(f"zenoh:{options.maps.removeprefix('zenoh:')}")
+
+    def commands(self) -> list[Command]:
+        """The questions that may be asked, since the last call; others are answered here."""
+        if self._server is None:
+            return []
+        out = []
+        for asked in self._server.questions():
+            try:
+                out.append(Command(asked.number, asked.verb, self._opened(asked.verb, asked.text)))
+            except WireError as error:
+                self._server.answer(asked.number, False, json.dumps({"error": str(error)}))
+        return out
+
+    def answer(self, answers: Sequence[Answer]) -> None:
+        """Send answers."""
+        for answer in answers:
+            if self._server is not None:
+                self._server.answer(answer.id, answer.ok, answer.text)
+
+    def _opened(self, verb: str, text: str) -> str:
+        if self._guard is None:
+            return unsigned(text)
+        question = self._guard.open(verb, text, int(time.time()))
+        if question is not None:
+            return question
+        if verb in READING and self._reading_free:
+            return text
+        raise WireError(_MEND.format(what="questions" if verb in READING else "changes"))

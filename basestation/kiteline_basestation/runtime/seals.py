@@ -1,0 +1,77 @@
+"""The base's side of seals: the hub through which packets pass, keys that change while it runs, and what is wrong."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from kiteline_basestation.runtime.options import BaseOptions
+from kiteline_codec.transport.seal import Direction, Opener, Sealer, suite_for
+from kiteline_codec.transport.seal_watch import SealWatch
+from kiteline_hw.links.kinds import link_traits
+from kiteline_hw.links.sealed_link import SealedHub, WatchedHub
+from kiteline_hw.links.zenoh_link import ZenohHub
+from kiteline_hw.ports import LinkError, LinkHub
+from kiteline_hw.system.key_store import read_keys
+
+_LOOK_NS = 1_000_000_000  # between two looks at the file of keys
+
+
+class BaseSeals:
+    """Seals packets if there is a file of keys, and tells in either case why agents are not understood."""
+
+    def __init__(self, options: BaseOptions, link: LinkHub) -> None:
+        """Raises LinkError."""
+        self._options, self._link = options, link
+        self._path = Path(options.key) if options.key else None
+        self._keys = {} if self._path is None else read_keys(self._path)
+        self._written_ns = self._time_of_keys()
+        self._looked_ns = 0
+        self._doubles: frozenset[int] = frozenset()
+        self._opener = None if self._path is None else Opener(self._keys, Direction.UP)
+        self.sealers: dict[int, Sealer] = {}  # by agent
+        self._watch = SealWatch(Direction.DOWN, self._opener)
+        self._sealed = None if self._path is None else SealedHub(link, self._sealer, self._watch)
+        self.hub: LinkHub = WatchedHub(link, self._watch) if self._sealed is None else self._sealed
+
+    def lines(self, now_ns: int) -> list[str]:
+        """What the user is to be told since the last call. Takes new keys, too."""
+        lines = self._watch.lines()
+        if now_ns - self._looked_ns >= _LOOK_NS:
+            self._looked_ns = now_ns
+            lines += self._new_keys()
+            doubles = self._link.doubles() if isinstance(self._link, ZenohHub) else frozenset()
+            lines += [
+                f"two agents have number {agent}: give each its own --agent N"
+                for agent in sorted(doubles - self._doubles)
+            ]
+            self._doubles = doubles
+        return lines
+
+    def _sealer(self, agent: int) -> Sealer | None:
+        if agent in self._keys:
+            suite = suite_for(link_traits(self._options.link))
+            self.sealers[agent] = Sealer(self._keys[agent], agent, self._options.session, Direction.DOWN, suite)
+        return self.sealers.get(agent)
+
+    def _time_of_keys(self) -> int:
+        try:
+            return 0 if self._path is None else self._path.stat().st_mtime_ns
+        except OSError:
+            return 0
+
+    def _new_keys(self) -> list[str]:
+        """Take keys that changed in the file; a file that cannot be read changes none."""
+        written_ns = self._time_of_keys()
+        if self._path is None or self._opener is None or self._sealed is None or written_ns == self._written_ns:
+            return []
+        self._written_ns = written_ns
+        try:
+            keys = read_keys(self._path)
+        except LinkError as error:
+            return [str(error)]
+        changed = sorted(agent for agent, key in keys.items() if self._keys.get(agent) != key)
+        self._keys |= keys
+        for agent in changed:
+            self._opener.set_key(agent, keys[agent])
+            self._sealed.renew(agent)
+        return [f"new key for agent {agent}" for agent in changed]

@@ -1,0 +1,76 @@
+"""Questions to a base, signed by who has the right to change maps. Pure: time and random bytes are handed in.
+
+A signed question is a JSON object: `signed`, the question; `t_s`, Unix time in s; `nonce`; `tag`, BLAKE2b of verb,
+question, time and nonce under the key. Each is taken once, and only near its time.
+"""
+
+from __future__ import annotations
+
+import hmac
+import json
+from collections import OrderedDict
+from hashlib import blake2b
+from typing import Any
+
+from kiteline_codec.coding.packing import WireError
+from kiteline_core.errors import INPUT_FAULTS
+
+_NEAR_S = 300  # by which the clocks of two machines may differ
+_REMEMBERED = 10_000  # nonces; more questions within their time are refused
+_TAG_BYTES = 16
+
+
+def sign(key: bytes, verb: str, text: str, t_s: int, nonce: str) -> str:
+    """The signed question. nonce: random, never used again."""
+    return json.dumps({"signed": text, "t_s": t_s, "nonce": nonce, "tag": _tag(key, verb, text, t_s, nonce)})
+
+
+def unsigned(text: str) -> str:
+    """The question in a signed one, unchecked; the text itself if it is not signed."""
+    given = _signed(text)
+    question = None if given is None else given["signed"]
+    return question if isinstance(question, str) else text
+
+
+def _signed(text: str) -> dict[str, Any] | None:
+    """The object of a signed question; None for any other text."""
+    try:
+        given = json.loads(text or "{}")
+    except (ValueError, *INPUT_FAULTS):
+        return None
+    return given if isinstance(given, dict) and "signed" in given else None
+
+
+def _tag(key: bytes, verb: str, text: str, t_s: int, nonce: str) -> str:
+    signed = json.dumps([verb, text, t_s, nonce]).encode()
+    return blake2b(signed, key=key, digest_size=_TAG_BYTES, person=b"kiteline-maps").hexdigest()
+
+
+class QuestionGuard:
+    """Lets questions pass that are signed with the key."""
+
+    def __init__(self, key: bytes | None) -> None:
+        """key: None if nobody has the right."""
+        self._key = key
+        self._taken: OrderedDict[str, int] = OrderedDict()  # nonces, and when they may be forgotten
+
+    def open(self, verb: str, text: str, now_s: int) -> str | None:
+        """The question in a signed one; None for one that is not signed. Raises WireError for a wrong signature."""
+        given = _signed(text)
+        if given is None:
+            return None
+        question, t_s, nonce, tag = (given.get(name) for name in ("signed", "t_s", "nonce", "tag"))
+        if not (isinstance(question, str) and isinstance(nonce, str) and isinstance(tag, str) and type(t_s) is int):
+            raise WireError("a signed question has a text, a time, a nonce and a tag")
+        if self._key is None or not hmac.compare_digest(
+            _tag(self._key, verb, question, t_s, nonce).encode(), tag.encode(errors="replace")
+        ):  # fmt: skip
+            raise WireError("the question is signed with another key than this base's for maps")
+        while self._taken and next(iter(self._taken.values())) < now_s:
+            self._taken.popitem(last=False)
+        if abs(now_s - t_s) > _NEAR_S:
+            raise WireError(f"the question is of {t_s - now_s:+d} s from now: set the clocks of both machines")
+        if nonce in self._taken or len(self._taken) >= _REMEMBERED:
+            raise WireError("the question was asked before, or too many were asked")
+        self._taken[nonce] = now_s + 2 * _NEAR_S
+        return question

@@ -1,0 +1,133 @@
+"""Ends that do not understand each other say why, on both sides, after a few packets."""
+
+from __future__ import annotations
+
+import pytest
+
+from kiteline_codec.coding.packing import WireError
+from kiteline_codec.sync.config import SyncConfig
+from kiteline_codec.sync.endpoint import Endpoint
+from kiteline_codec.transport.seal import Direction, Opener, Sealer, Suite
+from kiteline_codec.transport.seal_watch import SealWatch, Trouble, notice, read_notice
+from kiteline_codec.transport.signed_question import QuestionGuard, sign, unsigned
+
+AGENT = 5  # whose seals begin with the byte that unsealed packets begin with
+OURS, OTHER = bytes(32), bytes([1]) * 32
+
+
+def packet() -> bytes:
+    out = Endpoint(SyncConfig(), 3).poll(0)
+    assert out is not None
+    return out
+
+
+class End:
+    """One end: with a key or without."""
+
+    def __init__(self, side: Direction, key: bytes | None, boot: int = 4, suite: Suite = Suite.ENCRYPTED) -> None:
+        other = Direction.DOWN if side == Direction.UP else Direction.UP
+        self.sealer = None if key is None else Sealer(key, AGENT, boot, side, suite)
+        self.opener = None if key is None else Opener({AGENT: key}, other)
+        self.watch = SealWatch(side, self.opener)
+
+    def packet(self) -> bytes:
+        return packet() if self.sealer is None else self.sealer.seal(packet())
+
+
+def exchange(agent: End, base: End, packets: int = 4) -> tuple[int, list[str], list[str]]:
+    """Send packets up, and what the base answers down. Returns how many arrived, and what both say."""
+    arrived = 0
+    for _ in range(packets):
+        opened, answer = base.watch.take(AGENT, agent.packet())
+        arrived += opened is not None
+        if answer is not None:
+            assert len(answer) == 10
+            agent.watch.take(AGENT, answer)
+    return arrived, agent.watch.lines(), base.watch.lines()
+
+
+@pytest.mark.parametrize("suite", list(Suite))
+@pytest.mark.parametrize(
+    ("agent_key", "base_key", "at_agent", "at_base"),
+    [
+        (None, OURS, "the base seals its packets, and this agent has no key", "agent 5 sends without seals"),
+        (OURS, None, "the base sends without seals", "agent 5 seals its packets, and this base has no keys"),
+        (OTHER, OURS, "the base has another key", "agent 5 has another key"),
+    ],
+)
+def test_seals_on_one_side_and_other_keys_are_named_on_both(
+    suite: Suite, agent_key: bytes | None, base_key: bytes | None, at_agent: str, at_base: str
+) -> None:
+    agent, base = End(Direction.UP, agent_key, suite=suite), End(Direction.DOWN, base_key, suite=suite)
+    arrived, agent_lines, base_lines = exchange(agent, base)
+    assert arrived == 0
+    assert len(agent_lines) == len(base_lines) == 1
+    assert at_agent in agent_lines[0] and at_base in base_lines[0]
+    assert exchange(agent, base, 200)[1:] == ([], [])  # once is enough
+
+
+@pytest.mark.parametrize("key", [None, OURS])
+def test_ends_that_understand_each_other_say_nothing(key: bytes | None) -> None:
+    agent, base = End(Direction.UP, key), End(Direction.DOWN, key)
+    assert exchange(agent, base, 50) == (50, [], [])
+
+
+def test_an_earlier_boot_is_named_on_both_sides_and_a_repeated_packet_is_not() -> None:
+    base = End(Direction.DOWN, OURS)
+    later, earlier = End(Direction.UP, OURS, boot=9), End(Direction.UP, OURS, boot=8)
+    again = later.packet()
+    for _ in range(5):
+        base.watch.take(AGENT, again)
+    assert base.watch.lines() == []
+    arrived, agent_lines, base_lines = exchange(earlier, base)
+    assert arrived == 0
+    assert "a later start of agent 5" in agent_lines[0] and "two agents 5" in base_lines[0]
+
+
+def test_few_answers_go_to_a_flood() -> None:
+    base = End(Direction.DOWN, OURS)
+    answers = [base.watch.take(AGENT, packet())[1] for _ in range(1000)]
+    assert 0 < sum(a is not None for a in answers) < 100
+
+
+def test_damaged_packets_reach_the_endpoint_that_counts_them() -> None:
+    base = End(Direction.DOWN, None)
+    damaged = bytearray(packet())
+    damaged[0] = 0x6B
+    assert base.watch.take(AGENT, bytes(damaged)) == ((AGENT, bytes(damaged)), None)
+
+
+def test_notices_are_read_exactly() -> None:
+    for trouble in Trouble:
+        assert read_notice(notice(trouble)) is trouble
+    for other in (b"", notice(Trouble.SEALED) + b"x", b"\0kiteline\0", b"\0kiteline\xff", packet()):
+        assert read_notice(other) is None
+
+
+def test_a_key_can_be_changed_while_packets_arrive() -> None:
+    base, agent = End(Direction.DOWN, OTHER), End(Direction.UP, OURS)
+    assert exchange(agent, base)[0] == 0
+    assert base.opener is not None
+    base.opener.set_key(AGENT, OURS)
+    assert exchange(agent, base)[0] == 4
+
+
+def test_questions_need_the_key_and_are_taken_once() -> None:
+    guard = QuestionGuard(OURS)
+    text = sign(OURS, "delete", '{"map": "0.0.0"}', 1000, "n1")
+    assert guard.open("delete", text, 1010) == '{"map": "0.0.0"}'
+    for verb, again, now_s in (
+        ("delete", text, 1011),  # asked before
+        ("merge", sign(OURS, "delete", "{}", 1000, "n2"), 1000),  # another verb
+        ("delete", sign(OTHER, "delete", "{}", 1000, "n3"), 1000),
+        ("delete", sign(OURS, "delete", "{}", 1000, "n4"), 2000),  # too late
+        ("delete", '{"signed": 1}', 1000),
+        ("delete", '{"signed": "{}", "t_s": 1e999, "nonce": "a", "tag": "\ud800"}', 1000),
+    ):
+        with pytest.raises(WireError):
+            guard.open(verb, again, now_s)
+    assert guard.open("delete", '{"map": "0.0.0"}', 1000) is None
+    assert guard.open("delete", "[" * 1000, 1000) is None
+    with pytest.raises(WireError):
+        QuestionGuard(None).open("delete", text, 1000)
+    assert unsigned(text) == '{"map": "0.0.0"}' and unsigned("[" * 1000) == "[" * 1000

@@ -1,0 +1,172 @@
+"""What is sealed by default, pairing codes, and what a base lets strangers do."""
+
+from __future__ import annotations
+
+import socket
+import stat
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zenoh
+
+from kiteline_hw.links.sealing import is_loopback, sealing_of
+from kiteline_hw.links.zenoh_link import ZenohHub, ZenohLink
+from kiteline_hw.links.zenoh_session import close_session, direct, open_session
+from kiteline_hw.ports import LinkError
+from kiteline_hw.system.key_store import default_path, first_keys, new_code, new_maps_key, pair, read_file, read_keys
+
+NETWORK, LOOPBACK = "zenoh:tcp/0.0.0.0:7447", "zenoh:tcp/127.0.0.1:7447"
+
+
+@pytest.fixture(autouse=True)
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
+    return tmp_path
+
+
+def test_a_base_on_a_network_makes_keys_at_its_first_start_and_says_how_to_pair() -> None:
+    first = sealing_of(NETWORK, "base", 0, "", insecure=False)
+    assert first.key == str(default_path())
+    assert "new keys" in first.lines[0] and "kiteline keys pair" in first.lines[0]
+    assert stat.S_IMODE(default_path().stat().st_mode) == 0o600
+    keys = read_file(default_path())
+    assert len(keys.agents) == 64 and len(set(keys.agents.values())) == 64 and keys.maps is not None
+    assert "new keys" not in sealing_of(NETWORK, "base", 0, "", insecure=False).lines[0]
+    assert read_file(default_path()) == keys
+    # an agent of the same user on the same machine needs no pairing
+    assert sealing_of(LOOPBACK, "agent", 7, "", insecure=False).key == str(default_path())
+
+
+def test_an_agent_on_a_network_is_paired_first() -> None:
+    with pytest.raises(LinkError, match="kiteline keys pair 3"):
+        sealing_of("zenoh:tcp/10.0.0.1:7447", "agent", 3, "", insecure=False)
+    pair(default_path(), 3, new_code())
+    assert sealing_of("zenoh:tcp/10.0.0.1:7447", "agent", 3, "", insecure=False).key == str(default_path())
+
+
+@pytest.mark.parametrize("role", ["agent", "base"])
+def test_one_machine_cables_and_insecure_links_are_not_sealed_and_it_is_said(role: Any) -> None:
+    assert sealing_of("none", role, 0, "", insecure=False) == sealing_of("none", role, 0, "", insecure=True)
+    assert sealing_of(LOOPBACK, role, 0, "", insecure=False).key == ""
+    assert "this machine" in sealing_of(LOOPBACK, role, 0, "", insecure=False).lines[0]
+    assert "not sealed" in sealing_of("serial:/dev/ttyUSB0:57600", role, 0, "", insecure=False).lines[0]
+    loud = sealing_of(NETWORK, role, 0, "", insecure=True)
+    assert loud.key == "" and "NOT SEALED" in loud.lines[0]
+    assert sealing_of(NETWORK, role, 0, "some.key", insecure=False).key == "some.key"
+    with pytest.raises(LinkError, match="choose one"):
+        sealing_of(NETWORK, role, 0, "some.key", insecure=True)
+    assert not default_path().exists()
+
+
+@pytest.mark.parametrize(
+    ("link", "own"),
+    [("zenoh:tcp/127.0.0.1:1", True), ("zenoh:tcp/[::1]:1", True), ("zenoh:udp/localhost:1", True),
+     ("zenoh:router/tcp/127.0.0.1:1", True), ("zenoh:tcp/0.0.0.0:1", False), ("zenoh:tcp/[::]:1", False),
+     ("zenoh:tcp/base.local:1", False), ("zenoh:tcp/127.0.0.1.evil.org:1", False), ("zenoh:tcp/10.0.0.1:1", False)],
+)  # fmt: skip
+def test_loopback_is_known_by_its_address(link: str, own: bool) -> None:
+    assert is_loopback(link) == own
+
+
+def test_a_code_makes_the_same_key_on_both_sides(tmp_path: Path) -> None:
+    code = new_code()
+    assert len(code) == 19
+    keys = [pair(tmp_path / side, 3, code) for side in ("base", "agent")]
+    assert keys[0] == keys[1] == read_keys(tmp_path / "agent")[3]
+    assert pair(tmp_path / "typed", 3, code.lower().replace("-", " ").replace("0", "O").replace("1", "l")) == keys[0]
+    assert pair(tmp_path / "agent", 4, code) != keys[0]  # of another agent
+    assert set(read_keys(tmp_path / "agent")) == {3, 4}
+    for wrong in ("", "abc", code + "A", code[:-1] + ("A" if code[-1] != "A" else "B"), "U" * 16):
+        with pytest.raises(LinkError, match="is no pairing code"):
+            pair(tmp_path / "agent", 3, wrong)
+
+
+def test_the_right_to_change_maps_is_kept_beside_the_keys(tmp_path: Path) -> None:
+    path = tmp_path / "keys"
+    pair(path, 3, new_code())
+    key = new_maps_key(path)
+    pair(path, 4, new_code())
+    assert read_file(path).maps == key
+    with pytest.raises(LinkError, match="--replace"):
+        new_maps_key(path)
+    assert not first_keys(path)
+
+
+@pytest.fixture
+def endpoint() -> str:
+    with socket.socket() as s:
+        s.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{s.getsockname()[1]}"
+
+
+def until(condition: Callable[[], object], seconds: float = 6.0) -> None:
+    end_s = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end_s
+        time.sleep(0.02)
+
+
+def test_a_base_routes_nothing_between_its_clients(endpoint: str) -> None:
+    with ZenohHub(endpoint) as hub, ZenohLink(endpoint, 3) as agent:
+        stranger, another = (open_session(endpoint, "client") for _ in range(2))
+        heard: list[str] = []
+        try:
+            subscriptions = [
+                stranger.declare_subscriber(key, direct(lambda sample: heard.append(str(sample.key_expr))))
+                for key in ("kiteline/1/default/*/up", "other/**")
+            ]
+            until(lambda: agent.connected and 3 in hub.links())
+            received: list[bytes] = []
+
+            def pass_packets() -> bool:
+                agent.send(b"from the agent")
+                hub.links()[3].send(b"from the base")
+                stranger.put("kiteline/1/default/3/down", b"in the base's name")
+                another.put("other/x", b"x")
+                received.extend(agent.receive())
+                return b"from the base" in received and b"from the agent" in hub.links()[3].receive()
+
+            until(pass_packets)
+            time.sleep(0.3)
+            received += agent.receive()
+            assert set(received) == {b"from the base"}
+            assert heard == []
+            del subscriptions
+        finally:
+            close_session(stranger)
+            close_session(another)
+
+
+def test_two_agents_with_one_number_are_found_on_both_ends_within_three_seconds(endpoint: str) -> None:
+    with ZenohHub(endpoint) as hub, ZenohLink(endpoint, 3) as one:
+        until(lambda: one.connected)
+        with ZenohLink(endpoint, 3) as other, ZenohLink(endpoint, 4) as third:
+            until(lambda: other.connected and third.connected)
+            assert hub.doubles() == frozenset()
+            until(lambda: hub.doubles() == {3} and one.doubled and other.doubled, 3.0)
+            assert not third.doubled
+        until(lambda: not hub.doubles())
+
+
+def test_what_is_too_long_is_dropped_before_it_takes_memory(endpoint: str) -> None:
+    with ZenohHub(endpoint) as hub:
+        stranger = open_session(endpoint, "client")
+        try:
+            for _ in range(30):
+                stranger.put(
+                    "kiteline/1/default/3/up", bytes(100_000), congestion_control=zenoh.CongestionControl.BLOCK
+                )
+            stranger.put("kiteline/1/default/3/up", b"short")
+            until(lambda: 3 in hub.links())
+            time.sleep(0.2)
+            assert hub.links()[3].receive() == [b"short"]
+            assert hub.counters.overrun_packets > 0
+            for _ in range(5000):
+                stranger.put("kiteline/1/default/3/up", bytes(1000), congestion_control=zenoh.CongestionControl.BLOCK)
+            time.sleep(1.0)
+            assert sum(map(len, hub.links()[3].receive())) <= 1 << 20
+        finally:
+            close_session(stranger)
