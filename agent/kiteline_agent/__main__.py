@@ -35,8 +35,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if not a.source:
         p.error("a SOURCE is required")
     sealing = sealing_of(a.link, "agent", a.agent, a.key, insecure=a.insecure)
-    a.key = sealing.key
-    process.print_lines(sealing.lines)
+    a.key, a.told = sealing.key, sealing.lines
     kept = process.kept_folder(f"agent{a.agent}")
     options = options_of(a, Path(a.log) / kept.name if a.log else kept)
     fly_live(options, None, process.StopSignal(), numbers_in(kept))

@@ -35,8 +35,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             process.run_child(options.link, partial(fly_lockstep, options), partial(fly_live, options), expected)
         )
     sealing = sealing_of(a.link, "base", 0, a.key, insecure=a.insecure)
-    a.key = sealing.key
-    process.print_lines(sealing.lines)
+    a.key, a.told = sealing.key, sealing.lines
     # Time since a fixed date: a base on another machine, without this one's files, still begins a later session.
     least = max(0, int(time.time()) - _EPOCH_S) // _UNIT_S << _DRAWN_BITS | secrets.randbelow(1 << _DRAWN_BITS)
     start = numbers_in(process.kept_folder("base")).next(max(1, least))

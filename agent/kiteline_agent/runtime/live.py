@@ -91,7 +91,7 @@ def fly_live(
         process.notify("READY=1")
         status = StatusMessages()
         if parent is None:
-            process.print_lines([f"flying {source.name}, {_link_text(options)}"])
+            process.print_lines([f"flying {source.name}, {_link_text(options)}", *options.told])
         begin_ns = clock.now_ns()
         runtime.begin_at(begin_ns)
         if controller is not None:
@@ -200,8 +200,8 @@ def _key_of(options: AgentOptions) -> bytes | None:
     keys = read_keys(Path(options.key))
     if options.agent not in keys:
         raise LinkError(
-            f"{options.key} has no key for agent {options.agent}: run `kiteline keys pair {options.agent}` at the base, "
-            f"and here the command that it shows, with --file {options.key}"
+            f"{options.key} has no key for agent {options.agent}: run `kiteline keys pair {options.agent}` at the "
+            f"base, and here the command that it shows, with --file {options.key}"
         )
     return keys[options.agent]
 

@@ -43,6 +43,7 @@ class AgentOptions:
     seconds: float = 0.0  # s of flight time to fly; 0: all
     up_bytes_s: int = 0  # B/s that the link takes; 0: any number
     key: str = ""  # a file with this agent's key; "": packets are not sealed
+    told: tuple[str, ...] = ()  # lines about that for the user
     profile: str = ""  # what to share of a keyframe: wifi or radio; "": as the link allows
     delay_s: float = 0.0  # s that a packet is under way
     loss: float = 0.0  # probability that a packet is lost
@@ -71,7 +72,8 @@ def options_of(a: argparse.Namespace, folder: Path) -> AgentOptions:
         source=a.source, folder=str(folder), log_name=LOG_STEM if a.log else "", log_mib=a.log_mib,
         log_optional=True, agent=a.agent,
         link=a.link, mono=a.mono, imu=not a.no_imu, config=a.config, rig=a.rig, calibration=a.calibration,
-        up_bytes_s=a.up_bytes, profile=a.profile, key=a.key, cpu_percent=a.cpu, mavlink=a.mavlink, axes=a.axes,
+        up_bytes_s=a.up_bytes, profile=a.profile, key=a.key, told=a.told,
+        cpu_percent=a.cpu, mavlink=a.mavlink, axes=a.axes,
         odometry=a.odometry, imu_of=a.imu, offset=a.offset, heading=a.heading, pose_messages=a.pose_messages,
         origin=a.origin, mavlink_key=a.mavlink_key, obstacles=a.obstacles,
         grid=a.grid,
@@ -180,6 +182,7 @@ def parser(forms: str = "") -> argparse.ArgumentParser:
     p.add_argument("--up-bytes", metavar="N", type=int, default=0, help="B/s that may be sent, headers included")
     p.add_argument("--key", metavar="FILE", default="", help="seal packets; take none but sealed ones "
                    "(default: the file of `kiteline keys pair`)")  # fmt: skip
+    p.set_defaults(told=())
     p.add_argument("--insecure", action="store_true", help="use an IP link without seals")
     p.add_argument("--profile", choices=("wifi", "radio"), default="", help="default: as the link allows")
     p.add_argument("--mono", action="store_true", help="the left camera alone")

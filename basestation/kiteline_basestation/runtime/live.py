@@ -70,7 +70,7 @@ def fly_live(options: BaseOptions, parent: process.Parent | None, stop: process.
         begin_ns, stepped_ns = clock.now_ns(), 0
         if terminal is not None:
             store = f"store {options.store}" if options.store else "no --store: the map is not saved"
-            process.print_lines([f"base on {options.link}, session {options.session}, {store}"])
+            process.print_lines([f"base on {options.link}, session {options.session}, {store}", *options.told])
         while not stop:
             now_ns = clock.now_ns()
             packets = {agent: received for agent, end in hub.links().items() if (received := end.receive())}

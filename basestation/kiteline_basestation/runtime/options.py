@@ -34,6 +34,7 @@ class BaseOptions:
     start_ns: int = 0  # time stamp of flight time 0: the log uses the time of the first source
     down_bytes_s: int = 0  # B/s to each agent; 0: no limit
     key: str = ""  # a file with the agents' keys; "": packets are not sealed
+    told: tuple[str, ...] = ()  # lines about that for the user
     profile: str = ""  # wifi or radio; "": by the link's throughput
     delay_s: float = 0.0  # s; modelled delay of the link
     loss: float = 0.0  # probability that a packet is lost
@@ -78,6 +79,7 @@ def parser(link_forms: str = "") -> argparse.ArgumentParser:
     p.add_argument("--down-bytes", metavar="N", type=int, default=0, help="B/s to each agent, headers included")
     p.add_argument("--key", metavar="FILE", default="", help="seal packets; drop those of agents without a key in it "
                    "(default, beyond this machine: a file that is made at the first start)")  # fmt: skip
+    p.set_defaults(told=())
     p.add_argument("--insecure", action="store_true", help="serve anyone who reaches the link, without seals")
     p.add_argument("--profile", choices=("wifi", "radio"), default="", help="default: as the link allows")
     p.add_argument("--quiet", action="store_true", help="print no status messages")
@@ -90,7 +92,8 @@ def options_of(a: argparse.Namespace, session: int) -> BaseOptions:
     return BaseOptions(
         folder=a.log, log_name=f"{LOG_STEM}{session}.mcap" if a.log else "", log_mib=a.log_mib, log_optional=True,
         session=session,
-        link=a.link, config=a.config, down_bytes_s=a.down_bytes, profile=a.profile, key=a.key, store=a.store, web=a.web,
+        link=a.link, config=a.config, down_bytes_s=a.down_bytes, profile=a.profile, key=a.key, told=a.told,
+        store=a.store, web=a.web,
         imports=tuple(a.imports), maps=a.maps, quiet=a.quiet,
     )  # fmt: skip
 
