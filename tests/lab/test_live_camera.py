@@ -86,7 +86,7 @@ def test_cameras_are_unplugged_and_back_and_the_flight_goes_on(
         a = parser().parse_args(
             [source, "--mavlink", f"udp:127.0.0.1:{controller.port}", "--log", str(tmp_path), "--no-imu"]
         )
-        fly_live(options_of(a, tmp_path, 0), None, stop)
+        fly_live(options_of(a, tmp_path), None, stop)
         thread.join()
         heartbeats = sum(model.heartbeats.values())
     said = [line.split(" s  ", 1)[-1] for line in capsys.readouterr().err.splitlines() if "camera" in line]
@@ -94,7 +94,7 @@ def test_cameras_are_unplugged_and_back_and_the_flight_goes_on(
     assert sum("images again after" in line for line in said) == 2, said
     assert sum("right image" in line for line in said) == 1, said
     assert heartbeats >= 4  # the controller heard from us all the while
-    with LogReader(tmp_path / "boot00000.mcap") as log:
+    with LogReader(tmp_path / "boot.mcap") as log:
         estimates = [estimate_from_json(m.json()) for m in log.messages(["/estimate"])]
         stamps = np.array([e.t_ns for e in estimates])
         gap = int(np.argmax(np.diff(stamps)))
@@ -126,8 +126,8 @@ def test_a_log_without_all_images_says_so_at_replay(
     config = tmp_path / "agent.toml"
     config.write_text("[agent.log]\nevery = 3\n", encoding="utf-8")
     a = parser().parse_args([str(recording), "--log", str(tmp_path), "--config", str(config)])
-    fly_live(options_of(a, tmp_path, 0), None, StopAfter())
-    with LogReader(tmp_path / "boot00000.mcap") as log:
+    fly_live(options_of(a, tmp_path), None, StopAfter())
+    with LogReader(tmp_path / "boot.mcap") as log:
         frames = sum(m.json()["frame_ns"] is not None for m in log.messages(["/step"]))
         assert log.topics["/left/image"] == -(-frames // 3) > 3
         with pytest.raises(SourceError, match=r"has no images: it was flown with every = 0 or more than 1"):

@@ -50,7 +50,7 @@ def fly(recording: Path, folder: Path) -> None:
             url = f"udp:127.0.0.1:{controller.port}"
             a = parser().parse_args([str(recording), "--mavlink", url, "--imu", "controller", "--config", str(config),
                                      "--log", str(folder)])  # fmt: skip
-            fly_live(options_of(a, folder, 0), None, process.StopSignal())
+            fly_live(options_of(a, folder), None, process.StopSignal())
         finally:
             over.set()
             unit.join()
@@ -58,7 +58,7 @@ def fly(recording: Path, folder: Path) -> None:
 
 def test_the_imu_of_a_flight_controller_reaches_the_agent(recording: Path, tmp_path: Path) -> None:
     fly(recording, tmp_path)
-    with LogReader(tmp_path / "boot00000.mcap") as log:
+    with LogReader(tmp_path / "boot.mcap") as log:
         batches = [message.imu() for message in log.messages(["/imu"])]
         frames = [message.t_ns for message in log.messages(["/left/image"])]
         assert sum(len(batch.t_ns) for batch in batches) > 50

@@ -69,7 +69,7 @@ class AgentOptions:
 def options_of(a: argparse.Namespace, folder: Path) -> AgentOptions:
     """Options from the command line, without the numbers of this start. folder: for the log."""
     return AgentOptions(
-        source=a.source, folder=str(folder), log_name=LOG_STEM if a.log else "", log_mib=a.log_mib,
+        source=a.source, folder=str(folder), log_name=f"{LOG_STEM}.mcap" if a.log else "", log_mib=a.log_mib,
         log_optional=True, agent=a.agent,
         link=a.link, mono=a.mono, imu=not a.no_imu, config=a.config, rig=a.rig, calibration=a.calibration,
         up_bytes_s=a.up_bytes, profile=a.profile, key=a.key, told=a.told,

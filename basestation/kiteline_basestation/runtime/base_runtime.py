@@ -21,7 +21,6 @@ from kiteline_basestation.runtime.options import LOG_STEM, BaseOptions, base_con
 from kiteline_basestation.runtime.warm import warm, warm_graphs
 from kiteline_basestation.runtime.worker import SAMPLES, LockstepJobs, Worker
 from kiteline_basestation.station import Import, Station, StationOutput
-from kiteline_basestation.store.combine import combine
 from kiteline_basestation.store.keeper import Keeper
 from kiteline_basestation.store.restore import Restored, restore
 from kiteline_basestation.store.saved_map import SavedMap, pack
@@ -131,12 +130,12 @@ class BaseRuntime:
         Raises StoreError, SourceError, WireError.
         """
         self.keeper = Keeper(Path(self.options.store)) if self.options.store else None
-        stored = saved = SavedMap() if self.keeper is None else self.keeper.load()
-        maps, self._imports = read_imports(
-            self.options.imports, lambda data: station_of(data, load_vocabulary(), link_traits)
+        stored = SavedMap() if self.keeper is None else self.keeper.load()
+        saved, logs = read_imports(
+            self.options.imports, stored, lambda data: station_of(data, load_vocabulary(), link_traits)
         )
-        for other in maps:
-            saved = combine(saved, other)
+        self._imports = list(logs.pieces)
+        process.print_lines(f"import: {fault}" for fault in logs.faults)
         restored = None
         if not saved.empty:
             if self._log is not None:

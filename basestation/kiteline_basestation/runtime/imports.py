@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from kiteline_basestation.jobs import Job
 from kiteline_basestation.runtime import flight_log
 from kiteline_basestation.station import Import, Station
 from kiteline_basestation.store.checksums import StoreError
+from kiteline_basestation.store.combine import combine
 from kiteline_basestation.store.keeper import snapshot
 from kiteline_basestation.store.restore import restore
-from kiteline_basestation.store.saved_map import SavedMap, unpack
+from kiteline_basestation.store.saved_map import SavedMap, SavedValues, unpack, value_name
 from kiteline_basestation.store.store import FILE, read
-from kiteline_codec.schema import Key, record_log
+from kiteline_codec.schema import Key, WireError, messages, record_log
 from kiteline_core.errors import INPUT_FAULTS
 from kiteline_core.ids import AgentId
 from kiteline_hw.logs.mcap_log import LogMessage, LogReader
@@ -21,8 +23,16 @@ from kiteline_hw.logs.mcap_log import LogMessage, LogReader
 _STEP_VALUES = 200  # values of an agent's log that one step takes in, so that the loop goes on
 
 
-def import_map(path: Path, make_station: Callable[[Mapping[str, str]], Station]) -> SavedMap | list[Import]:
-    """A saved map (of a store or a base's log), or the values of an agent's log in pieces for several steps.
+@dataclass(frozen=True, slots=True)
+class FromLog:
+    """The values of an agent's log, in pieces for several steps. faults: what was left out, in words."""
+
+    pieces: tuple[Import, ...]
+    faults: tuple[str, ...] = ()
+
+
+def import_map(path: Path, make_station: Callable[[Mapping[str, str]], Station]) -> SavedMap | FromLog:
+    """A saved map (of a store or a base's log), or the values of an agent's log.
 
     make_station: from the metadata of a base's log, a station as in the log. Raises StoreError, SourceError.
     """
@@ -36,20 +46,30 @@ def import_map(path: Path, make_station: Callable[[Mapping[str, str]], Station])
         ) from error
 
 
-def _of_log(path: Path, make_station: Callable[[Mapping[str, str]], Station]) -> SavedMap | list[Import]:
+def _of_log(path: Path, make_station: Callable[[Mapping[str, str]], Station]) -> SavedMap | FromLog:
     with LogReader(path) as log:
         role = log.metadata.get("role")
         if role == "agent":
             return _of_agent(log, path)
+        if role == "base" and "part" in log.metadata:
+            raise StoreError(
+                f"{path}: part {log.metadata['part']} of a base's log: expected its beginning, or the store"
+            )
         if role == "base":
             return _of_base(log, path, make_station(log.metadata))
     raise StoreError(f"{path}: expected the log of an agent or of a base, or a base's store")
 
 
-def _of_agent(log: LogReader, path: Path) -> list[Import]:
+def _of_agent(log: LogReader, path: Path) -> FromLog:
     values: dict[AgentId, dict[Key, bytes]] = {}
+    faults = [] if log.cut is None else [f"{path}: {log.cut}: what came after is left out"]
     for message in log.messages((record_log.TOPIC,)):
         agent, key, code = record_log.read_record(message.blob())
+        try:
+            messages.decode(key, code)
+        except WireError as error:
+            faults.append(f"{path}: {value_name(key)} of agent {agent} cannot be read ({error}): left out")
+            continue
         values.setdefault(agent, {})[key] = code
     if not values:
         raise StoreError(f"{path}: no keyframes in this log; expected an agent's log with {record_log.TOPIC} in it")
@@ -57,7 +77,7 @@ def _of_agent(log: LogReader, path: Path) -> list[Import]:
     for agent, codes in sorted(values.items()):
         items = sorted(codes.items())
         out += [Import(agent, tuple(items[i : i + _STEP_VALUES])) for i in range(0, len(items), _STEP_VALUES)]
-    return out
+    return FromLog(tuple(out), tuple(faults))
 
 
 def _of_base(log: LogReader, path: Path, station: Station) -> SavedMap:
@@ -70,13 +90,13 @@ def _of_base(log: LogReader, path: Path, station: Station) -> SavedMap:
         restore(station, before, blob.t_ns)
     station.track_changes()
     jobs: dict[int, Job] = {}
-    for messages in _steps(log):
-        head = messages[0].json()
+    for step in _steps(log):
+        head = step[0].json()
         topics = {AgentId(int(a)): flight_log.packets_in(int(a)) for a in head["agents"]}
-        packets = {agent: [m.blob() for m in messages if m.topic == topic] for agent, topic in topics.items()}
-        logged = [m for m in messages if m.topic == flight_log.JOB]
+        packets = {agent: [m.blob() for m in step if m.topic == topic] for agent, topic in topics.items()}
+        logged = [m for m in step if m.topic == flight_log.JOB]
         done = [flight_log.done_again(jobs.pop(n), m) for n, m in zip(head["done"], logged, strict=True)]
-        output = station.step(packets, done, head["now_ns"], flight_log.read_orders(messages))
+        output = station.step(packets, done, head["now_ns"], flight_log.read_orders(step))
         jobs.update({job.id: job for job in output.jobs})
     return snapshot(station, before)
 
@@ -95,15 +115,24 @@ def _steps(log: LogReader) -> Iterator[Sequence[LogMessage]]:
 
 
 def read_imports(
-    paths: Sequence[str], make_station: Callable[[Mapping[str, str]], Station]
-) -> tuple[list[SavedMap], list[Import]]:
-    """Saved maps and pieces of agents' logs that --import names. Raises StoreError, SourceError."""
-    maps: list[SavedMap] = []
-    pieces: list[Import] = []
+    paths: Sequence[str], stored: SavedMap, make_station: Callable[[Mapping[str, str]], Station]
+) -> tuple[SavedMap, FromLog]:
+    """The stored map with all maps that --import names, and what their agents' logs hold.
+
+    All of it or nothing: raises StoreError, SourceError, WireError before anything is taken in.
+    """
+    saved, logs = stored, list[FromLog]()
     for text in paths:
         found = import_map(Path(text), make_station)
         if isinstance(found, SavedMap):
-            maps.append(found)
+            saved = combine(saved, found)
         else:
-            pieces += found
-    return maps, pieces
+            logs.append(found)
+    for piece in [piece for log in logs for piece in log.pieces]:
+        held = saved.agents.get(piece.agent, SavedValues({}, {})).received
+        combine(  # raises if these are other keyframes under the same ids
+            SavedMap({piece.agent: SavedValues({key: held[key] for key, _ in piece.codes if key in held}, {})}),
+            SavedMap({piece.agent: SavedValues(dict(piece.codes), {})}),
+        )
+    faults = tuple(fault for log in logs for fault in log.faults)
+    return saved, FromLog(tuple(piece for log in logs for piece in log.pieces), faults)

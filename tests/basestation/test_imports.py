@@ -1,0 +1,64 @@
+"""Imports are taken in as a whole or not at all, and what was left out is told."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from kiteline_basestation.runtime.imports import read_imports
+from kiteline_basestation.station import Station
+from kiteline_basestation.store.saved_map import SavedMap, SavedValues
+from kiteline_codec.schema import KeyframeHeader, WireError, messages, record_log
+from kiteline_hw.logs.mcap_log import LogWriter
+from kiteline_hw.ports import SourceError
+
+MakeFlight = Callable[..., Any]
+
+
+def no_station(metadata: Mapping[str, str]) -> Station:
+    raise AssertionError("no log of a base")
+
+
+def log_of(path: Path, flight: Any, spoil: int | None = None) -> Path:
+    """The log of an agent; the record `spoil` cannot be read."""
+    with LogWriter(path, {"role": "agent"}) as log:
+        for n, record in enumerate(record for step in flight.records for record in step):
+            code = b"" if n == spoil else messages.encode(record)
+            log.blob(record_log.TOPIC, n, record_log.write_record(flight.agent, messages.key(record), code))
+            log.flush()
+    return path
+
+
+def test_what_cannot_be_read_is_left_out_and_named(make_flight: MakeFlight, tmp_path: Path) -> None:
+    flight = make_flight(keyframes=4, turns=0.1)
+    path = log_of(tmp_path / "log.mcap", flight, spoil=1)
+    _, whole = read_imports([str(log_of(tmp_path / "whole.mcap", flight))], SavedMap(), no_station)
+    saved, found = read_imports([str(path)], SavedMap(), no_station)
+    assert saved.empty and whole.faults == ()
+    assert sum(len(p.codes) for p in found.pieces) == sum(len(p.codes) for p in whole.pieces) - 1
+    assert len(found.faults) == 1 and "cannot be read" in found.faults[0]
+
+
+def test_a_cut_log_is_told(make_flight: MakeFlight, tmp_path: Path) -> None:
+    path = log_of(tmp_path / "log.mcap", make_flight(keyframes=8, turns=0.1))
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    _, found = read_imports([str(path)], SavedMap(), no_station)
+    assert found.pieces and len(found.faults) == 1 and "what came after is left out" in found.faults[0]
+
+
+def test_other_keyframes_under_the_same_ids_are_refused_before_anything_is_taken(
+    make_flight: MakeFlight, tmp_path: Path
+) -> None:
+    flight = make_flight(keyframes=4, turns=0.1)
+    path = log_of(tmp_path / "log.mcap", flight)
+    _, found = read_imports([str(path)], SavedMap(), no_station)
+    codes = dict(code for piece in found.pieces for code in piece.codes)
+    header = max(key for key in codes if key.kind == KeyframeHeader.KIND)
+    stored = SavedMap({flight.agent: SavedValues({**codes, header: codes[header] + b"!"}, {})})
+    with pytest.raises(WireError, match="another agent with this number"):
+        read_imports([str(path)], stored, no_station)
+    with pytest.raises(SourceError):
+        read_imports([str(path), str(tmp_path / "missing")], SavedMap(), no_station)
