@@ -27,6 +27,8 @@ from kiteline_core.frame import EncodedImage
 from kiteline_core.ids import MAX_BOOTS, AgentId
 from kiteline_hw.logs.mcap_log import LEFT, RIG, RIGHT, LogReader, LogWriter, read_frame
 from kiteline_hw.logs.rig_json import rig_from_json
+from kiteline_hw.system.key_store import new_key
+from kiteline_hw.system.start_numbers import numbers_in
 from kiteline_lab.flights.contract import check_contract
 from kiteline_lab.flights.fly import fly
 from kiteline_lab.flights.plan import Options
@@ -265,6 +267,27 @@ def stretched(source: Path, out: Path, times: int) -> None:
         for t_ns, pair in sorted(images.items()):
             frame = read_frame(pair, begin_ns + times * (t_ns - begin_ns))
             writer.frame(frame)
+
+
+def test_an_agent_whose_state_was_lost_is_heard_by_a_base_that_knows_later_starts(
+    recording: Path, tmp_path: Path, start: Start
+) -> None:
+    keys, endpoint = tmp_path / "keys", free_endpoint()
+    new_key(keys, 0)
+    words = ("--link", f"zenoh:{endpoint}", "--key", keys)
+    start("base", *words, "--store", tmp_path / "store")
+    states = [tmp_path / "kept", tmp_path / "lost"]
+    folders = [state / "kiteline" / "agent0" for state in states]
+    numbers_in(folders[0]).next(1 << 20)
+    held = 0
+    for state in states:
+        agent = start("agent", recording, *words, XDG_STATE_HOME=str(state))
+        _, said = agent.communicate(timeout=60.0)
+        assert agent.returncode == 0, said
+        assert ("the base knows a later start" in said) == (state == states[1]), said
+        wait_for("its keyframes", lambda held=held: heads(tmp_path / "store" / FILE) >= held + 3)  # type: ignore[misc]
+        held = heads(tmp_path / "store" / FILE)
+    assert numbers_in(folders[1]).next().order > numbers_in(folders[0]).next().order
 
 
 def test_a_base_imports_logs_and_manages_maps(

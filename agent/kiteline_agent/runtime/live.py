@@ -84,6 +84,7 @@ def fly_live(
         watch = SealWatch(Direction.UP, None if key is None else Opener({options.agent: key}, Direction.DOWN))
         end, doubled = link, False
         link = SealedLink(link, options.agent, sealer, watch)
+        follower = _SessionFollower(session, sealer, numbers)
         if options.cpu_percent > 0.0:
             stack.enter_context(CpuQuota(options.cpu_percent)).add(os.getpid())
         if parent is not None:
@@ -126,8 +127,7 @@ def fly_live(
             if controller is not None and (own_hz > 0.0) == (frame is None):
                 push = partial(_push, controller, runtime.agent, captured_ns, options.boot, clock)
             sent = runtime.step(frame, imu, link.receive(), now_ns, odometry, predict_ns, push)
-            if runtime.session > session:
-                session = _overtake(runtime.session, sealer, numbers)
+            follower.follow(runtime.session)
             for packet in sent:
                 link.send(packet)
             if controller is not None:
@@ -146,7 +146,7 @@ def fly_live(
                 parent.send_event("progress", frames=runtime.counts.frames, tracked=runtime.counts.tracked)
         if parent is None:
             process.print_lines([f"over: {summary(runtime.counts)}", *runtime.take_notices(), *runtime.log_notes()])
-        _drain_live(runtime, link, clock, parent, stop)
+        _drain_live(runtime, link, clock, parent, stop, follower)
         if parent is not None:
             parent.send_event("result", report=runtime.report())
 
@@ -206,14 +206,25 @@ def _key_of(options: AgentOptions) -> bytes | None:
     return keys[options.agent]
 
 
-def _overtake(session: int, sealer: Sealer | None, numbers: StartNumbers | None) -> int:
-    """Go on in a session above that of an earlier start which the base knows and this one did not: seal, keep, tell."""
-    if sealer is not None:
-        sealer.raise_to(session)
-    if numbers is not None:  # beside the flight, which cannot wait for a disk
-        threading.Thread(target=numbers.raise_to, args=(order_of(session),), name="start-number", daemon=True).start()
-    process.print_lines(["the base knows a later start of this agent: state lost, or two agents with one number?"])
-    return session
+class _SessionFollower:
+    """Goes on in a session above that of an earlier start, which the base knows and this one did not: seal, keep, tell.
+
+    numbers: where the order is kept; None: nowhere.
+    """
+
+    def __init__(self, session: int, sealer: Sealer | None, numbers: StartNumbers | None) -> None:
+        self._session, self._sealer, self._numbers = session, sealer, numbers
+
+    def follow(self, session: int) -> None:
+        """Take over the channel's session, if it rose."""
+        if session <= self._session:
+            return
+        self._session, order = session, order_of(session)
+        if self._sealer is not None:
+            self._sealer.raise_to(session)
+        if self._numbers is not None:  # beside the flight, which cannot wait for a disk
+            threading.Thread(target=self._numbers.raise_to, args=(order,), name="start-number", daemon=True).start()
+        process.print_lines(["the base knows a later start of this agent: state lost, or two agents with one number?"])
 
 
 def _drain_live(
@@ -222,6 +233,7 @@ def _drain_live(
     clock: MonotonicClock,
     parent: process.Parent | None,
     stop: process.StopSignal,
+    follower: _SessionFollower,
 ) -> None:
     """After the last frame: step until both sides hold the same values, or _DRAIN_S have passed."""
     runtime.end_of_frames()
@@ -232,7 +244,9 @@ def _drain_live(
     while not stop and now_ns < end_ns and now_ns - quiet_ns < _QUIET_S * 1e9:
         stop.wait(_IDLE_TICK_S / 2)
         now_ns = clock.now_ns()
-        for packet in runtime.step(None, None, link.receive(), now_ns):
+        sent = runtime.step(None, None, link.receive(), now_ns)
+        follower.follow(runtime.session)
+        for packet in sent:
             link.send(packet)
         if not all(settled(runtime.channel)):
             quiet_ns = now_ns
