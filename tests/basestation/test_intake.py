@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from kiteline_basestation.config import BaseConfig
+from kiteline_basestation.config import BaseConfig, IntakeConfig
 from kiteline_basestation.intake.intake import Intake
+from kiteline_basestation.map import sparse_map as sparse_map_module
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_codec.schema import (
     RECORD_TYPES,
@@ -24,7 +25,7 @@ from kiteline_codec.schema import (
     SubmapTie,
 )
 from kiteline_core.geometry.cameras import RectifiedCamera
-from kiteline_core.ids import NO_KEYFRAME, AgentId, keyframe_id, submap_id
+from kiteline_core.ids import NO_KEYFRAME, AgentId, keyframe_id, point_id, submap_id
 
 ONE, OTHER = AgentId(1), AgentId(2)
 SUBMAP, LATER = submap_id(ONE, 3, 0), submap_id(ONE, 3, 1)
@@ -100,3 +101,25 @@ def test_every_record_of_agents_has_a_handler() -> None:
     written = {kind for kind in RECORD_TYPES.values() if kind.__module__.startswith("kiteline_codec.schema.agent.")}
     assert len(written) > 5
     assert new_intake()._handlers.keys() == written
+
+
+def test_what_waits_for_keyframes_that_never_come_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An agent may name new ones in each version of its observations, and a new submap in each live pose."""
+    monkeypatch.setattr(sparse_map_module, "_MOST_WAITED_FOR", 500)
+    sparse_map = SparseMap()
+    intake = Intake(IntakeConfig(max_pending=100), sparse_map)
+    own = submap_id(1, 0, 0)
+    keyframe = keyframe_id(own, 9)
+    intake.take(AgentId(1), (KeyframeHeader(keyframe, 1, NO_KEYFRAME, np.eye(4), 50),), 0)
+    index = np.arange(50, dtype=np.uint16)
+    floats, bytes_ = np.ones(50, np.float32), np.zeros(50, np.uint8)
+    for version in range(40):
+        names = np.array([point_id(keyframe_id(own, 100 + 50 * version + i), 0) for i in range(50)], np.int64)
+        uv = np.ones((50, 2), np.float32)
+        intake.take(AgentId(1), (Observations(keyframe, 0, index, uv, floats, bytes_, names),), 0)
+        intake.take(AgentId(1), (Observations(keyframe, 0, index, uv, floats, bytes_, names),), 0)
+    assert sum(map(len, sparse_map._waiting.values())) <= 500
+    for number in range(300):
+        pose = LivePose(AgentId(1), number, keyframe_id(submap_id(1, 1 + number, 0), 0), np.eye(4), 90)
+        intake.take(AgentId(1), (pose,), 0)
+    assert len(intake.last_pose) <= 100 and intake.refused == 200

@@ -165,8 +165,11 @@ class Intake:
         held = self.live.get(record.agent)
         if held is not None and _start(record) == _start(held) and record.t_ns < held.t_ns:
             return
-        self.live[record.agent] = record
         submap = submap_of_keyframe(record.keyframe)
+        if submap not in self.last_pose and len(self.last_pose) >= self._config.max_pending:
+            self.refused += 1  # each may name another submap that does not exist
+            return
+        self.live[record.agent] = record
         self.last_pose[submap] = record
         if record.quality > 0:
             self.tracked_ns[submap] = record.t_ns

@@ -68,7 +68,7 @@ class MapView:
         self.rows_read: set[AgentId] = set()  # agents that read the right image there
         self.moved_rows: set[int] = set()  # keyframes whose pose changed, by row, since a reader cleared it
         self._children: dict[KeyframeId, list[int]] = {}
-        self._waiting: dict[KeyframeId, list[int]] = {}  # slots whose landmark's keyframe is not received yet
+        self._waiting: dict[KeyframeId, dict[int, None]] = {}  # slots whose landmark's keyframe is not received yet
 
     def __len__(self) -> int:
         """Number of keyframes."""

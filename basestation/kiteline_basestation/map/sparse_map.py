@@ -49,6 +49,8 @@ Bool = NDArray[np.bool_]
 
 _REPAIRED_PX = 0.5  # difference of a number of a disparity offset; flights of one rig differ by a tenth
 
+_MOST_WAITED_FOR = 100_000  # keyframes that observations name and that were not received: only a faulty agent has more
+
 
 class SparseMap(MapView):
     """Keyframes, keypoints and landmarks of all agents. Row and slot numbers never change."""
@@ -139,7 +141,7 @@ class SparseMap(MapView):
             self._compose(row)
         waiting = self._waiting.pop(keyframe, None)
         if waiting is not None:
-            self._link_observations(np.array(waiting, np.int32))
+            self._link_observations(np.array(list(waiting), np.int32))
         return row
 
     def _note_offset(self, keyframe: KeyframeId) -> None:
@@ -312,7 +314,12 @@ class SparseMap(MapView):
         for slot in slots[~known].tolist():
             anchor = KeyframeId(int(table.landmark[slot]) >> KEYPOINT_BITS)
             if anchor not in self.rows:
-                self._waiting.setdefault(anchor, []).append(slot)
+                slots_of_anchor = self._waiting.get(anchor)
+                if slots_of_anchor is None:
+                    if len(self._waiting) >= _MOST_WAITED_FOR:
+                        continue
+                    slots_of_anchor = self._waiting[anchor] = {}
+                slots_of_anchor[slot] = None
 
     def _refresh_usable(self, row: int) -> None:
         table = self.keypoints

@@ -13,7 +13,7 @@ from kiteline_codec.coding.packing import Writer
 from kiteline_codec.schema import RECORD_TYPES, IdOf, Key
 from kiteline_codec.sync.config import SyncConfig
 from kiteline_codec.transport.packet import Header, Item, add_checksum, write_header, write_item
-from kiteline_core.ids import AgentId, keyframe_id, submap_id
+from kiteline_core.ids import MAX_BOOTS, MAX_KEYFRAMES, MAX_SUBMAPS, AgentId, keyframe_id, submap_id
 
 PEER_BYTES = 24 << 20  # that this sender's values may take, map included: a small share of what a flight may
 _AGENT, _OTHER = AgentId(3), AgentId(4)
@@ -48,11 +48,13 @@ class KeyedSender:
 
     def _packet(self, mutated: bytes, draw: random.Random) -> bytes:
         self._number += draw.choice((1, 1, 1, 0, 2, 100))
+        channel = self.station.channels.get(_AGENT)
+        ours = channel.endpoint.session if isinstance(channel, CodedChannel) else 7
         watermark = draw.choice((0, 0, 0, max(0, self._version - draw.randrange(400)), draw.choice(_HUGE[:3])))
         if draw.random() < 0.98:
             watermark = min(watermark, self._version)
         header = Header(
-            self._session, draw.choice((7, 7, 7, 7, 0, 6, 8)),
+            self._session, ours if draw.random() < 0.99 else draw.choice((0, ours - 1, ours + 1, *_HUGE[:4])),
             (draw.randrange(100), draw.getrandbits(64)) if draw.random() < 0.5 else None,
             (draw.choice((0, self._version, *_HUGE[:4])), draw.randbytes(16)) if draw.random() < 0.05 else None,
             draw.choice((0, 5, *_HUGE[:4])) if draw.random() < 0.05 else None,
@@ -88,7 +90,7 @@ class KeyedSender:
     @staticmethod
     def _key(known: Key, draw: random.Random) -> Key:
         agent = _AGENT if draw.random() < 0.9 else _OTHER
-        submap = submap_id(agent, draw.choice((0, 1, 16383)), draw.choice((0, 1, 2, 4095)))
+        submap = submap_id(agent, draw.choice((0, 1, MAX_BOOTS - 1)), draw.choice((0, 1, 2, MAX_SUBMAPS - 1)))
         id_of = RECORD_TYPES[known.kind].ID
         number = known.id
         if id_of is IdOf.AGENT:
@@ -96,5 +98,5 @@ class KeyedSender:
         elif id_of is IdOf.SUBMAP:
             number = int(submap)
         elif id_of is IdOf.KEYFRAME:
-            number = int(keyframe_id(submap, draw.choice((0, 1, 2, draw.randrange(1 << 20)))))
+            number = int(keyframe_id(submap, draw.choice((0, 1, 2, draw.randrange(MAX_KEYFRAMES)))))
         return Key(known.kind if draw.random() < 0.98 else draw.randrange(64), number, draw.choice((0, 0, 1, 255)))

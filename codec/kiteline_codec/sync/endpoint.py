@@ -261,6 +261,8 @@ class Endpoint:
                 self._out.predictors_changed()
 
     def _refuse(self, reason: str) -> list[Update]:
+        if reason not in self._reasons and len(self._reasons) >= 64:  # texts name numbers that the peer chose
+            reason = "other reasons"
         self._reasons[reason] = self._reasons.get(reason, 0) + 1
         return []
 

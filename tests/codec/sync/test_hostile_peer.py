@@ -219,3 +219,16 @@ def test_cameras_whose_numbers_overflow_are_refused(change: dict[str, float]) ->
     record = CameraIntrinsics(AgentId(3), replace(CAMERA, **change))  # type: ignore[arg-type]
     with pytest.raises(WireError):
         messages.decode(messages.key(record), messages.encode(record))
+
+
+def test_reasons_of_refusals_are_bounded() -> None:
+    """Their texts name numbers that the peer chose."""
+    end, sender = Endpoint(PLAIN, 1, coder=ResidualCoder()), Sender()
+    for kind in range(1, 63):
+        for part in (0, 1, 70_000 % 65_536):
+            item = Item(Key(kind, 1, part), 1, 9, 0, bytes([kind]) * 9, residual=True)
+            end.receive(sender.packet([item]), 0)
+    for number in range(200):
+        end._refuse(f"found the number {number}")
+    assert len(end.stats.reasons) <= 65
+    assert dict(end.stats.reasons)["other reasons"] >= 100
