@@ -209,6 +209,7 @@ class DisparityConfig:
     points: int = 120  # most of them that are used
     sigma_px: float = 0.3  # px at octave 0; of aligned coordinates and disparities
     inflation: float = 2.0  # of variance: templates and lens errors are common to neighbouring points
+    usual_square: float = 0.45  # mean squared error above which a pair counts less before an offset is applied
     iterations: int = 3  # Gauss-Newton steps; two converge from a scale that is off by a tenth
     growth: float = 1.2  # of the parallax between two pairs of the same keyframe
     known_px: float = 0.1  # px; by which each number changes between two flights: mounts and temperature

@@ -145,6 +145,18 @@ def test_the_offset_of_a_worn_rig_is_found_and_corrects_the_map(seed: int) -> No
 
 
 @pytest.mark.parametrize("seed", range(4))
+def test_people_in_a_third_of_the_view_are_no_offset(seed: int) -> None:
+    """A third of the landmarks walk at the middle of the view while the first pairs of a true rig are compared."""
+    flight = Flight(NOTHING, seed, SIDEWAYS)
+    across, still = flight.xyz[:, 0] / flight.xyz[:, 2], flight.xyz.copy()
+    walks = np.abs(across - np.median(across)) < np.quantile(np.abs(across - np.median(across)), 0.35)
+    for k, frame in enumerate(flight.frames(12)):
+        assert flight.alignment.add(*frame) is None
+        flight.xyz = still + walks[:, None] * np.array([0.01 * (k + 2), 0.0, 0.0])
+    assert not flight.map.disparity_offset.any()
+
+
+@pytest.mark.parametrize("seed", range(4))
 def test_a_true_rig_is_left_alone(seed: int) -> None:
     flight = Flight(NOTHING, seed, SIDEWAYS)
     begin = np.trace(flight.alignment.expected_cov)

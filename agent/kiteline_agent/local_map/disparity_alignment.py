@@ -43,7 +43,11 @@ class DisparityAlignment:
         self._pair_h, self._pair_b = np.zeros((slots, TERMS, TERMS)), np.zeros((slots, TERMS))
         self._evicted_h, self._evicted_b, self._evicted_moved = np.zeros((TERMS, TERMS)), np.zeros(TERMS), np.zeros(3)
         self._earlier_h, self._earlier_b = np.zeros((TERMS, TERMS)), np.zeros(TERMS)
+        # Share of a pair's information that counts before an offset is applied; and what counted of those evicted.
+        self._share = np.ones(slots)
+        self._evicted_sure_h, self._evicted_sure_b = np.zeros((TERMS, TERMS)), np.zeros(TERMS)
         self._refuted = False  # earlier flights were of another rig; the map still has their offset
+        self._good = np.eye(TERMS) / config.good_px**2
         self._prior = np.diag(np.array([config.prior_px, *[config.prior_slope_px] * (TERMS - 1)]) ** -2.0)
         x, y = np.meshgrid(np.linspace(0.0, camera.width, 7), np.linspace(0.0, camera.height, 5))
         self._grid = terms(np.stack([(x.ravel() - camera.cx) / camera.fx, (y.ravel() - camera.cy) / camera.fy], 1))
@@ -135,6 +139,8 @@ class DisparityAlignment:
         """A new keyframe took this slot: keep the information of the one before, which was evicted."""
         self._evicted_h += self._pair_h[slot]
         self._evicted_b += self._pair_b[slot]
+        self._evicted_sure_h += self._share[slot] * self._pair_h[slot]
+        self._evicted_sure_b += self._share[slot] * self._pair_b[slot]
         self._evicted_moved += self._moved[slot]
         self._pair_h[slot], self._pair_b[slot], self._moved[slot] = 0.0, 0.0, 0.0
         self._keyframe[slot], self._parallax[slot], self._score[slot] = self._map.keyframe[slot], 0.0, 0.0
@@ -191,6 +197,7 @@ class DisparityAlignment:
         if not np.isfinite(score) or (self._score[slot] != 0.0 and score <= self._score[slot]):
             return False
         self._score[slot], self._pair_h[slot], self._pair_b[slot] = score, information, side
+        self._share[slot] = max(square, 1.0) / max(square / config.usual_square, 1.0)
         self._moved[slot] = (T[:3, :3].T @ T[:3, 3]) ** 2
         return True
 
@@ -199,7 +206,7 @@ class DisparityAlignment:
 
         What earlier flights found is dropped if the flight is likelier without it: the rig was repaired.
         """
-        config, good = self._config, np.eye(TERMS) / self._config.good_px**2
+        config, good = self._config, self._good
         h, b = self._evicted_h + self._pair_h.sum(0), self._evicted_b + self._pair_b.sum(0)
         log_odds = self._prior_log_odds
         if self._earlier_h.any() and self._moves_sideways():
@@ -216,6 +223,15 @@ class DisparityAlignment:
         self._log_odds = float(log_odds)
         self.worn = _probability(self._log_odds)
         self._set_rig_worn()
+
+    def _is_sure(self) -> bool:
+        """True if the rig is worn though pairs tell less whose landmarks fit badly: some may be on people who walk."""
+        if self.worn < self._config.sure:
+            return False
+        h = self._evicted_sure_h + np.einsum("s,sij->ij", self._share, self._pair_h) + self._earlier_h
+        b = self._evicted_sure_b + self._share @ self._pair_b + self._earlier_b
+        odds = self._prior_log_odds + _log_evidence(h, b, self._prior) - _log_evidence(h, b, self._good)
+        return _probability(odds) >= self._config.sure
 
     def _set_rig_worn(self) -> None:
         self.rig_worn = _probability(self._log_odds + self._row_evidence)
@@ -243,7 +259,7 @@ class DisparityAlignment:
         config, offset = self._config, self._estimate
         if not self._moves_sideways() and not self._rows_are_worn():
             return None
-        if not self.applied and self.worn < config.sure:
+        if not self.applied and not self._is_sure():
             if not self._refuted:
                 return None
             offset = none()
