@@ -71,7 +71,7 @@ class CorrectionJobs:
 
     @property
     def bundled_sizes(self) -> dict[SubmapId, int]:
-        """Number of keyframes of each map when its full bundle was last scheduled."""
+        """Size of each map when its full bundle was last scheduled."""
         return self._schedule.bundled
 
     def restore(self, graphs: Collection[SubmapId], bundles: Collection[SubmapId]) -> None:
@@ -161,9 +161,13 @@ class CorrectionJobs:
         return FullBundle(bundle.map_id, replace(window, problem=problem), agents)
 
     def _sizes(self) -> dict[SubmapId, int]:
-        """Number of keyframes of each map that one bundle can hold."""
-        out: dict[SubmapId, int] = {}
+        """Keyframes and keypoints that have arrived of each map, if it has enough keyframes and one bundle holds it."""
+        counts: dict[SubmapId, int] = {}
+        sizes: dict[SubmapId, int] = {}
+        filled, rows = self._map.keyframes.filled, self._map.rows
         for submap, keyframes in self._map.submaps.items():
             map_id = self._map.map_id(submap)
-            out[map_id] = out.get(map_id, 0) + len(keyframes)
-        return {map_id: size for map_id, size in out.items() if size <= self._config.graph.max_full}
+            counts[map_id] = counts.get(map_id, 0) + len(keyframes)
+            sizes[map_id] = sizes.get(map_id, 0) + len(keyframes) + int(filled[[rows[k] for k in keyframes]].sum())
+        least, most = self._config.graph.first_full, self._config.graph.max_full
+        return {map_id: size for map_id, size in sizes.items() if least <= counts[map_id] <= most}

@@ -1,5 +1,6 @@
 """Schedules full bundles: a map is bundled as a whole when it has grown and the worker has time.
 
+Over a thin link a keyframe's observations arrive seconds after its header: a map has grown when they do.
 Local bundles see a window only, and disparity offsets are observable in whole maps only. The last full bundle of a
 quiet base includes all keyframes, so that the map does not depend on when it is read.
 """
@@ -13,7 +14,7 @@ from kiteline_core.ids import SubmapId
 
 
 class FullBundleSchedule:
-    """Chooses the next map. The size of a map is its number of keyframes."""
+    """Chooses the next map. The size of a map is the number of its keyframes and keypoints that have arrived."""
 
     def __init__(self, config: GraphConfig) -> None:
         self._config = config
@@ -31,7 +32,7 @@ class FullBundleSchedule:
 
     def waiting(self, sizes: Mapping[SubmapId, int]) -> list[SubmapId]:
         """Maps whose size has changed since their last full bundle."""
-        return [m for m in sorted(sizes) if sizes[m] >= self._config.first_full and sizes[m] != self.bundled.get(m, 0)]
+        return [m for m in sorted(sizes) if sizes[m] != self.bundled.get(m, 0)]
 
     def done(self, cost_ops: int, now_ns: int) -> None:
         """Let the worker rest from full bundles in proportion to the cost of the one that is done."""
