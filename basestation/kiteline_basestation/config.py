@@ -208,7 +208,7 @@ class InertialScaleConfig:
     image_m: float = 5e-4  # m; the same of near scenes
     huber: float = 2.5  # deviations; steps by images with larger errors weigh less
     bias_sigma: float = 0.3  # m/s^2; of the accelerometer's bias where a chain begins
-    bias_walk: float = 0.04  # m/s^2 per sqrt(s); its slow errors: axes, vibration, temperature
+    bias_walk: float = 0.03  # m/s^2 per sqrt(s); its slow errors: axes, vibration, temperature, as true poses show them
     agent_sigma: float = 0.03  # of the agent's scale
     hold: float = 0.5  # deviations; a smaller change would only move the world under the vehicle
 
