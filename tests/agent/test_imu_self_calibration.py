@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from kiteline_agent.inertial.calibration.gyro_calibration import GyroCalibration
 from kiteline_agent.inertial.calibration.known_imu import KnownImuConfig
 from kiteline_agent.inertial.calibration.self_calibration import SelfCalibration, SelfCalibrationConfig
 from kiteline_agent.inertial.calibration.window import Window
@@ -186,6 +187,14 @@ def test_the_report_names_what_was_found() -> None:
     turned = se3.so3_exp(np.array([4e-3, -3e-3, 2e-3]))
     found = calibrated(flight(25.0, 0, turned, turned)).report()
     np.testing.assert_allclose(found["camera_rotation_deg"], np.degrees([4e-3, -3e-3, 2e-3]), atol=0.1)
+
+
+def test_one_window_that_speaks_against_the_gyro_does_not_correct_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    measured = iter([0.0, 27.7, 17.7, 26.0, 9.0, *[0.0] * 1000])
+    monkeypatch.setattr(GyroCalibration, "significance", lambda self: next(measured))
+    assert not calibrated(flight(8.0)).report()["gyro"]["applied"]
+    measured = iter([0.0, 27.7, 26.0, *[0.0] * 1000])
+    assert calibrated(flight(8.0)).report()["gyro"]["applied"]
 
 
 def test_axes_can_be_held() -> None:

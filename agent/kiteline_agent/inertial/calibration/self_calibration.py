@@ -40,6 +40,7 @@ class SelfCalibrationConfig:
     misalignment_sigma: float = 0.007  # rad; by which a sensing axis leans to another; data sheets give 0.5 to 1 degree
     scale_sigma: float = 0.015  # relative, of lengths by the images
     significance: float = 25.0  # squared deviations of 9 axes from a true rig, above which they are applied
+    significant_windows: int = 2  # of turns, in a row: people who walk by turn one window
     apply_s: float = 0.5  # time constant with which applied axes follow
     offset_s: float = 0.0  # camera stamp + offset = IMU time, if a calibration gives it
     offset_sigma_s: float = 0.02  # cameras without a trigger line
@@ -80,6 +81,7 @@ class SelfCalibration:
         self._unsteady = 1.0  # factor on the variance of poses by images, since the last window of moves
         self.offset_s = config.offset_s  # applied: camera stamp + offset = IMU time
         self._gyro_matrix, self._accel_matrix = np.eye(3), np.eye(3)  # applied to samples
+        self._gyro_windows = 0  # in a row after which the gyro's axes differed significantly
         self._corrects_offset = self._corrects_gyro = self._corrects_accel = False
         self.camera_rotation_rad = 0.0  # against the gyro, rms as expected
         self._events: list[str] = []
@@ -103,6 +105,7 @@ class SelfCalibration:
                 offset_s, float(np.hypot(offset_sigma_s, config.kept_offset_sigma_s)),
             )  # fmt: skip
             self._follow_offset(np.inf)
+            self._gyro_windows = config.significant_windows  # they were, in flight
             self._test_gyro()
         if known.accel:
             sigma = np.hypot(known.accel_sigma, config.kept_axes_sigma)
@@ -215,7 +218,8 @@ class SelfCalibration:
         """Correct the gyro's samples from now on if its axes differ significantly from those of a true rig."""
         config = self._config
         self.camera_rotation_rad = _rotation_rad(self.gyro.matrix, self.gyro.axes_cov, config.misalignment_sigma)
-        if config.apply_axes and not self._corrects_gyro and self.gyro.significance() > config.significance:
+        self._gyro_windows = self._gyro_windows + 1 if self.gyro.significance() > config.significance else 0
+        if config.apply_axes and not self._corrects_gyro and self._gyro_windows >= config.significant_windows:
             self._corrects_gyro = True
             self._events.append(_event("gyro", self.gyro.matrix))
 
