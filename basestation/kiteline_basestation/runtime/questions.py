@@ -5,8 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import time
-from collections.abc import Sequence
-from pathlib import Path
+from collections.abc import Callable, Sequence
 
 from kiteline_basestation.management import READING, Answer, Command
 from kiteline_basestation.runtime.options import BaseOptions
@@ -16,7 +15,6 @@ from kiteline_hw.links.sealing import is_loopback
 from kiteline_hw.links.zenoh_link import ZenohHub
 from kiteline_hw.links.zenoh_queries import QueryServer
 from kiteline_hw.ports import LinkHub
-from kiteline_hw.system.key_store import read_file
 
 _MEND = (
     "this base takes {what} only with the right to change maps: `kiteline maps --key FILE`, with the file of its keys "
@@ -29,8 +27,10 @@ class Questions:
     them a change needs a signature, and reading does too, except on a --maps endpoint of this machine.
     """
 
-    def __init__(self, options: BaseOptions, hub: LinkHub, stack: contextlib.ExitStack) -> None:
-        """Raises LinkError."""
+    def __init__(
+        self, options: BaseOptions, hub: LinkHub, stack: contextlib.ExitStack, maps_key: Callable[[], bytes | None]
+    ) -> None:
+        """maps_key: that of the right to change maps, now. Raises LinkError."""
         self._server: QueryServer | None = None
         if options.maps:
             self._server = QueryServer("maps", endpoint=options.maps.removeprefix("zenoh:"))
@@ -38,7 +38,7 @@ class Questions:
             self._server = QueryServer("maps", session=hub.session)
         if self._server is not None:
             stack.callback(self._server.close)
-        self._guard = QuestionGuard(read_file(Path(options.key)).maps) if options.key else None
+        self._guard = QuestionGuard(maps_key) if options.key else None
         self._reading_free = bool(options.maps) and is_loopback(f"zenoh:{options.maps.removeprefix('zenoh:')}")
 
     def commands(self) -> list[Command]:

@@ -11,7 +11,7 @@ from kiteline_hw.links.kinds import link_traits
 from kiteline_hw.links.sealed_link import SealedHub, WatchedHub
 from kiteline_hw.links.zenoh_link import ZenohHub
 from kiteline_hw.ports import LinkError, LinkHub
-from kiteline_hw.system.key_store import read_keys
+from kiteline_hw.system.key_store import WatchedKeys
 
 _LOOK_NS = 1_000_000_000  # between two looks at the file of keys
 
@@ -22,15 +22,14 @@ class BaseSeals:
     def __init__(self, options: BaseOptions, link: LinkHub) -> None:
         """Raises LinkError."""
         self._options, self._link = options, link
-        self._path = Path(options.key) if options.key else None
-        self._keys = {} if self._path is None else read_keys(self._path)
-        self._written_ns = self._time_of_keys()
+        self._file = WatchedKeys(Path(options.key)) if options.key else None
+        self._keys = {} if self._file is None else dict(self._file.held.agents)
         self._looked_ns = 0
         self._doubles: frozenset[int] = frozenset()
-        self._opener = None if self._path is None else Opener(self._keys, Direction.UP)
+        self._opener = None if self._file is None else Opener(self._keys, Direction.UP)
         self.sealers: dict[int, Sealer] = {}  # by agent
         self._watch = SealWatch(Direction.DOWN, self._opener)
-        self._sealed = None if self._path is None else SealedHub(link, self._sealer, self._watch)
+        self._sealed = None if self._file is None else SealedHub(link, self._sealer, self._watch)
         self.hub: LinkHub = WatchedHub(link, self._watch) if self._sealed is None else self._sealed
 
     def lines(self, now_ns: int) -> list[str]:
@@ -53,25 +52,25 @@ class BaseSeals:
             self.sealers[agent] = Sealer(self._keys[agent], agent, self._options.session, Direction.DOWN, suite)
         return self.sealers.get(agent)
 
-    def _time_of_keys(self) -> int:
-        try:
-            return 0 if self._path is None else self._path.stat().st_mtime_ns
-        except OSError:
-            return 0
+    @property
+    def maps_key(self) -> bytes | None:
+        """The key of the right to change maps; None if nobody has it."""
+        return None if self._file is None else self._file.held.maps
 
     def _new_keys(self) -> list[str]:
         """Take keys that changed in the file; a file that cannot be read changes none."""
-        written_ns = self._time_of_keys()
-        if self._path is None or self._opener is None or self._sealed is None or written_ns == self._written_ns:
+        if self._file is None or self._opener is None or self._sealed is None:
             return []
-        self._written_ns = written_ns
         try:
-            keys = read_keys(self._path)
+            if not self._file.take_change():
+                return []
         except LinkError as error:
-            return [str(error)]
-        changed = sorted(agent for agent, key in keys.items() if self._keys.get(agent) != key)
-        self._keys |= keys
+            return [f"{error}; the keys before it stay valid"]
+        keys, before = self._file.held.agents, self._keys
+        self._keys = dict(keys)
+        changed = sorted(agent for agent in keys.keys() | before.keys() if keys.get(agent) != before.get(agent))
         for agent in changed:
-            self._opener.set_key(agent, keys[agent])
+            self._opener.set_key(agent, keys.get(agent))
+            self.sealers.pop(agent, None)
             self._sealed.renew(agent)
-        return [f"new key for agent {agent}" for agent in changed]
+        return [f"{'new key for' if agent in keys else 'no key any more for'} agent {agent}" for agent in changed]

@@ -235,9 +235,13 @@ class Opener:
         except InvalidTag:
             return None
 
-    def set_key(self, agent: int, key: bytes) -> None:
-        """Open an agent's packets with another key from now on."""
-        self._keys |= {(agent, s): _derived(key, s, self._direction) for s in Suite}
+    def set_key(self, agent: int, key: bytes | None) -> None:
+        """Open an agent's packets with another key from now on, and none under the one before. None: it has no key."""
+        self._salted = {held: k for held, k in self._salted.items() if held[0] != agent}
+        for suite in Suite:
+            self._keys.pop((agent, suite), None)
+            if key is not None:
+                self._keys[agent, suite] = _derived(key, suite, self._direction)
         self._writers[agent] = _Writer(-1)
 
     def _refuse(self, why: str, agent: int) -> None:

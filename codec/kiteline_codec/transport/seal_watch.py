@@ -15,6 +15,7 @@ from kiteline_codec.transport.seal import EARLIER_BOOT, Direction, Opener
 _MAGIC = b"\0kiteline"
 _REPLY_EVERY = 32  # refused packets for one notice
 _SURE = 3  # refused packets in a row before it is said: one may be damaged
+_WELL = 500  # sound packets in a row after which a trouble is over, and is said anew if it comes again
 
 
 class Trouble(IntEnum):
@@ -85,6 +86,7 @@ class SealWatch:
         self._at_base = side == Direction.DOWN
         self._opener = opener
         self._refused: dict[int, int] = {}  # in a row, by agent
+        self._sound: dict[int, int] = {}  # the same of packets that opened
         self._said: set[tuple[int, str]] = set()
         self._lines: list[str] = []
 
@@ -92,6 +94,7 @@ class SealWatch:
         """Open a packet of an agent's link: its agent and content, or None; and a notice to be sent back, or None."""
         told = read_notice(packet)
         if told is not None:
+            self._sound[agent] = 0
             self._say(agent, (_TOLD_AT_BASE if self._at_base else _TOLD_AT_AGENT)[told])
             return None, None
         trouble: Trouble | None
@@ -104,11 +107,14 @@ class SealWatch:
             opened = self._opener.open(packet)
             if opened is not None:
                 self._refused.pop(opened[0], None)
-                self._said = {said for said in self._said if said[0] != opened[0]}
+                sound = self._sound[opened[0]] = self._sound.get(opened[0], 0) + 1
+                if sound == _WELL:  # not at once: a stranger's packets among sound ones would fill the terminal
+                    self._said = {said for said in self._said if said[0] != opened[0]}
                 return opened, None
             trouble = self._trouble(packet)
         if trouble is None:
             return None, None
+        self._sound[agent] = 0
         count = self._refused[agent] = self._refused.get(agent, 0) + 1
         if count >= _SURE or trouble is Trouble.UNSEALED:
             self._say(agent, (_AT_BASE if self._at_base else _AT_AGENT)[trouble])

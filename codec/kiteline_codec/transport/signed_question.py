@@ -9,6 +9,7 @@ from __future__ import annotations
 import hmac
 import json
 from collections import OrderedDict
+from collections.abc import Callable
 from hashlib import blake2b
 from typing import Any
 
@@ -49,8 +50,8 @@ def _tag(key: bytes, verb: str, text: str, t_s: int, nonce: str) -> str:
 class QuestionGuard:
     """Lets questions pass that are signed with the key."""
 
-    def __init__(self, key: bytes | None) -> None:
-        """key: None if nobody has the right."""
+    def __init__(self, key: Callable[[], bytes | None]) -> None:
+        """key: that of the right, now; None if nobody has it."""
         self._key = key
         self._taken: OrderedDict[str, int] = OrderedDict()  # nonces, and when they may be forgotten
 
@@ -62,10 +63,15 @@ class QuestionGuard:
         question, t_s, nonce, tag = (given.get(name) for name in ("signed", "t_s", "nonce", "tag"))
         if not (isinstance(question, str) and isinstance(nonce, str) and isinstance(tag, str) and type(t_s) is int):
             raise WireError("a signed question has a text, a time, a nonce and a tag")
-        if self._key is None or not hmac.compare_digest(
-            _tag(self._key, verb, question, t_s, nonce).encode(), tag.encode(errors="replace")
-        ):  # fmt: skip
-            raise WireError("the question is signed with another key than this base's for maps")
+        key = self._key()
+        if key is None:
+            raise WireError("nobody has the right to change this base's maps: `kiteline keys new maps` there gives it")
+        expected = _tag(key, verb, question, t_s, nonce)
+        if not hmac.compare_digest(expected.encode(), tag.encode(errors="replace")):
+            raise WireError(
+                "the question is signed with another key than this base's for maps: `kiteline maps --key FILE`, with "
+                "the file of its keys"
+            )
         while self._taken and next(iter(self._taken.values())) < now_s:
             self._taken.popitem(last=False)
         if abs(now_s - t_s) > _NEAR_S:

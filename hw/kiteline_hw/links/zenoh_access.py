@@ -21,6 +21,7 @@ _TO_CLIENTS = (
     (("declare_liveliness_subscriber", "liveliness_query"), ("*/alive", "*/alive/*")),
     (("declare_queryable", "reply"), ("maps/*",)),
 )
+_MOST_INSTANCES = 16  # that are remembered: strangers may announce any number
 _TOGETHER_S = 2.2  # s: longer than Zenoh remembers a process that died (the lease of a session)
 
 
@@ -49,9 +50,9 @@ class Instances:
 
     def note(self, name: str, *, here: bool) -> None:
         """Note that a process came or went."""
-        if here:
+        if here and (name in self._since_s or len(self._since_s) < _MOST_INSTANCES):
             self._since_s.setdefault(name, time.monotonic())
-        else:
+        elif not here:
             self._since_s.pop(name, None)
 
     @property

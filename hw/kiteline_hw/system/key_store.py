@@ -6,6 +6,7 @@ letters and digits (Crockford's base 32), for a person to type on the agent; key
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
 import secrets
@@ -52,7 +53,10 @@ def read_file(path: Path) -> Keys:
         text = path.read_text(encoding="ascii")
         mode = path.stat().st_mode
     except (OSError, UnicodeDecodeError) as error:
-        raise LinkError(f"cannot read keys from {path}: {error}; `kiteline keys new` makes one") from error
+        raise LinkError(
+            f"cannot read keys from {path}: {getattr(error, 'strerror', None) or error}; `kiteline keys --file {path} "
+            "pair N` makes the file"
+        ) from error
     if mode & (stat.S_IRWXG | stat.S_IRWXO):
         raise LinkError(f"keys in {path} may be read by others (mode {mode & 0o777:o}): chmod 600 {path}")
     keys = Keys()
@@ -77,6 +81,36 @@ def read_file(path: Path) -> Keys:
             ) from None
         keys.agents[agent] = key
     return keys
+
+
+class WatchedKeys:
+    """A file of keys that may change while it is used. Raises LinkError.
+
+    held: what it held when it could last be read.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._stamp = self._stamp_now()  # before it is read: what changes meanwhile is read again
+        self.held = read_file(path)
+
+    def take_change(self) -> bool:
+        """Read the file if it was changed, or given to another owner or mode; whether it was. Raises LinkError, once a
+        change.
+        """
+        stamp = self._stamp_now()
+        if stamp == self._stamp:
+            return False
+        self._stamp = stamp
+        self.held = read_file(self._path)
+        return True
+
+    def _stamp_now(self) -> tuple[int, int, int] | None:
+        try:
+            status = self._path.stat()
+        except OSError:
+            return None
+        return status.st_ino, status.st_mtime_ns, status.st_ctime_ns
 
 
 def first_keys(path: Path) -> bool:
@@ -139,7 +173,10 @@ def _store(path: Path, agent: int, key: bytes, keys: Keys) -> bytes:
 
 
 def _write(path: Path, keys: Keys) -> None:
-    """Replace the file atomically; it never exists with another mode or half written. Raises LinkError."""
+    """Replace the file atomically; it never exists with another mode or half written, and keeps its owner.
+
+    Raises LinkError.
+    """
     lines = [f"{agent} {keys.agents[agent].hex()}\n" for agent in sorted(keys.agents)]
     if keys.maps is not None:
         lines.append(f"{MAPS} {keys.maps.hex()}\n")
@@ -151,7 +188,16 @@ def _write(path: Path, keys: Keys) -> None:
         with os.fdopen(fd, "w", encoding="ascii") as out:
             out.write(_HEAD + "".join(lines))
             out.flush()
+            _keep_owner(path, fd)
             os.fsync(out.fileno())
         os.replace(new, path)
     except OSError as error:
         raise LinkError(f"cannot write keys to {path}: {error.strerror or error}; name another file") from error
+
+
+def _keep_owner(path: Path, fd: int) -> None:
+    """Give a new file the owner of the one that it replaces: root may change the keys of a service's user."""
+    with contextlib.suppress(FileNotFoundError):
+        old, new = path.stat(), os.fstat(fd)
+        if (old.st_uid, old.st_gid) != (new.st_uid, new.st_gid):
+            os.fchown(fd, old.st_uid, old.st_gid)

@@ -141,6 +141,19 @@ def test_a_raised_boot_goes_on_and_lower_ones_are_ignored(suite: Suite) -> None:
     assert theirs.boots == {3: 900}
 
 
+@SUITES
+def test_after_a_change_of_keys_nothing_under_the_old_one_goes_through(suite: Suite) -> None:
+    old, theirs = sealer(suite), opener()
+    recorded = old.seal(b"1")
+    assert theirs.open(recorded) is not None
+    theirs.set_key(3, OTHER)
+    assert theirs.open(recorded) is None and theirs.open(old.seal(b"2")) is None
+    new = sealer(suite, key=OTHER)
+    assert theirs.open(new.seal(b"3")) == (3, b"3")
+    theirs.set_key(3, None)
+    assert theirs.open(new.seal(b"4")) is None
+
+
 def test_encrypted_packets_tell_nothing() -> None:
     assert b"secret" not in sealer(Suite.ENCRYPTED).seal(b"secret" * 5)
 

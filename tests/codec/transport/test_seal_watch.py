@@ -90,6 +90,18 @@ def test_few_answers_go_to_a_flood() -> None:
     assert 0 < sum(a is not None for a in answers) < 100
 
 
+def test_a_stranger_among_sound_packets_is_said_once_and_a_trouble_that_comes_again_is_said_again() -> None:
+    agent, base = End(Direction.UP, OURS), End(Direction.DOWN, OURS)
+    for _ in range(300):
+        assert base.watch.take(AGENT, agent.packet())[0] is not None
+        base.watch.take(AGENT, packet())
+        base.watch.take(AGENT, notice(Trouble.OTHER_KEY))
+    assert len(base.watch.lines()) == 2
+    exchange(agent, base, 1000)
+    base.watch.take(AGENT, packet())
+    assert len(base.watch.lines()) == 1
+
+
 def test_damaged_packets_reach_the_endpoint_that_counts_them() -> None:
     base = End(Direction.DOWN, None)
     damaged = bytearray(packet())
@@ -113,7 +125,7 @@ def test_a_key_can_be_changed_while_packets_arrive() -> None:
 
 
 def test_questions_need_the_key_and_are_taken_once() -> None:
-    guard = QuestionGuard(OURS)
+    guard = QuestionGuard(lambda: OURS)
     text = sign(OURS, "delete", '{"map": "0.0.0"}', 1000, "n1")
     assert guard.open("delete", text, 1010) == '{"map": "0.0.0"}'
     for verb, again, now_s in (
@@ -128,6 +140,6 @@ def test_questions_need_the_key_and_are_taken_once() -> None:
             guard.open(verb, again, now_s)
     assert guard.open("delete", '{"map": "0.0.0"}', 1000) is None
     assert guard.open("delete", "[" * 1000, 1000) is None
-    with pytest.raises(WireError):
-        QuestionGuard(None).open("delete", text, 1000)
+    with pytest.raises(WireError, match="keys new maps"):
+        QuestionGuard(lambda: None).open("delete", text, 1000)
     assert unsigned(text) == '{"map": "0.0.0"}' and unsigned("[" * 1000) == "[" * 1000

@@ -13,6 +13,7 @@ import pytest
 import zenoh
 
 from kiteline_hw.links.sealing import is_loopback, sealing_of
+from kiteline_hw.links.zenoh_access import Instances
 from kiteline_hw.links.zenoh_link import ZenohHub, ZenohLink
 from kiteline_hw.links.zenoh_session import close_session, direct, open_session
 from kiteline_hw.ports import LinkError
@@ -149,6 +150,16 @@ def test_two_agents_with_one_number_are_found_on_both_ends_within_three_seconds(
             until(lambda: hub.doubles() == {3} and one.doubled and other.doubled, 3.0)
             assert not third.doubled
         until(lambda: not hub.doubles())
+
+
+def test_names_that_strangers_announce_take_little_memory() -> None:
+    instances = Instances()
+    for i in range(1000):
+        instances.note(f"stranger {i}", here=True)
+    assert len(instances._since_s) <= 16
+    for i in range(1000):
+        instances.note(f"stranger {i}", here=False)
+    assert not instances._since_s and not instances.several
 
 
 def test_what_is_too_long_is_dropped_before_it_takes_memory(endpoint: str) -> None:

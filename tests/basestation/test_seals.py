@@ -1,0 +1,99 @@
+"""Keys of a base that change while it runs."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from kiteline_basestation.runtime.options import BaseOptions
+from kiteline_basestation.runtime.seals import BaseSeals
+from kiteline_codec.transport.seal import Direction, Sealer, Suite
+from kiteline_hw.links.ends import OneLinkHub
+from kiteline_hw.system import key_store
+from kiteline_hw.system.key_store import new_code, new_maps_key, pair, read_keys
+
+SECOND_NS = 1_000_000_000
+
+
+class Wire:
+    """A ByteLink whose incoming packets are handed in."""
+
+    def __init__(self) -> None:
+        self.inbox: list[bytes] = []
+
+    def send(self, packet: bytes) -> bool:
+        return True
+
+    def receive(self) -> list[bytes]:
+        packets, self.inbox = self.inbox, []
+        return packets
+
+    def close(self) -> None:
+        self.inbox = []
+
+
+class Base:
+    """Seals of a base that serves agent 3 with a file of keys."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.wire, self.now_ns = path, Wire(), 0
+        options = BaseOptions(folder="", key=str(path), link="zenoh:tcp/127.0.0.1:1", session=7)
+        self.seals = BaseSeals(options, OneLinkHub(self.wire, 3))
+
+    def agent(self) -> Sealer:
+        return Sealer(read_keys(self.path)[3], 3, 5, Direction.UP, Suite.ENCRYPTED)
+
+    def takes(self, packet: bytes) -> bool:
+        self.wire.inbox = [packet]
+        link = self.seals.hub.links().get(3)
+        return link is not None and link.receive() != []
+
+    def lines(self) -> list[str]:
+        self.now_ns += 2 * SECOND_NS
+        return self.seals.lines(self.now_ns)
+
+
+@pytest.fixture
+def base(tmp_path: Path) -> Base:
+    pair(tmp_path / "keys", 3, new_code())
+    return Base(tmp_path / "keys")
+
+
+def test_a_key_that_is_replaced_or_removed_opens_nothing_more(base: Base) -> None:
+    old = base.agent()
+    assert base.takes(old.seal(b"1"))
+    pair(base.path, 3, new_code())
+    assert base.lines() == ["new key for agent 3"]
+    assert not base.takes(old.seal(b"2"))
+    new = base.agent()
+    assert base.takes(new.seal(b"3"))
+    base.path.write_text("# none\n")
+    assert base.lines()[-1] == "no key any more for agent 3"
+    assert not base.takes(new.seal(b"4"))
+
+
+def test_a_file_that_cannot_be_read_yet_is_taken_once_it_can(base: Base) -> None:
+    pair(base.path, 3, new_code())
+    base.path.chmod(0o644)
+    assert "chmod 600" in base.lines()[0]
+    assert base.lines() == []
+    base.path.chmod(0o600)  # its content and time of writing stay
+    assert base.lines() == ["new key for agent 3"]
+    assert base.takes(base.agent().seal(b"1"))
+
+
+def test_the_right_to_change_maps_is_taken_while_the_base_runs(base: Base) -> None:
+    assert base.seals.maps_key is None
+    key = new_maps_key(base.path)
+    assert base.lines() == []
+    assert base.seals.maps_key == key
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root gives files away")
+def test_a_file_of_keys_keeps_its_owner(base: Base) -> None:
+    os.chown(base.path, 1234, 1235)
+    key_store.pair(base.path, 4, new_code())
+    status = base.path.stat()
+    assert (status.st_uid, status.st_gid, status.st_mode & 0o777) == (1234, 1235, 0o600)
