@@ -233,6 +233,45 @@ def test_a_map_notes_which_offset_each_keyframe_was_measured_with() -> None:
         assert not one.offset_measured_with(other).any()
 
 
+def test_steps_in_a_scene_without_disparities_are_taken_as_told() -> None:
+    """A changed offset leaves none of the synthetic points' disparities: all would be behind infinity."""
+    sparse_map, _ = flight(noise_px=0.0)
+    sparse_map.keypoints.inv_depth[: sparse_map.slots] *= 0.005
+    keyframes = [keyframe_id(SUBMAP, k) for k in range(KEYFRAMES)]
+    config = BaseConfig()
+    part = bundle_window(sparse_map, keyframes, config.bundle_window, config.measurement)
+    assert part is not None
+    sparse_map.disparity_offset_px[AgentId(0)] = 4.0 * OFFSET
+    far = replace(part, problem=replace(part.problem, measured=part.problem.measured * (1.0, 1.0, 0.005)))
+    linked = with_odometry_factors(sparse_map, far, config.odometry_factors)
+    added = linked.measured[len(part.slots) :]
+    assert len(added) and (added[:, 2] > 0.0).all()
+
+
+def test_offsets_of_steps_do_not_depend_on_the_order_in_which_keyframes_arrive() -> None:
+    sparse_map = SparseMap()
+    keyframes = [keyframe_id(SUBMAP, k) for k in range(6)]
+
+    def arrive(*numbers: int) -> None:
+        for k in numbers:
+            sparse_map.add_keyframe(keyframes[k], k, KeyframeId(keyframes[k] - 1) if k else NO_KEYFRAME, np.eye(4), 0)
+
+    arrive(0, 2, 3)
+    sparse_map.disparity_offset_px[AgentId(0)] = OFFSET
+    arrive(1, 5, 4)  # 1 was measured before 2
+    assert [sparse_map.offset_measured_with(k)[0] for k in keyframes] == [0.0, 0.0, 0.0, 0.0, 0.5, 0.5]
+
+
+def test_offsets_of_steps_of_a_start_with_smaller_ids_are_not_those_of_an_earlier_start() -> None:
+    sparse_map = SparseMap()
+    first, second = (keyframe_id(submap_id(0, boot, 0), 3) for boot in (7, 2))
+    sparse_map.add_keyframe(first, 0, NO_KEYFRAME, np.eye(4), 0)
+    sparse_map.disparity_offset_px[AgentId(0)] = OFFSET
+    sparse_map.add_keyframe(second, 1, NO_KEYFRAME, np.eye(4), 0)
+    assert not sparse_map.offset_measured_with(first).any()
+    assert np.array_equal(sparse_map.offset_measured_with(second), OFFSET)
+
+
 def test_a_keyframe_without_observations_stays_tied_to_its_parent() -> None:
     """The parent is in the window though it shares no landmark, fixed, and its odometry factor with it."""
     sparse_map, _ = flight(noise_px=0.5)

@@ -28,8 +28,8 @@ from kiteline_core.ids import (
     AgentId,
     KeyframeId,
     SubmapId,
-    agent_of_keyframe,
     agent_of_submap,
+    submap_of_keyframe,
 )
 
 F32 = NDArray[np.float32]
@@ -63,7 +63,7 @@ class MapView:
         self.disparity_sigma_px: dict[AgentId, float] = {}  # its deviation, rms over the image, if the rig is worn
         self.known_offset_px: dict[AgentId, F64] = {}  # (5,) by agent: that of earlier flights, or found on board
         self.onboard_sigma_px: dict[AgentId, float] = {}  # deviation of a known offset that was found on board
-        self.measured_with_px: dict[KeyframeId, F64] = {}  # (5,) offset that motion was measured with, where it changed
+        self.measured_with_px: dict[KeyframeId, F64] = {}  # (5,) offset that motion was measured with, where it changed in a submap
         self.rows_px: dict[AgentId, F64] = {}  # (5,) by agent: how far the right image lies off its rows
         self.rows_read: set[AgentId] = set()  # agents that read the right image there
         self.moved_rows: set[int] = set()  # keyframes whose pose changed, by row, since a reader cleared it
@@ -236,12 +236,15 @@ class MapView:
         return agent in self.onboard_sigma_px and self.disparity_offset_px[agent] is self.known_offset_px[agent]
 
     def offset_measured_with(self, keyframe: KeyframeId) -> F64:
-        """Disparity offset (5,) px that an agent corrected for when it measured the motion to a keyframe."""
-        changes = sorted(self.measured_with_px)
-        before = changes[: bisect_right(changes, keyframe)]
-        if not before or agent_of_keyframe(before[-1]) != agent_of_keyframe(keyframe):
+        """Disparity offset (5,) px that an agent corrected for when it measured the motion to a keyframe.
+
+        That of the newest note up to it in its submap: ids of a later start may be smaller than those of an earlier one.
+        """
+        noted = sorted(self.measured_with_px)
+        before = bisect_right(noted, keyframe)
+        if not before or submap_of_keyframe(noted[before - 1]) != submap_of_keyframe(keyframe):
             return disparity_offset.none()
-        return self.measured_with_px[before[-1]]
+        return self.measured_with_px[noted[before - 1]]
 
     def map_id(self, submap: SubmapId) -> SubmapId:
         """The root submap of the map that a submap belongs to."""

@@ -7,7 +7,7 @@ landmark that a keypoint observes; for a fused landmark, the root landmark. Reco
 
 from __future__ import annotations
 
-from bisect import insort
+from bisect import bisect_right, insort
 
 import numpy as np
 from numpy.typing import NDArray
@@ -145,8 +145,16 @@ class SparseMap(MapView):
         return row
 
     def _note_offset(self, keyframe: KeyframeId) -> None:
-        """Note the disparity offset that both sides know as a keyframe arrives: its motion was measured with it."""
-        offset = self.disparity_offset_px.get(agent_of_keyframe(keyframe))
+        """Note the disparity offset that both sides know as a keyframe arrives: its motion was measured with it.
+
+        One that arrives late was measured before the next one of its submap, and shares the offset of that.
+        """
+        submap = self.submaps[submap_of_keyframe(keyframe)]
+        after = submap[bisect_right(submap, keyframe) :]
+        if after:
+            offset: F64 | None = self.offset_measured_with(after[0])
+        else:
+            offset = self.disparity_offset_px.get(agent_of_keyframe(keyframe))
         if offset is not None and not np.array_equal(offset, self.offset_measured_with(keyframe)):
             self.measured_with_px[keyframe] = offset
 

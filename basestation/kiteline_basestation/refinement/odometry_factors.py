@@ -32,6 +32,7 @@ _PX_OF_ROTATION = 1.7  # factor from a rotation's error to the standard deviatio
 _MIN_RUN = 5  # rotations for an estimate of their common error
 _DEPTHS = (0.7, 1.8)  # times the median depth: near points constrain translation, far ones rotation
 _ROTATION_DEPTHS = (8.0,)  # the same for rotation alone
+_LEAST_POINTS = 4  # synthetic points of a step
 _NO_DISPARITY, _NO_GROUP = -1.0, -1
 
 
@@ -67,13 +68,12 @@ def with_odometry_factors(sparse_map: SparseMap, window: BundleWindow, config: O
             in_k, in_p, world = synthetic
             at = np.zeros((len(in_k), disparity_offset.TERMS))
             if ranged and depths is _DEPTHS:
-                at = disparity_offset.terms((in_k[:, :2] - problem.lens[k, 2:4]) / problem.lens[k, :2])
-                in_k[:, 2] += at @ (
-                    sparse_map.offset_measured_with(keyframe) - _assumed(sparse_map, agent, of_camera[k])
-                )
-                in_p[:, 2] = _NO_DISPARITY
-                seen = in_k[:, 2] > 0.0
-                in_k, in_p, world, at = in_k[seen], in_p[seen], world[seen], at[seen]
+                change_px = sparse_map.offset_measured_with(keyframe) - _assumed(sparse_map, agent, of_camera[k])
+                following = _following_offset(problem.lens[k], in_k, change_px)
+                if following is not None:
+                    in_k, at, seen = following
+                    in_p, world = in_p[seen], world[seen]
+                    in_p[:, 2] = _NO_DISPARITY
             points.append(world)
             first, second = (p, k) if p < k else (k, p)
             for i in range(len(world)):
@@ -101,6 +101,20 @@ def with_odometry_factors(sparse_map: SparseMap, window: BundleWindow, config: O
         sigma=np.concatenate([problem.sigma, np.array(sigma)]),
         border=border,
     )
+
+
+def _following_offset(lens: F64, in_k: F64, change_px: F64) -> tuple[F64, F64, NDArray[np.bool_]] | None:
+    """Observations (n,3) of synthetic points whose disparities follow an offset that changed by change_px (5,).
+
+    Returns those (m,3) that still have a disparity, the terms (m,5) of the offset there, and which (n,) they are. None
+    if they are too few: steps in scenes so far away are taken as they were told.
+    """
+    at = disparity_offset.terms((in_k[:, :2] - lens[2:4]) / lens[:2])
+    disparity = in_k[:, 2] + at @ change_px
+    seen = disparity > 0.0
+    if np.count_nonzero(seen) < _LEAST_POINTS:
+        return None
+    return np.column_stack([in_k[seen, :2], disparity[seen]]), at[seen], seen
 
 
 def _groups(problem: BundleProblem) -> NDArray[np.int32]:
@@ -153,7 +167,7 @@ def _synthetic_points(
     local = np.concatenate([np.column_stack([_GRID, np.ones(len(_GRID))]) * typical * d for d in depths])
     in_parent = se3.transform(T_p_k, local)
     ahead = in_parent[:, 2] > 0.1 * typical
-    if np.count_nonzero(ahead) < 4:
+    if np.count_nonzero(ahead) < _LEAST_POINTS:
         return None
     local, in_parent = local[ahead], in_parent[ahead]
     world = se3.transform(se3.inverse(problem.T_c_m[k]), local)
