@@ -178,7 +178,8 @@ def reference(
     """Cells (size, size) with the bands of obstacles, sampled densely on the surface in each column. ranges: (n,3)."""
     out = np.zeros((size, size), np.int64)
     for i, (lower, middle, upper) in enumerate(ranges):
-        n = max(1, int(np.ceil(2.0 * (max(lower, middle, upper) * step + abs(upper - lower)))))
+        deep = abs(middle - lower) + abs(upper - middle)
+        n = max(1, int(np.ceil(2.0 * (max(lower, middle, upper) * step + deep))))
         part = (np.arange(n) + 0.5) / n
         at = np.interp(part, [0.0, 0.5, 1.0], [lower, middle, upper])
         for a, r in zip(first + (i + part) * step, at, strict=True):
@@ -189,7 +190,7 @@ def reference(
 @given(st.integers(0, 2**31))
 def test_hits_are_marked_as_in_the_reference_and_leave_no_trace(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    ranges = rng.uniform(2, 80, (30, 1)) * (1.0 + rng.uniform(0.0, 0.1) * np.array([-1.0, 0.0, 1.0]))
+    ranges = rng.uniform(2, 80, (30, 1)) * (1.0 + rng.uniform(-0.1, 0.1, (30, 3)))
     bands = rng.integers(1, 8, 30).astype(np.uint8)
     weight = rng.integers(1, 9, 30)
     first, step = float(rng.uniform(-4, 4)), 0.03
@@ -210,6 +211,18 @@ def test_hits_are_marked_as_in_the_reference_and_leave_no_trace(seed: int) -> No
     assert not pool.any()
     kernels.clear_hits(hits, cells, found)
     assert not hits.any()
+
+
+def test_a_surface_that_juts_out_within_a_column_has_no_gaps() -> None:
+    """Its edges are equally far: the samples follow the way there and back."""
+    hits, cells = np.zeros((192, 192), np.uint16), np.zeros((400, 2), np.int32)
+    ranges, bands = np.array([[70.0, 80.0, 70.0]]), np.full(1, 7, np.uint8)
+    found = kernels.mark_hits(20.0, 20.0, 0.7, 0.03, ranges, bands, np.full(1, 8), hits, cells)
+    marked = cells[:found]
+    for part in np.linspace(0.02, 0.98, 200):
+        reach, angle = np.interp(part, [0.0, 0.5, 1.0], ranges[0]), 0.7 + part * 0.03
+        place = np.floor([20.0 + reach * np.sin(angle), 20.0 + reach * np.cos(angle)])
+        assert np.abs(marked - place).max(1).min() <= 1
 
 
 @given(st.integers(0, 2**31), st.booleans())

@@ -242,7 +242,7 @@ class ScanGrid:
             self._hits = np.zeros((rows, columns), np.uint16)
         hits = self._hits[:rows, :columns]
         solid = sectors.obstacle[sectors.bands > 0]
-        samples = 2.0 * (solid.max(1) * sectors.step_rad + np.abs(solid[:, 2] - solid[:, 0])) + 2.0
+        samples = 2.0 * (solid.max(1) * sectors.step_rad + np.abs(np.diff(solid, axis=1)).sum(1)) + 2.0
         cells = np.empty((int(np.sum(samples)), 2), np.int32)
         found = kernels.mark_hits(
             sectors.x, sectors.y, sectors.first_rad, sectors.step_rad, sectors.obstacle, sectors.bands, sectors.weight,

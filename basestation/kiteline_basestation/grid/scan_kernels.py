@@ -73,7 +73,8 @@ def mark_hits(
         lower, middle, upper = range_cells[i, 0], range_cells[i, 1], range_cells[i, 2]
         if not middle < np.inf:
             continue
-        samples = max(1, int(np.ceil(2.0 * (max(lower, middle, upper) * step_rad + abs(upper - lower)))))
+        deep = abs(middle - lower) + abs(upper - middle)  # there and back, where the middle juts out
+        samples = max(1, int(np.ceil(2.0 * (max(lower, middle, upper) * step_rad + deep))))
         for k in range(samples):
             part = (k + 0.5) / samples
             reach = _between(lower, middle, upper, part)

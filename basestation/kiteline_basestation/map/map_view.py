@@ -238,7 +238,7 @@ class MapView:
     def offset_measured_with(self, keyframe: KeyframeId) -> F64:
         """Disparity offset (5,) px that an agent corrected for when it measured the motion to a keyframe.
 
-        That of the newest note up to it in its submap: ids of a later start may be smaller than those of an earlier one.
+        That of the newest note up to it in its submap: ids of a later start may be smaller than of an earlier one.
         """
         noted = sorted(self.measured_with_px)
         before = bisect_right(noted, keyframe)
