@@ -63,7 +63,9 @@ class MapView:
         self.disparity_sigma_px: dict[AgentId, float] = {}  # its deviation, rms over the image, if the rig is worn
         self.known_offset_px: dict[AgentId, F64] = {}  # (5,) by agent: that of earlier flights, or found on board
         self.onboard_sigma_px: dict[AgentId, float] = {}  # deviation of a known offset that was found on board
-        self.measured_with_px: dict[KeyframeId, F64] = {}  # (5,) offset that motion was measured with, where it changed in a submap
+        self.measured_with_px: dict[
+            KeyframeId, F64
+        ] = {}  # (5,) offset that motion was measured with, where it changed in a submap
         self.rows_px: dict[AgentId, F64] = {}  # (5,) by agent: how far the right image lies off its rows
         self.rows_read: set[AgentId] = set()  # agents that read the right image there
         self.moved_rows: set[int] = set()  # keyframes whose pose changed, by row, since a reader cleared it
