@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import multiprocessing
 import os
 import shutil
@@ -18,7 +19,7 @@ from hypothesis import strategies as st
 
 from kiteline_basestation.store.checksums import StoreError, sum_of
 from kiteline_basestation.store.saved_map import SavedMap, SavedValues, pack, unpack
-from kiteline_basestation.store.store import FILE, Batch, Store, backup, batch_of, read
+from kiteline_basestation.store.store import FILE, Batch, DiskError, Store, backup, batch_of, read
 from kiteline_codec.schema import GravityAlignment, Key, KeyframeHeader, RefinedLandmarks, WireError
 from kiteline_core.ids import SEQUENCE_BITS, AgentId, submap_id
 
@@ -169,6 +170,61 @@ def test_an_altered_value_is_left_out_named_and_kept_aside(tmp_path: Path) -> No
     assert read(tmp_path).faults == () and read(tmp_path).agents[AgentId(1)].received[Key(3, 89)] == code
     assert "altered" in (tmp_path / f"{FILE}.damaged-1.txt").read_text()
     assert (tmp_path / f"{FILE}.damaged-1").stat().st_size == len(content)
+
+
+@pytest.mark.parametrize("moves", range(4))
+def test_a_kill_while_a_damaged_store_is_written_anew_loses_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moves: int
+) -> None:
+    saved = filled(tmp_path)
+    content = (tmp_path / FILE).read_bytes()
+    code = saved.agents[AgentId(1)].received[Key(3, 89)]
+    (tmp_path / FILE).write_bytes(content.replace(code, code[:-1] + b"?"))
+    (tmp_path / f"{FILE}-wal").touch()
+    replace, left = os.replace, [moves]
+
+    def killed(old: Path, new: Path) -> None:
+        if not left[0]:
+            raise KeyboardInterrupt
+        left[0] -= 1
+        replace(old, new)
+
+    store = Store(tmp_path)
+    monkeypatch.setattr(os, "replace", killed)
+    with contextlib.suppress(KeyboardInterrupt):
+        store.load()
+    store._lock.close()
+    monkeypatch.setattr(os, "replace", replace)
+    again = Store(tmp_path)
+    loaded = again.load()
+    again.close()
+    assert Key(3, 88) in loaded.agents[AgentId(1)].received and Key(3, 89) not in loaded.agents[AgentId(1)].received
+    assert read(tmp_path).faults == () and (tmp_path / f"{FILE}.damaged-1").exists()
+    assert not list(tmp_path.glob("*.fresh"))
+
+
+def test_a_store_that_was_written_anew_and_could_not_be_opened_is_opened_later(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    saved = filled(tmp_path)
+    content = (tmp_path / FILE).read_bytes()
+    code = saved.agents[AgentId(1)].received[Key(3, 89)]
+    (tmp_path / FILE).write_bytes(content.replace(code, code[:-1] + b"?"))
+    sent_again = Batch(rows=[(1, own, 3, 89, 0, code) for own in (0, 1)])
+    store = Store(tmp_path)
+
+    def full(_: Path) -> sqlite3.Connection:
+        raise DiskError("full")
+
+    with monkeypatch.context() as disk:
+        disk.setattr("kiteline_basestation.store.store._open", full)
+        store.load()
+        with pytest.raises(DiskError):
+            store.write(sent_again)
+    store.write(sent_again)
+    store.close()
+    assert read(tmp_path) == SavedMap(saved.agents, saved.texts)
+    assert len(list(tmp_path.glob("*.damaged-?"))) == 1
 
 
 def test_rows_that_are_gone_are_missed(tmp_path: Path) -> None:

@@ -40,6 +40,7 @@ def test_overview_follows_a_flight(make_flight: Callable[..., Any]) -> None:
         done = tuple(run_job(job) for job in out.jobs)
         for _, packets in out.packets:
             agent.receive(packets, now_ns)
+    station.mapper.jobs_failed = 2
     now = take_snapshot(station, 4 * S, 0)
     shown = status(now)
     (only,) = shown["agents"]
@@ -47,7 +48,7 @@ def test_overview_follows_a_flight(make_flight: Callable[..., Any]) -> None:
     totals = {n["label"]: n["value"] for n in shown["totals"]}
     assert only["agent"] == 0 and counts["Keyframes"] == 6 and counts["Submaps"] == 1
     assert only["bytes_up"] > 10_000 and only["bytes_down"] > 0
-    assert totals["Landmarks"] == counts["Landmarks"] > 100
+    assert totals["Landmarks"] == counts["Landmarks"] > 100 and totals["Failed jobs"] == 2
     assert now.agents[0].path.shape == (6, 3)
     radius = np.linalg.norm(now.agents[0].path - now.agents[0].path.mean(axis=0), axis=1)
     np.testing.assert_allclose(radius, 1.2, atol=0.1)

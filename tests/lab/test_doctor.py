@@ -5,7 +5,9 @@ from pathlib import Path
 
 import pytest
 
+from kiteline_hw.system import key_store
 from kiteline_lab.tools import doctor
+from kiteline_lab.tools.checks import keys
 from kiteline_lab.tools.doctor import DoctorCheck, Severity
 
 
@@ -49,6 +51,20 @@ def test_the_cache_folder_must_be_writable(monkeypatch: pytest.MonkeyPatch, tmp_
     found = next(iter(doctor.check_kernel_cache()))
     assert found.severity is Severity.FAIL
     assert "NUMBA_CACHE_DIR" in found.remedy
+
+
+def test_keys_that_others_may_read_fail_with_the_mend(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
+    monkeypatch.setattr(keys, "OF_SERVICES", ())
+    (none,) = keys.check_keys()
+    assert none.severity is Severity.NOTE and "kiteline keys pair" in none.remedy
+    key_store.pair(key_store.default_path(), 3, key_store.new_code())
+    (good,) = keys.check_keys()
+    assert good.severity is Severity.OK and good.text.endswith("of agent 3")
+    key_store.default_path().chmod(0o640)
+    (bad,) = keys.check_keys()
+    assert bad.severity is Severity.FAIL and "chmod 600" in bad.text
+    assert keys.check_keys in doctor.CHECKS
 
 
 def test_serial_ports_are_found_by_pattern(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

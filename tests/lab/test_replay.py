@@ -11,6 +11,7 @@ import pytest
 from mcap.writer import CompressionType, Writer
 
 from kiteline_core.frame import Frame, OdometryBatch
+from kiteline_hw.logs.log_budget import LogBudget
 from kiteline_hw.logs.mcap_file import McapFile
 from kiteline_hw.logs.mcap_log import ODOMETER, LogReader, LogWriter
 from kiteline_hw.logs.mcap_repair import repair
@@ -156,6 +157,16 @@ def test_what_no_packet_carried_cannot_be_replayed(recording: Path, tmp_path: Pa
     fly(Options((str(recording),), tmp_path, "monolith", seconds=0.3), quiet=True)
     with pytest.raises(SourceError, match="monolith"):
         main([str(tmp_path / half / "log.mcap"), "--verify"])
+
+
+@pytest.mark.parametrize("role", ["agent", "base"])
+def test_a_later_part_of_a_log_is_no_beginning(tmp_path: Path, role: str) -> None:
+    log = LogWriter(tmp_path / "boot00007.mcap", {"role": role}, budget=LogBudget(tmp_path, "boot", 800))
+    for i in range(3):
+        log.blob("/step", i, bytes(90))
+    log.close()
+    with pytest.raises(SourceError, match="part 1 of a log: a replay begins with its first part"):
+        main([str(tmp_path / "boot00007_1.mcap"), "--verify"])
 
 
 def test_a_recording_is_no_log_of_ours(recording: Path, tmp_path: Path) -> None:

@@ -70,19 +70,34 @@ def write_new(path: Path, saved: SavedMap) -> None:
 
 def renew(path: Path, saved: SavedMap) -> Path:
     """Put a new file with a map in the place of a damaged one, which is kept. Returns where."""
-    number = 1
-    while (kept := path.with_name(f"{path.name}.damaged-{number}")).exists():
-        number += 1
-    fresh = path.with_name(path.name + ".fresh")
-    write_new(fresh, saved)
-    os.replace(path, kept)
-    for end in _BESIDE:
-        with contextlib.suppress(FileNotFoundError):
-            os.replace(path.with_name(path.name + end), kept.with_name(kept.name + end))
-    os.replace(fresh, path)
+    write_new(_fresh(path), saved)
+    kept = _exchange(path)
     with contextlib.suppress(OSError):
         kept.with_name(kept.name + ".txt").write_text("".join(f"{fault}\n" for fault in saved.faults))
     sync_folder(path.parent)
+    return kept
+
+
+def finish(path: Path) -> None:
+    """Go on with a `renew` that was cut short, if one was: its new file is whole as soon as it has its name."""
+    if _fresh(path).exists():
+        _exchange(path)
+        sync_folder(path.parent)
+
+
+def _fresh(path: Path) -> Path:
+    return path.with_name(path.name + ".fresh")
+
+
+def _exchange(path: Path) -> Path:
+    """Move a damaged file away, as far as it is there, and the new one into its place. Returns where it is kept."""
+    number = 1
+    while (kept := path.with_name(f"{path.name}.damaged-{number}")).exists():
+        number += 1
+    for end in ("", *_BESIDE):
+        with contextlib.suppress(FileNotFoundError):
+            os.replace(path.with_name(path.name + end), kept.with_name(kept.name + end))
+    os.replace(_fresh(path), path)
     return kept
 
 

@@ -83,7 +83,10 @@ class Store:
         self.path = folder / FILE
         self._lock = _take(folder)
         self._damaged: SavedMap | None = None  # what is left of a damaged file that could not be written anew yet
+        self._renewed = False  # its file was, and is not open yet
         try:
+            with _explained(self.path):
+                salvage.finish(self.path)
             self._db = _open(self.path)
         except BaseException:
             self._lock.close()
@@ -104,9 +107,11 @@ class Store:
         if self._damaged is not None:
             with _explained(self.path):
                 self._db.close()
-                salvage.renew(self.path, self._damaged)
-                self._damaged = None
+                if not self._renewed:
+                    salvage.renew(self.path, self._damaged)
+                    self._renewed = True
             self._db = _open(self.path)
+            self._damaged = None
 
     def write(self, batch: Batch) -> None:
         """Write a batch, all of it or nothing."""

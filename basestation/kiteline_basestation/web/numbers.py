@@ -35,6 +35,7 @@ TOTALS: tuple[Number[PageSnapshot], ...] = (
     Number("Loops", "", lambda page: page.counts.get("loops", 0)),
     Number("Merges", "", lambda page: page.counts.get("merges", 0)),
     Number("Mapped", "m²", mapped_m2),
+    Number("Failed jobs", "", lambda page: page.counts.get("jobs_failed", 0)),
 )
 
 # On the card of each agent.

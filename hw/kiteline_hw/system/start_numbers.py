@@ -25,7 +25,6 @@ from kiteline_core.ids import MAX_BOOTS, MAX_SUBMAPS
 NAME = "start"  # of the file
 _SLOT_BYTES = 512  # a sector: written as a whole by most disks
 _ORIGINS = 1 << 14  # orders that a file begins at
-_UNKEPT = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.EACCES, errno.EPERM)
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,8 +69,6 @@ class StartNumbers:
             with self._folder.lock():
                 return self._next(least_order)
         except OSError as error:
-            if error.errno not in _UNKEPT:
-                raise
             last = None
             with contextlib.suppress(OSError):
                 last = self._last()

@@ -75,6 +75,11 @@ def check_replayable(log: LogReader, role: str) -> None:
         raise SourceError(f"no log of an {role}: a recording is flown with `kiteline fly`, not replayed")
     if log.metadata.get("channel") == "PlainChannel":
         raise SourceError("this is a monolith's log: its agent and base exchanged no packets, so they are not in it")
+    if part := log.metadata.get("part"):
+        raise SourceError(
+            f"part {part} of a log: a replay begins with its first part, the name without _{part}, if that "
+            "was not deleted; `kiteline fly` flies the frames of any part anew"
+        )
 
 
 def agent_of_log(log: LogReader) -> Agent:

@@ -20,6 +20,7 @@ from pathlib import Path
 
 from kiteline_lab.tools.checks.check import DoctorCheck, Severity
 from kiteline_lab.tools.checks.controller import check_controller
+from kiteline_lab.tools.checks.keys import check_keys
 from kiteline_lab.tools.checks.vehicle import check_disk, check_power, check_temperature, check_time
 
 PLAIN = {  # distribution: module, for what the drone needs
@@ -223,6 +224,7 @@ CHECKS: tuple[Callable[[], Iterable[DoctorCheck]], ...] = (
     check_memory,
     check_zenoh,
     check_serial,
+    check_keys,
     check_cgroup,
     check_clock,
     check_time,

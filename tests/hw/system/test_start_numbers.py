@@ -66,6 +66,12 @@ def test_a_disk_that_takes_nothing_does_not_stop_a_start(
     assert numbers(tmp_path / "new", drawn=900).next().kept == os.strerror(number)
 
 
+def test_a_folder_that_is_none_does_not_stop_a_start(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    start = numbers(tmp_path / "file" / "agent0", drawn=900).next()
+    assert (start.order, start.boot) == (901, 900) and start.kept
+
+
 def test_a_full_disk_takes_the_next_number(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     numbers(tmp_path).next()
     size = (tmp_path / NAME).stat().st_size
