@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from kiteline_codec.schema import RECORD_TYPES, Key, Priority
 from kiteline_codec.sync.resumption import SUMMARY_KIND
@@ -13,6 +13,7 @@ from kiteline_codec.transport.packet import MAX_HEADER_BYTES, MAX_ITEM_BYTES
 _ORDERS = {kind: (int(t.PRIORITY), t.FIRST_PARTS) for kind, t in RECORD_TYPES.items()}
 _UNKNOWN_KIND = int(Priority.GRID), 1
 _REST = int(Priority.REST)
+_MOST_REASONS = 64  # texts of refusals that are counted apart: they name numbers that the peer chose
 MIN_PACKET_BYTES = MAX_HEADER_BYTES + MAX_ITEM_BYTES + 24
 
 
@@ -70,6 +71,39 @@ class SyncConfig:
     def burst_bytes(self) -> int:
         """Bytes that may leave at once: a packet, and what adds up between two frames at 10 Hz."""
         return max(self.filled_bytes + self.overhead_bytes, (self.budget_bytes or 0) // 8)
+
+
+@dataclass(slots=True)
+class Traffic:
+    """Packets of an endpoint, counted as they pass. Bytes are those on the wire, `overhead_bytes` a packet included."""
+
+    overhead_bytes: int
+    bytes_sent: int = 0
+    packets_sent: int = 0
+    bytes_received: int = 0
+    packets_received: int = 0
+    duplicates: int = 0
+    restarts: int = 0
+    mismatches: int = 0
+    reasons: dict[str, int] = field(default_factory=dict)
+
+    def sent(self, packet: bytes) -> int:
+        """Count a packet that leaves; its bytes on the wire."""
+        size = len(packet) + self.overhead_bytes
+        self.bytes_sent += size
+        self.packets_sent += 1
+        return size
+
+    def received(self, packet: bytes) -> None:
+        """Count a packet that has arrived."""
+        self.bytes_received += len(packet) + self.overhead_bytes
+        self.packets_received += 1
+
+    def refuse(self, reason: str) -> None:
+        """Count a packet, or a value in it, that was refused."""
+        if reason not in self.reasons and len(self.reasons) >= _MOST_REASONS:
+            reason = "other reasons"
+        self.reasons[reason] = self.reasons.get(reason, 0) + 1
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,7 +19,7 @@ from kiteline_codec.schema import PREDICTOR_KINDS, Key, WireError
 from kiteline_codec.sync import resumption
 from kiteline_codec.sync.agreement import OwnState, OwnValues, PeerValues
 from kiteline_codec.sync.archive import Spill
-from kiteline_codec.sync.config import MIN_PACKET_BYTES, SyncConfig, SyncStats
+from kiteline_codec.sync.config import MIN_PACKET_BYTES, SyncConfig, SyncStats, Traffic
 from kiteline_codec.sync.inbox import Claims, EarlierValues, Inbox, Update
 from kiteline_codec.sync.outbox import Known, Outbox
 from kiteline_codec.sync.round_trip import RoundTrip
@@ -75,9 +75,7 @@ class Endpoint:
         self._window = CongestionWindow(config.window_packets)
         self._throughput = Throughput()
         self.throughput_bytes_s: int | None = None  # what the link delivers; None while nothing has to wait
-        self._bytes_sent = self._packets_sent = self._bytes_received = self._packets_received = 0
-        self._duplicates = self._restarts = self._mismatches = 0
-        self._reasons: dict[str, int] = {}
+        self._traffic = Traffic(config.overhead_bytes)
 
     # ---- values
 
@@ -147,13 +145,13 @@ class Endpoint:
     @property
     def stats(self) -> SyncStats:
         """A snapshot of the numbers."""
-        reasons = tuple(sorted(self._reasons.items()))
-        out, packets = self._out, self._out.packets
+        out, packets, traffic = self._out, self._out.packets, self._traffic
+        reasons = tuple(sorted(traffic.reasons.items()))
         return SyncStats(
-            self._bytes_sent, self._packets_sent, self._bytes_received, self._packets_received, packets.lost,
-            self._duplicates, sum(n for _, n in reasons), reasons, self._round_trip.mean_ns, out.pending,
-            packets.in_flight, len(self._in), len(self._earlier.codes), self.peer_session, self._restarts,
-            self._mismatches, self.backlog_bytes, out.resident_bytes, out.archive.values, out.dropped,
+            traffic.bytes_sent, traffic.packets_sent, traffic.bytes_received, traffic.packets_received, packets.lost,
+            traffic.duplicates, sum(n for _, n in reasons), reasons, self._round_trip.mean_ns, out.pending,
+            packets.in_flight, len(self._in), len(self._earlier.codes), self.peer_session, traffic.restarts,
+            traffic.mismatches, self.backlog_bytes, out.resident_bytes, out.archive.values, out.dropped,
             self.throughput_bytes_s,
         )  # fmt: skip
 
@@ -166,8 +164,7 @@ class Endpoint:
 
     def receive(self, packet: bytes, now_ns: int) -> list[Update]:
         """Take in a packet. Returns the values that changed. Never raises: bad packets are counted."""
-        self._bytes_received += len(packet) + self.config.overhead_bytes
-        self._packets_received += 1
+        self._traffic.received(packet)
         try:
             header, items = parse(packet, self.config.max_value_bytes)
         except VersionError as e:
@@ -192,7 +189,7 @@ class Endpoint:
         if header.values is not None:
             number, watermark = header.values
             if not self._in.packets.is_new(number):
-                self._duplicates += 1
+                self._traffic.duplicates += 1
                 self._owe_answer(now_ns)
                 return updates
             try:
@@ -261,15 +258,13 @@ class Endpoint:
                 self._out.predictors_changed()
 
     def _refuse(self, reason: str) -> list[Update]:
-        if reason not in self._reasons and len(self._reasons) >= 64:  # texts name numbers that the peer chose
-            reason = "other reasons"
-        self._reasons[reason] = self._reasons.get(reason, 0) + 1
+        self._traffic.refuse(reason)
         return []
 
     def _begin_session(self, session: int) -> None:
         """Begin with a new session of the peer, which holds nothing of ours; what the last one wrote stays readable."""
         if self.peer_session is not None:
-            self._restarts += 1
+            self._traffic.restarts += 1
         self.peer_session = session
         self._earlier.keep(self.peer_values())
         self._in = Inbox(self.config.resident_inbox_bytes, self._spill)
@@ -328,7 +323,7 @@ class Endpoint:
             self._in.newest = version
             self._peer_values.found_equal(version)
         elif self._peer_values.found_different(version):
-            self._mismatches += 1
+            self._traffic.mismatches += 1
         self._owe_answer(now_ns)
 
     # ---- sending
@@ -396,7 +391,5 @@ class Endpoint:
             self._digest_sent = (out.newest, now_ns)
         self._unanswered = 0
         self._sent_ns = now_ns
-        self._budget.spend(now_ns, len(packet) + self.config.overhead_bytes)
-        self._bytes_sent += len(packet) + self.config.overhead_bytes
-        self._packets_sent += 1
+        self._budget.spend(now_ns, self._traffic.sent(packet))
         return packet
