@@ -17,6 +17,7 @@ from numba.core import caching, ir, typed_passes, types, untyped_passes
 from numba.core.codegen import JITCodeLibrary, JITCPUCodegen
 from numba.core.compiler import CompilerBase
 from numba.core.compiler_machinery import PassManager
+from numba.core.dispatcher import Dispatcher
 from numba.core.lowering import Lower
 from numba.core.targetconfig import ConfigStack
 from numba.core.types.functions import BaseFunction
@@ -95,6 +96,8 @@ _set_env = JITCPUCodegen.set_env
 _call_type = types.Dispatcher.get_call_type
 _resolve = BaseFunction.get_call_type
 _fix_index = arrayobj.fix_integer_index
+_enable_caching = Dispatcher.enable_caching
+_save_overload = caching.Cache.save_overload
 _arguments = Lower.extract_function_arguments
 _lowering = [False]  # whether the code that is being generated is a kernel's, innermost last
 
@@ -208,6 +211,25 @@ def save(self: Any, key: Any, data: Any) -> None:
         self._save_index({**overloads, key: name})
 
 
+unkept: list[str] = []  # why compiled code of this process is not in the cache, if it is not
+
+
+def enable_caching(self: Any) -> None:
+    """Keep compiled code on disk, if there is a folder that takes it; numba would refuse to make the function."""
+    try:
+        _enable_caching(self)
+    except RuntimeError as error:
+        unkept.append(str(error))
+
+
+def save_overload(self: Any, signature: Any, data: Any) -> None:
+    """Keep compiled code, if the disk takes it. It is in memory in either case: numba would not let it run."""
+    try:
+        _save_overload(self, signature, data)  # type: ignore[no-untyped-call]
+    except OSError as error:
+        unkept.append(error.strerror or str(error))
+
+
 _OTHER, _VARIABLE, _INSTRUCTION, _SEQUENCE, _MAPPING = range(5)
 _kinds: dict[type, int] = {}
 
@@ -249,6 +271,8 @@ def install() -> dict[str, Any]:
         (Lower, "extract_function_arguments", borrowed_arguments),
         (ir.Inst, "_rec_list_vars", variables_in),
         (caching.IndexDataCacheFile, "save", save),
+        (caching.Cache, "save_overload", save_overload),
+        (Dispatcher, "enable_caching", enable_caching),
     ):
         setattr(owner, name, value)
     llvmlite.binding.ffi.lib._lock._cblist.clear()  # events of each call of LLVM, to which nothing listens

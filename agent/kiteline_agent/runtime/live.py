@@ -70,7 +70,8 @@ def fly_live(
             options = _numbered(options, start)
             if start.kept:
                 process.print_lines([f"the number of this start is drawn, as it cannot be kept: {start.kept}"])
-        runtime = AgentRuntime(options, source, channel_with_spill(options), whole_process=True)
+        with starting():  # it compiles what could not be kept
+            runtime = AgentRuntime(options, source, channel_with_spill(options), whole_process=True)
         stack.callback(runtime.close)
         clock = MonotonicClock()
         controller = controller_link(options, source, clock, stack)

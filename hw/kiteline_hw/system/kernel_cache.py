@@ -6,30 +6,38 @@ The compiler keeps 200 MiB that its process never returns, so it must not run in
 from __future__ import annotations
 
 import contextlib
+import errno
 import hashlib
 import os
 import platform
+import shutil
 import subprocess
 import sys
+import tempfile
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
-from kiteline_hw.system.process import StopSignal
+from kiteline_hw.system.process import StopSignal, print_lines
 
 _KERNELS = "_kernels"  # suffix of kernel modules
 _RECORD = "kiteline-compiled"  # file that lists compiled modules, beside their kernels
 _POLL_S = 0.1  # s between two looks at the compiler
+_ROOM_BYTES = 32 << 20  # bytes that must be free: all kernels take 15 MB
 _TIMEOUT_S = 900.0  # s that a slow board may take to compile all
 
 
 def fill(modules: Sequence[str], stop: StopSignal | None = None) -> bool:
     """Run `kernel_compilation` on modules unless all loaded kernels are compiled; True if they are now.
 
-    If nothing can be written, the caller compiles in its own process. stop: ends the compilation.
+    If nothing can be written, that is said, and the caller compiles in its own process. stop: ends the compilation.
     """
     if filled():
         return True
+    if why := _no_room():
+        _say(f"compiled kernels cannot be kept ({why}): they are compiled anew, for a minute; see `kiteline doctor`")
+        return False
     with contextlib.suppress(OSError, subprocess.SubprocessError):
         compiler = subprocess.Popen(
             [sys.executable, "-m", "kiteline_hw.system.kernel_compilation", *modules],
@@ -66,8 +74,33 @@ def filled() -> bool:
         return False
 
 
-def mark() -> None:
-    """Record that the kernels of all loaded modules are compiled."""
+def _no_room() -> str:
+    """Why the folders of compiled kernels do not take them; "" if they do."""
+    try:
+        folders = _needed()
+        for folder in folders:
+            folder.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=folder):
+                pass
+            if shutil.disk_usage(folder).free < _ROOM_BYTES:
+                return f"{folder}: {os.strerror(errno.ENOSPC)}"
+    except OSError as error:
+        return f"{error.filename}: {error.strerror}"
+    return "" if folders else "no folder can be written"
+
+
+@cache
+def _say(line: str) -> None:
+    """Print a line, once."""
+    print_lines([line])
+
+
+def mark() -> bool:
+    """Record that the kernels of all loaded modules are compiled. False if this process could not keep them all."""
+    from kiteline_core import kernel_compiler
+
+    if kernel_compiler.unkept:
+        return False
     with contextlib.suppress(OSError, ValueError):
         for folder, lines in _needed().items():
             folder.mkdir(parents=True, exist_ok=True)
@@ -76,6 +109,7 @@ def mark() -> None:
             new = folder / f"{_RECORD}.{os.getpid()}"
             new.write_text("\n".join(sorted(lines | others)) + "\n")
             os.replace(new, folder / _RECORD)
+    return True
 
 
 def folder_of(module: Any) -> Path | None:

@@ -42,7 +42,8 @@ def main(arguments: list[str]) -> None:
         share_out(by_module(lines), processes(len(os.sched_getaffinity(0)), ComputerReader().read()))
         for module in modules:
             module.warm()
-        kernel_cache.mark()
+        if not kernel_cache.mark():
+            sys.exit(1)
 
 
 def processes(cores: int, computer: Computer) -> int:

@@ -7,6 +7,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numba
+import pytest
+
+from kiteline_core.kernel_compiler import TRIED
+
 KERNELS = """
 from numba import njit
 
@@ -40,3 +45,43 @@ def test_a_child_process_compiles_each_source_once(tmp_path: Path) -> None:
     assert fly(tmp_path, "no_such_module") == ["True", "True", "0"]
     (tmp_path / "tiny_kernels.py").write_text(KERNELS + "\nOTHER = 1\n")
     assert fly(tmp_path, "no_such_module") == ["False", "False", "1"]
+
+
+FULL = """
+import errno, os, shutil, sys
+import numba.core.caching as caching
+from kiteline_core.jit import njit
+import tiny_kernels
+from kiteline_hw.system import kernel_cache
+
+def full(*_):
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+if sys.argv[1] == "full":
+    shutil.disk_usage = lambda _: shutil._ntuple_diskusage(1, 1, 0)
+    caching._CacheLocator.ensure_cache_path = full
+print(kernel_cache.fill(["no_such_module"]), tiny_kernels.twice(4), kernel_cache.mark(), kernel_cache.filled())
+"""
+
+
+@pytest.mark.parametrize("disk", ["full", "none"])
+def test_a_disk_that_takes_no_kernels_does_not_keep_them_from_running(tmp_path: Path, disk: str) -> None:
+    if not numba.__version__.startswith(TRIED):
+        pytest.skip("numba does as it does")
+    source = "from kiteline_core.jit import njit\n\n@njit\ndef twice(x):\n    return 2 * x\n"
+    if disk == "none":  # no folder at all: neither the named one, nor one beside the source, nor the user's
+        source = (
+            "import numba.core.caching as c\nfor one in c.CacheImpl._locator_classes:\n"
+            "    one.from_function = classmethod(lambda *_: None)\n" + source
+        )
+    (tmp_path / "tiny_kernels.py").write_text(source)
+    environment = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path]),
+        "NUMBA_CACHE_DIR": str(tmp_path / "cache"),
+    }
+    done = subprocess.run(
+        [sys.executable, "-c", FULL, disk], env=environment, capture_output=True, text=True, check=False
+    )
+    assert (done.stdout.split(), done.returncode) == (["False", "8", "False", "False"], 0), done.stderr
+    assert done.stderr.count("compiled kernels cannot be kept") == 1
