@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import fields, replace
 from pathlib import Path
 
+import numpy as np
+
 from kiteline_agent.agent import Agent
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.exchange.no_base import NoBaseChannel
@@ -13,8 +15,9 @@ from kiteline_agent.governor.governor import CARRIED, governed
 from kiteline_agent.governor.virtual_cpu import VirtualCpu
 from kiteline_agent.step import Identity, StepInput
 from kiteline_core.frame import Frame
-from kiteline_core.ids import AgentId
+from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId
 from kiteline_hw.sources.open import open_source
+from kiteline_hw.system.vocabulary import shipped_vocabulary
 
 
 def costs_of(path: Path, config: AgentConfig, frames: int = 12) -> tuple[list[int], list[Work], list[bool]]:
@@ -46,6 +49,23 @@ def test_a_flight_costs_what_was_counted(recording: Path) -> None:
     assert usual and all(work.alignments > 100 and work.stereo_points > 20 for work in usual)
     assert all(work.detected_px == 0 for work in usual)
     assert costs[0] > max(cost for cost, work in zip(costs[1:], works[1:]) if not work.keyframes)
+
+
+def test_the_first_search_counts_the_keyframes_that_it_enters(recording: Path) -> None:
+    source = open_source(str(recording))
+    agent = Agent(source.rig, None, AgentConfig(), Identity(AgentId(0), 0), NoBaseChannel(), shipped_vocabulary())
+    relocaliser = agent._relocaliser
+    for frame in [item for item in source if isinstance(item, Frame)][:12]:
+        agent.step(StepInput(frame), frame.t_ns)
+    held = np.count_nonzero(agent.map.keyframe != NO_KEYFRAME)
+    for entered in (held, 0):
+        agent.work.clear()
+        relocaliser._enter_keyframes()
+        assert agent.work.places == entered
+    slots = len(agent.map.keyframe)
+    for k in range(5 * slots):  # a long flight without a search: evicted keyframes do not wait
+        relocaliser.add_keyframe(KeyframeId(1_000 + k))
+        assert len(relocaliser._waiting) <= 2 * slots
 
 
 def test_less_effort_is_counted_as_less(recording: Path) -> None:

@@ -44,8 +44,8 @@ class Crowd:
             more[2][rows * 7919 % 20 < OF_TWENTY] += (SHIFT_PX, 0.0)
 
 
-def fly(flight: RoomFlight, crowd: Crowd) -> list[F64]:
-    """Poses T_o_b."""
+def fly(flight: RoomFlight, crowd: Crowd, alignments: list[int] | None = None) -> list[F64]:
+    """Poses T_o_b. alignments: counted in each frame, out."""
     agent = Agent(flight.rig, flight.imu, AgentConfig(), Identity(AgentId(0), 0), NoBaseChannel())
     out, begin_ns = [], 0
     for k, frame in enumerate(flight.frames[:FRAMES]):
@@ -56,6 +56,8 @@ def fly(flight: RoomFlight, crowd: Crowd) -> list[F64]:
         estimate = agent.step(step, frame.t_ns).estimate
         assert estimate is not None
         out.append(estimate.T_o_b)
+        if alignments is not None:
+            alignments.append(agent.work.alignments)
     return out
 
 
@@ -83,15 +85,21 @@ def test_landmarks_that_move_alike_do_not_drag_the_pose(
 def test_a_wrong_prediction_is_corrected_by_both_passes(
     room_flight: RoomFlight, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    plain = fly(room_flight, Crowd())
+    once: list[int] = []
+    both: list[int] = []
+    plain = fly(room_flight, Crowd(), once)
     real_predict, turn = MotionModel.predict, se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.02, 0.0]))  # 5 px or more
 
     def off(self: MotionModel, t_ns: int, imu: ImuBatch | None, dt_s: float) -> F64:
         return np.asarray(real_predict(self, t_ns, imu, dt_s) @ turn)
 
     monkeypatch.setattr(MotionModel, "predict", off)
-    wrong = fly(room_flight, Crowd())
+    wrong = fly(room_flight, Crowd(), both)
     assert max(float(np.linalg.norm((a - b)[:3, 3])) for a, b in zip(plain, wrong, strict=True)) < 0.005
+    align = AgentConfig().align
+    assert 0 < max(once[CROWDED[0] :]) <= align.points  # the finest level alone
+    least = (align.fine_from + 2) * min(once[CROWDED[0] :])  # that, and both levels of the fine pass again
+    assert min(both[CROWDED[0] :]) > least
 
 
 def test_a_flight_without_people_is_the_same(room_flight: RoomFlight, monkeypatch: pytest.MonkeyPatch) -> None:

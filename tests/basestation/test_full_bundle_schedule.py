@@ -76,3 +76,11 @@ def test_observations_that_arrive_long_after_their_keyframes_are_bundled() -> No
     assert not jobs.idle
     (job,) = jobs.jobs((), 11)
     assert job.kind == FULL_BUNDLE.name
+    arrived = sparse_map.keyframes.filled[: len(keyframes)].sum()
+    assert jobs._sizes() == {ONE: len(keyframes) + arrived} == {ONE: len(keyframes) * (1 + n)}
+    fewer = slice(0, n // 2)  # a part is sent again with fewer observations
+    sparse_map.put_observations(
+        keyframes[1], 0, index[fewer], uv[fewer].astype(np.float32), rho[fewer].astype(np.float32), none[fewer],
+        (keyframes[0] << 11) | np.arange(n)[fewer],
+    )  # fmt: skip
+    assert jobs._sizes() == {ONE: len(keyframes) * (1 + n) - n // 2}

@@ -93,6 +93,7 @@ class Relocaliser:
                 self._index.remove(key)
         for keyframe in waiting:
             if self._map.slot_of(keyframe) >= 0:
+                self._work.places += 1
                 self._enter(self._index, keyframe)
 
     def _enter(self, index: PlaceIndex, keyframe: KeyframeId) -> None:

@@ -48,6 +48,7 @@ class MapView:
         self.slots = 0
         self.rows: dict[KeyframeId, int] = {}
         self.submaps: dict[SubmapId, list[KeyframeId]] = {}  # keyframes by submap, in order of id
+        self.keypoints_of: dict[SubmapId, int] = {}  # number of keypoints by submap that have arrived
         self.submap_poses: dict[SubmapId, F64] = {}  # S_w_m (4,4) similarity by submap, where not the identity
         self._scales: dict[SubmapId, float] = {}  # of `submap_poses`
         self.root_submaps: dict[SubmapId, SubmapId] = {}  # merged submaps -> root submap of their map

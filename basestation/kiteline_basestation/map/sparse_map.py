@@ -336,7 +336,10 @@ class SparseMap(MapView):
         open_ = self.keyframes.culled[row] == 0 and self.keyframes.pose_source[row] != NO_POSE
         here = table.kind[mine] != EMPTY
         table.usable[mine] = here & (table.flags[mine] & REMOVED == 0) & open_
-        self.keyframes.filled[row] = np.count_nonzero(here)
+        filled = int(np.count_nonzero(here))
+        submap = submap_of_keyframe(KeyframeId(int(self.keyframes.id[row])))
+        self.keypoints_of[submap] = self.keypoints_of.get(submap, 0) + filled - int(self.keyframes.filled[row])
+        self.keyframes.filled[row] = filled
 
     def _compose(self, row: int) -> None:
         """Set a pose from the parent's, and the poses of descendants that are composed from it."""

@@ -164,10 +164,9 @@ class CorrectionJobs:
         """Keyframes and keypoints that have arrived of each map, if it has enough keyframes and one bundle holds it."""
         counts: dict[SubmapId, int] = {}
         sizes: dict[SubmapId, int] = {}
-        filled, rows = self._map.keyframes.filled, self._map.rows
         for submap, keyframes in self._map.submaps.items():
             map_id = self._map.map_id(submap)
             counts[map_id] = counts.get(map_id, 0) + len(keyframes)
-            sizes[map_id] = sizes.get(map_id, 0) + len(keyframes) + int(filled[[rows[k] for k in keyframes]].sum())
+            sizes[map_id] = sizes.get(map_id, 0) + len(keyframes) + self._map.keypoints_of.get(submap, 0)
         least, most = self._config.graph.first_full, self._config.graph.max_full
         return {map_id: size for map_id, size in sizes.items() if least <= counts[map_id] <= most}

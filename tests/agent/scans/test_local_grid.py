@@ -151,7 +151,11 @@ def test_the_grid_and_its_tiles_take_less_than_four_mib() -> None:
     grid = LocalGrid(config)
     held = [vars(grid), vars(grid._canvas), vars(grid._next)]
     arrays = [value for values in held for value in values.values() if isinstance(value, np.ndarray)]
-    scans = config.scans * sum(v.nbytes for v in (scan_at(0, 0, 0).scan.clear_m,) * 5)
+    grid.add(scan_at(0.0, 0.0, 0.0), EXACT)
+    scan, ranges = grid._scans[0].scan, grid._scans[0].ranges(EXACT, config.sigma_m)
+    assert ranges[0] is grid._scans[0].ranges(EXACT, config.sigma_m)[0]  # kept
+    each = (scan.free_from_m, scan.free_m, scan.obstacle_m, scan.bands, scan.clear_m, *ranges)
+    scans = config.scans * sum(v.nbytes for v in each)
     assert sum(a.nbytes for a in arrays) + scans + config.tiles * (64 * 64 + 200) < 4 << 20
 
 
