@@ -13,7 +13,9 @@ its IMU.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,52 +38,37 @@ _LEAST_POINTS = 4  # synthetic points of a step
 _NO_DISPARITY, _NO_GROUP = -1.0, -1
 
 
+class _Step(NamedTuple):
+    """Synthetic points of the step from keyframe p of a window to k, of deviation sigma_px.
+
+    in_k, in_p: (n,3) where both see them; terms: (n,5) of the disparity offset in k, zero where it does not count;
+    world: (n,3) positions.
+    """
+
+    k: int
+    p: int
+    in_k: F64
+    in_p: F64
+    terms: F64
+    world: F64
+    sigma_px: float
+
+
 def with_odometry_factors(sparse_map: SparseMap, window: BundleWindow, config: OdometryFactorConfig) -> BundleProblem:
     """The window's problem with odometry factors, stronger where observations are few; synthetic points last."""
     problem = window.problem
-    table = sparse_map.keyframes
-    counts = np.bincount(problem.camera, minlength=len(window.rows))
-    number = {int(table.id[row]): i for i, row in enumerate(window.rows.tolist())}
-    difference_px = _PX_OF_ROTATION * _rotation_difference_px(sparse_map, window, number, config.run)
     points, camera, measured, sigma, group, terms = [], [], [], [], [], []
     border, of_camera = problem.border, _groups(problem)
-    for k, row in enumerate(window.rows.tolist()):
-        p = number.get(int(table.parent[row]))
-        keyframe = KeyframeId(int(table.id[row]))
-        agent, submap = agent_of_keyframe(keyframe), submap_of_keyframe(keyframe)
-        if p is None or sparse_map.is_up_to_scale(submap) or not (problem.free[k] or problem.free[p]):
-            continue
-        gap_s = abs(float(table.t_ns[row] - table.t_ns[window.rows[p]])) * 1e-9
-        worn_px = config.worn_px * np.sqrt(gap_s) if agent in sparse_map.disparity_sigma_px else 0.0
-        rotation_sigma = max(config.rotation_sigma_px, worn_px, difference_px)
-        few = max(0.0, 1.0 - min(counts[k], counts[p]) / config.enough_observations)
-        point_sigma = 1.0 / np.hypot(few / max(config.sigma_px, worn_px), 1.0 / rotation_sigma)
-        ranged = sparse_map.cameras[agent].stereo or agent in sparse_map.measures_depth
-        sets = [(_DEPTHS if few > 0.0 else _ROTATION_DEPTHS, point_sigma)]
-        if not ranged:
-            sets.append((_DEPTHS, config.scale_sigma_px))
-        for depths, set_sigma in sets:
-            T_p_k = sim3.with_scaled_translation(table.T_p_k[row], sparse_map.scale(submap))
-            synthetic = _synthetic_points(sparse_map, problem, k, p, T_p_k, depths)
-            if synthetic is None:
-                continue
-            in_k, in_p, world = synthetic
-            at = np.zeros((len(in_k), disparity_offset.TERMS))
-            if ranged and depths is _DEPTHS:
-                change_px = sparse_map.offset_measured_with(keyframe) - _assumed(sparse_map, agent, of_camera[k])
-                following = _following_offset(problem.lens[k], in_k, change_px)
-                if following is not None:
-                    in_k, at, seen = following
-                    in_p, world = in_p[seen], world[seen]
-                    in_p[:, 2] = _NO_DISPARITY
-            points.append(world)
-            first, second = (p, k) if p < k else (k, p)
-            for i in range(len(world)):
-                camera += [first, second]
-                measured += [in_p[i], in_k[i]] if p < k else [in_k[i], in_p[i]]
-                sigma += [[set_sigma, set_sigma]] * 2
-                group += [_NO_GROUP, of_camera[k]] if p < k else [of_camera[k], _NO_GROUP]
-                terms += [at[i]] * 2
+    for step in _steps(sparse_map, window, config, of_camera):
+        points.append(step.world)
+        k, p = (step.k, step.in_k, of_camera[step.k]), (step.p, step.in_p, _NO_GROUP)
+        (first, in_first, of_first), (second, in_second, of_second) = (p, k) if step.p < step.k else (k, p)
+        for i in range(len(step.world)):
+            camera += [first, second]
+            measured += [in_first[i], in_second[i]]
+            sigma += [[step.sigma_px, step.sigma_px]] * 2
+            group += [of_first, of_second]
+            terms += [step.terms[i]] * 2
     if not points:
         return problem
     added = np.concatenate(points)
@@ -103,18 +90,55 @@ def with_odometry_factors(sparse_map: SparseMap, window: BundleWindow, config: O
     )
 
 
-def _following_offset(lens: F64, in_k: F64, change_px: F64) -> tuple[F64, F64, NDArray[np.bool_]] | None:
-    """Observations (n,3) of synthetic points whose disparities follow an offset that changed by change_px (5,).
+def _steps(
+    sparse_map: SparseMap, window: BundleWindow, config: OdometryFactorConfig, of_camera: NDArray[np.int32]
+) -> Iterator[_Step]:
+    """The steps between keyframes of a window. of_camera: see `_groups`."""
+    problem, table = window.problem, sparse_map.keyframes
+    counts = np.bincount(problem.camera, minlength=len(window.rows))
+    number = {int(table.id[row]): i for i, row in enumerate(window.rows.tolist())}
+    difference_px = _PX_OF_ROTATION * _rotation_difference_px(sparse_map, window, number, config.run)
+    for k, row in enumerate(window.rows.tolist()):
+        p = number.get(int(table.parent[row]))
+        keyframe = KeyframeId(int(table.id[row]))
+        agent, submap = agent_of_keyframe(keyframe), submap_of_keyframe(keyframe)
+        if p is None or sparse_map.is_up_to_scale(submap) or not (problem.free[k] or problem.free[p]):
+            continue
+        gap_s = abs(float(table.t_ns[row] - table.t_ns[window.rows[p]])) * 1e-9
+        worn_px = config.worn_px * np.sqrt(gap_s) if agent in sparse_map.disparity_sigma_px else 0.0
+        rotation_sigma = max(config.rotation_sigma_px, worn_px, difference_px)
+        few = max(0.0, 1.0 - min(counts[k], counts[p]) / config.enough_observations)
+        point_sigma = 1.0 / np.hypot(few / max(config.sigma_px, worn_px), 1.0 / rotation_sigma)
+        ranged = sparse_map.cameras[agent].stereo or agent in sparse_map.measures_depth
+        sets = [(_DEPTHS if few > 0.0 else _ROTATION_DEPTHS, point_sigma)]
+        if not ranged:
+            sets.append((_DEPTHS, config.scale_sigma_px))
+        T_p_k = sim3.with_scaled_translation(table.T_p_k[row], sparse_map.scale(submap))
+        for depths, sigma_px in sets:
+            synthetic = _synthetic_points(sparse_map, problem, k, p, T_p_k, depths)
+            if synthetic is None:
+                continue
+            in_k, in_p, world = synthetic
+            step = _Step(k, p, in_k, in_p, np.zeros((len(in_k), disparity_offset.TERMS)), world, sigma_px)
+            if ranged and depths is _DEPTHS:
+                change_px = sparse_map.offset_measured_with(keyframe) - _assumed(sparse_map, agent, of_camera[k])
+                step = _following_offset(problem.lens[k], step, change_px)
+            yield step
 
-    Returns those (m,3) that still have a disparity, the terms (m,5) of the offset there, and which (n,) they are. None
-    if they are too few: steps in scenes so far away are taken as they were told.
+
+def _following_offset(lens: F64, step: _Step, change_px: F64) -> _Step:
+    """A step whose disparities follow an offset that changed by change_px (5,): in k alone, where one is left.
+
+    If too few are, in scenes so far away, the step as it was told.
     """
-    at = disparity_offset.terms((in_k[:, :2] - lens[2:4]) / lens[:2])
-    disparity = in_k[:, 2] + at @ change_px
+    terms = disparity_offset.terms((step.in_k[:, :2] - lens[2:4]) / lens[:2])
+    disparity = step.in_k[:, 2] + terms @ change_px
     seen = disparity > 0.0
     if np.count_nonzero(seen) < _LEAST_POINTS:
-        return None
-    return np.column_stack([in_k[seen, :2], disparity[seen]]), at[seen], seen
+        return step
+    in_k = np.column_stack([step.in_k[seen, :2], disparity[seen]])
+    in_p = np.column_stack([step.in_p[seen, :2], np.full(len(in_k), _NO_DISPARITY)])
+    return step._replace(in_k=in_k, in_p=in_p, terms=terms[seen], world=step.world[seen])
 
 
 def _groups(problem: BundleProblem) -> NDArray[np.int32]:
