@@ -14,6 +14,7 @@ from kiteline_agent.runtime.options import (
     parser,
 )
 from kiteline_core import config as configuration
+from kiteline_core.ids import MAX_AGENTS
 from kiteline_hw.links.kinds import MAVLINK_FORMS, link_forms
 from kiteline_hw.links.sealing import sealing_of
 from kiteline_hw.ports import LinkError, SourceError
@@ -34,6 +35,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         )
     if not a.source:
         p.error("a SOURCE is required")
+    if not 0 <= a.agent < MAX_AGENTS:
+        p.error(f"--agent {a.agent}: expected 0 to {MAX_AGENTS - 1}")
     sealing = sealing_of(a.link, "agent", a.agent, a.key, insecure=a.insecure)
     a.key, a.told = sealing.key, sealing.lines
     kept = process.kept_folder(f"agent{a.agent}")

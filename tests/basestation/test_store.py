@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 
 from kiteline_basestation.store.checksums import StoreError, sum_of
 from kiteline_basestation.store.saved_map import SavedMap, SavedValues, pack, unpack
-from kiteline_basestation.store.store import FILE, Batch, DiskError, Store, backup, batch_of, read
+from kiteline_basestation.store.store import FILE, Batch, DiskError, Store, backup, batch_of, read, repair
 from kiteline_codec.schema import GravityAlignment, Key, KeyframeHeader, RefinedLandmarks, WireError
 from kiteline_core.ids import SEQUENCE_BITS, AgentId, submap_id
 
@@ -225,6 +225,15 @@ def test_a_store_that_was_written_anew_and_could_not_be_opened_is_opened_later(
     store.close()
     assert read(tmp_path) == SavedMap(saved.agents, saved.texts)
     assert len(list(tmp_path.glob("*.damaged-?"))) == 1
+
+
+def test_a_folder_without_a_store_is_not_repaired_into_an_empty_one(tmp_path: Path) -> None:
+    for folder in (tmp_path, tmp_path / "mistyped"):
+        with pytest.raises(StoreError, match="no such file"):
+            repair(folder)
+    assert not list(tmp_path.iterdir())
+    saved = filled(tmp_path)
+    assert repair(tmp_path) == repair(tmp_path / FILE) == SavedMap(saved.agents, saved.texts)
 
 
 def test_rows_that_are_gone_are_missed(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -22,6 +23,7 @@ from kiteline_basestation.merging.essential_graph import GraphInputs
 from kiteline_basestation.runtime import worker as worker_module
 from kiteline_basestation.runtime.flight_log import fingerprint
 from kiteline_basestation.runtime.worker import LockstepJobs, Worker
+from kiteline_hw.system.process import is_stopped
 from tests.basestation.feeding import feed
 
 
@@ -126,6 +128,26 @@ def test_a_stopped_worker_is_replaced(bad_jobs: None) -> None:
         assert [d.result for d in collected(worker, 1)] == ["b"]
         assert time.monotonic() - begin_s < 3.0
         assert "was stopped" in worker.notes[0]
+    finally:
+        worker.close()
+
+
+def test_a_large_job_does_not_wait_for_a_worker_that_was_stopped(bad_jobs: None) -> None:
+    worker = Worker()
+    try:
+        worker.add([Job(1, "bad", BadInputs("a"))], 0)
+        collected(worker, 1)
+        stopped = worker._process.pid or 0
+        os.kill(stopped, signal.SIGSTOP)
+        while not is_stopped(stopped):
+            time.sleep(0.01)
+        watchdog = threading.Timer(5.0, os.kill, (stopped, signal.SIGCONT))  # lest a failure hangs
+        watchdog.start()
+        begin_s = time.monotonic()
+        worker.add([Job(2, "bad", BadInputs("b" * 8_000_000))], 0)  # more than a pipe holds
+        assert time.monotonic() - begin_s < 2.0
+        watchdog.cancel()
+        assert [len(d.result) for d in collected(worker, 1)] == [8_000_000]
     finally:
         worker.close()
 

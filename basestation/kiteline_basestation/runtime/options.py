@@ -69,7 +69,7 @@ def parser(link_forms: str = "") -> argparse.ArgumentParser:
     p.add_argument("--import", dest="imports", metavar="LOG", nargs="+", default=[], action="extend",
                    help="add agents' logs, for what no link carried; or maps: a store, a base's log")  # fmt: skip
     p.add_argument("--maps", metavar="ENDPOINT", default="",
-                   help="answer `kiteline maps` here: tcp/HOST:PORT (default: on the link, if not sealed)")  # fmt: skip
+                   help="answer `kiteline maps` here: tcp/HOST:PORT (default: on an IP link)")  # fmt: skip
     p.add_argument("--web", metavar="HOST:PORT", default="", help="serve a status page")
     p.add_argument("--config", metavar="F", default="", help="a TOML file with a [base] section")
     p.add_argument("--log", metavar="DIR", default="", help="log each start to DIR; the map is left there too")

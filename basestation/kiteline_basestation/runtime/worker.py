@@ -103,8 +103,7 @@ class Worker:
         if now_s - self._looked_s >= _LOOK_S:
             self._looked_s = now_s
             if is_stopped(self._process.pid):
-                self.notes.append("the worker process was stopped; another one takes its place")
-                self._replace(now_s, is_fault=False)
+                self._replace_stopped(now_s)
         return (*results, *self._taken_aside())
 
     @property
@@ -146,11 +145,18 @@ class Worker:
 
     def _start_next(self) -> None:
         if self._ready and self._running is None and self._queue:
+            if is_stopped(self._process.pid):  # it would not read the job, and sending it would wait
+                self._replace_stopped(time.monotonic())
+                return
             self._running = self._queue.popleft()
             try:
                 self._pipe.send(self._running)
             except OSError:
                 self._replace(time.monotonic())
+
+    def _replace_stopped(self, now_s: float) -> None:
+        self.notes.append("the worker process was stopped; another one takes its place")
+        self._replace(now_s, is_fault=False)
 
     def _replace(self, now_s: float, *, is_fault: bool = True) -> None:
         """End the process and start another: at once, or later if it did nothing between two deaths."""

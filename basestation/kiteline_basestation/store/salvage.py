@@ -70,7 +70,7 @@ def write_new(path: Path, saved: SavedMap) -> None:
 
 def renew(path: Path, saved: SavedMap) -> Path:
     """Put a new file with a map in the place of a damaged one, which is kept. Returns where."""
-    write_new(_fresh(path), saved)
+    write_new(fresh(path), saved)
     kept = _exchange(path)
     with contextlib.suppress(OSError):
         kept.with_name(kept.name + ".txt").write_text("".join(f"{fault}\n" for fault in saved.faults))
@@ -80,12 +80,13 @@ def renew(path: Path, saved: SavedMap) -> Path:
 
 def finish(path: Path) -> None:
     """Go on with a `renew` that was cut short, if one was: its new file is whole as soon as it has its name."""
-    if _fresh(path).exists():
+    if fresh(path).exists():
         _exchange(path)
         sync_folder(path.parent)
 
 
-def _fresh(path: Path) -> Path:
+def fresh(path: Path) -> Path:
+    """The file that is to take the place of a damaged one."""
     return path.with_name(path.name + ".fresh")
 
 
@@ -97,7 +98,7 @@ def _exchange(path: Path) -> Path:
     for end in ("", *_BESIDE):
         with contextlib.suppress(FileNotFoundError):
             os.replace(path.with_name(path.name + end), kept.with_name(kept.name + end))
-    os.replace(_fresh(path), path)
+    os.replace(fresh(path), path)
     return kept
 
 

@@ -176,7 +176,10 @@ def backup(path: Path, out: Path) -> SavedMap:
 
 
 def repair(folder: Path) -> SavedMap:
-    """Write a store with faults anew, from what is sound. Returns what it holds, with its faults."""
+    """Write a store with faults anew, from what is sound. Returns what it holds, with its faults. Raises StoreError."""
+    folder = folder if folder.is_dir() else folder.parent
+    if not any((folder / name).exists() for name in (FILE, salvage.fresh(folder / FILE).name)):
+        raise StoreError(f"{folder / FILE}: no such file; expected what `kiteline base --store DIR` keeps in DIR")
     store = Store(folder)
     try:
         saved = store.load()

@@ -39,7 +39,7 @@ class Keys:
 
 def default_path() -> Path:
     """The default path of the key file."""
-    return Path(os.environ.get("XDG_CONFIG_HOME", "~/.config")).expanduser() / "kiteline" / "keys"
+    return Path(os.environ.get("XDG_CONFIG_HOME") or "~/.config").expanduser() / "kiteline" / "keys"
 
 
 def read_keys(path: Path) -> dict[int, bytes]:

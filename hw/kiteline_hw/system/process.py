@@ -145,7 +145,7 @@ def state_folder() -> Path:
     of_service = os.environ.get("STATE_DIRECTORY", "").split(":")[0]
     if of_service:
         return Path(of_service)
-    return Path(os.environ.get("XDG_STATE_HOME", "~/.local/state")).expanduser() / "kiteline"
+    return Path(os.environ.get("XDG_STATE_HOME") or "~/.local/state").expanduser() / "kiteline"
 
 
 def print_lines(lines: Iterable[str]) -> None:

@@ -18,6 +18,7 @@ from kiteline_hw.links.zenoh_link import ZenohHub, ZenohLink
 from kiteline_hw.links.zenoh_session import close_session, direct, open_session
 from kiteline_hw.ports import LinkError
 from kiteline_hw.system.key_store import default_path, first_keys, new_code, new_maps_key, pair, read_file, read_keys
+from kiteline_hw.system.process import state_folder
 
 NETWORK, LOOPBACK = "zenoh:tcp/0.0.0.0:7447", "zenoh:tcp/127.0.0.1:7447"
 
@@ -83,6 +84,14 @@ def test_a_code_makes_the_same_key_on_both_sides(tmp_path: Path) -> None:
     for wrong in ("", "abc", code + "A", code[:-1] + ("A" if code[-1] != "A" else "B"), "U" * 16):
         with pytest.raises(LinkError, match="is no pairing code"):
             pair(tmp_path / "agent", 3, wrong)
+
+
+def test_an_empty_variable_is_no_folder(monkeypatch: pytest.MonkeyPatch, home: Path) -> None:
+    monkeypatch.setenv("HOME", str(home))
+    for name in ("XDG_CONFIG_HOME", "XDG_STATE_HOME"):
+        monkeypatch.setenv(name, "")
+    assert default_path() == home / ".config/kiteline/keys"
+    assert state_folder() == home / ".local/state/kiteline"
 
 
 def test_the_right_to_change_maps_is_kept_beside_the_keys(tmp_path: Path) -> None:
