@@ -15,6 +15,7 @@ from kiteline_basestation.intake.intake import IntakeState
 from kiteline_basestation.intake.placements import PlacementState
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.merging.map_merger import MergerState
+from kiteline_core.geometry.disparity_offset import TERMS
 from kiteline_core.ids import AgentId, KeyframeId, SubmapId
 
 F64 = NDArray[np.float64]
@@ -68,7 +69,13 @@ def map_state(sparse_map: SparseMap) -> MapState:
 
 
 def restore_map(sparse_map: SparseMap, state: MapState) -> None:
-    """Continue from a saved state, in a map whose keyframes are all there."""
+    """Continue from a saved state, in a map whose keyframes are all there.
+
+    Raises ValueError for what is no disparity offset.
+    """
+    for offset in (*state.disparity_offset_px.values(), *state.measured_with_px.values()):
+        if offset.shape != (TERMS,) or not np.isfinite(offset).all():
+            raise ValueError(f"a disparity offset is {offset.tolist()}: expected {TERMS} numbers")
     sparse_map.root_submaps.update(state.root_submaps)
     for submap, S_w_m in state.submap_poses.items():
         sparse_map.move_submap(submap, S_w_m)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from kiteline_basestation.config import BaseConfig, OdometryFactorConfig
 from kiteline_basestation.map.sparse_map import SparseMap
@@ -270,6 +271,18 @@ def test_offsets_of_steps_of_a_start_with_smaller_ids_are_not_those_of_an_earlie
     sparse_map.add_keyframe(second, 1, NO_KEYFRAME, np.eye(4), 0)
     assert not sparse_map.offset_measured_with(first).any()
     assert np.array_equal(sparse_map.offset_measured_with(second), OFFSET)
+
+
+@pytest.mark.parametrize("wrong", [np.zeros(3), np.full(5, np.nan), np.zeros((5, 1))])
+def test_a_saved_state_with_what_is_no_disparity_offset_is_refused(wrong: np.ndarray) -> None:
+    """The map is left as it was; else the first bundle would fail on it."""
+    good = map_state(SparseMap())
+    noted = replace(good, measured_with_px={keyframe_id(SUBMAP, 0): wrong})
+    for state in (noted, replace(good, disparity_offset_px={AgentId(0): wrong})):
+        sparse_map = SparseMap()
+        with pytest.raises(ValueError, match="a disparity offset is"):
+            restore_map(sparse_map, state)
+        assert not sparse_map.measured_with_px and not sparse_map.disparity_offset_px
 
 
 def test_a_keyframe_without_observations_stays_tied_to_its_parent() -> None:
