@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sqlite3
 import threading
 import time
 from collections.abc import Callable
@@ -12,6 +13,7 @@ import pytest
 
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.station import Import, Station
+from kiteline_basestation.store import checksums
 from kiteline_basestation.store import keeper as keeper_module
 from kiteline_basestation.store.checksums import StoreError
 from kiteline_basestation.store.keeper import WRITE_NS, Keeper
@@ -82,3 +84,28 @@ def test_slow_disk_does_not_block_the_loop(
     flown.keeper.close(flown.station)
     assert flown.keeper.batches == 2
     assert kept_heads(tmp_path) == 12
+
+
+@pytest.mark.parametrize("left", [b"", b"header"])
+def test_a_first_start_on_a_full_disk_begins_the_store_later(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, left: bytes
+) -> None:
+    monkeypatch.setattr(keeper_module, "_RETRY_S", 0.02)
+    begin, full = checksums.make_tables, threading.Event()
+    full.set()
+
+    def make_tables(db: sqlite3.Connection) -> None:
+        if full.is_set():
+            if left:
+                db.execute("VACUUM")  # writes the first page, without tables
+            raise sqlite3.OperationalError("database or disk is full")
+        begin(db)
+
+    monkeypatch.setattr(checksums, "make_tables", make_tables)
+    keeper = Keeper(tmp_path)
+    assert keeper.load() == SavedMap()
+    full.clear()
+    station = Station(BaseConfig(), lambda agent: CodedChannel(SyncConfig(), 1))
+    keeper.begin(station, SavedMap(texts={"name": "text"}), SavedMap())
+    assert keeper.close(station)
+    assert read(tmp_path).texts["name"] == "text"

@@ -40,6 +40,10 @@ class StoreError(KitelineError):
     """A store that cannot be used. The text says what was found, what was expected and how to mend it."""
 
 
+class EmptyStoreError(StoreError):
+    """A file without tables: a disk that was full left it so."""
+
+
 def sum_of(key: Sequence[object], content: bytes) -> int:
     """The checksum of a row. key: all columns before its content."""
     named = "/".join(map(repr, key)).encode(errors="replace")
@@ -64,7 +68,7 @@ def check_tables(db: sqlite3.Connection, path: Path) -> None:
     application, version = (db.execute(f"PRAGMA {name}").fetchone()[0] for name in ("application_id", "user_version"))
     found = _schema(db)
     if not found:
-        raise StoreError(f"{path}: empty; expected a store that a base has begun")
+        raise EmptyStoreError(f"{path}: empty; expected a store that a base has begun")
     if (application, version) != (_APPLICATION, VERSION):
         what = f"version {version}" if application == _APPLICATION else "no store of a base"
         raise StoreError(

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from kiteline_basestation.exchange.map_cache_planner import is_cached_key
 from kiteline_basestation.station import Station
-from kiteline_basestation.store.checksums import StoreError
+from kiteline_basestation.store.checksums import EmptyStoreError, StoreError
 from kiteline_basestation.store.saved_map import SavedMap, SavedValues
 from kiteline_basestation.store.state_texts import StateWriter, texts_of
 from kiteline_basestation.store.store import FILE, Batch, DiskError, Store, batch_of, read, submap_of
@@ -59,7 +59,10 @@ class Keeper:
         """Read what earlier processes saved."""
         if self._store is not None:
             return self._store.load()
-        return read(self._folder) if (self._folder / FILE).exists() else SavedMap()
+        if (self._folder / FILE).exists():
+            with contextlib.suppress(EmptyStoreError):
+                return read(self._folder)
+        return SavedMap()
 
     def begin(self, station: Station, saved: SavedMap, held: SavedMap) -> None:
         """Begin with a station that was restored from `saved`, in a store that holds `held`."""
