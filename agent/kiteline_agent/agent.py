@@ -106,8 +106,9 @@ class Agent:
         self._scans = None
         if self._has_depth and config.scan.on:
             self._scans = ScanStage(
-                self._camera, self.map, maker, self._governor, channel, config.scan, config.ground, self.work
-            )
+                self._camera, self._rectifier, self.map, maker, self._governor, channel, config.scan, config.ground,
+                self.work,
+            )  # fmt: skip
         self._local_grid = LocalGrid(config.local_grid)
         self._loss = LossStage(
             self._camera, self._keyframes, self._submaps, self._relocaliser, self._governor,

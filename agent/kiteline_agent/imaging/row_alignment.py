@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_agent.imaging import row_kernels
-from kiteline_core.geometry.cameras import GRID_STEP, Rectifier
+from kiteline_core.geometry.cameras import Rectifier
 
 F64 = NDArray[np.float64]
 
@@ -175,14 +175,7 @@ class RowAlignment:
 
     def _read_at(self, rows_px: F64) -> None:
         self.applied_px = rows_px
-        self._rectifier.set_right_rows(self._on_grid(rows_px))
-
-    def _on_grid(self, rows_px: F64) -> F64:
-        """An offset (5,) at the points of a rectification grid."""
-        rows, columns = self._rectifier.grid_shape
-        pixels = np.stack(np.meshgrid(GRID_STEP * np.arange(columns), GRID_STEP * np.arange(rows)), -1)
-        offset = terms(self._normalised(pixels.reshape(-1, 2).astype(np.float64))) @ rows_px
-        return np.asarray(offset.reshape(rows, columns))
+        self._rectifier.set_right_rows(lambda uv: np.asarray(terms(self._normalised(uv)) @ rows_px))
 
     def _normalised(self, uv: F64) -> F64:
         camera = self._rectifier.camera

@@ -23,11 +23,13 @@ from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_codec.channel import RecordChannel
 from kiteline_codec.schema import KeyframeScan
 from kiteline_core.geometry import se3
+from kiteline_core.geometry.cameras import Rectifier
 from kiteline_core.ground.column_scan import ColumnScan
 from kiteline_core.ground.config import GroundConfig
 from kiteline_core.ground.disparity import DisparityStripes
 from kiteline_core.ground.ground_height import GroundHeight, Seen, Verdict, without_ground
 from kiteline_core.ground.segmentation import GroundSegmenter
+from kiteline_core.ground.wide_view import WideView
 from kiteline_core.ids import NO_KEYFRAME, KeyframeId
 
 F32 = NDArray[np.float32]
@@ -74,8 +76,8 @@ class ScanStage:
     """Chooses keyframes to scan, makes the scans, and shares them. For cameras that measure depth."""
 
     def __init__(
-        self, camera: CameraState, local_map: LocalMap, maker: KeyframeMaker, governor: Governor,
-        channel: RecordChannel, config: ScanConfig, ground: GroundConfig, work: Work,
+        self, camera: CameraState, rectifier: Rectifier, local_map: LocalMap, maker: KeyframeMaker,
+        governor: Governor, channel: RecordChannel, config: ScanConfig, ground: GroundConfig, work: Work,
     ) -> None:  # fmt: skip
         self._camera = camera
         self._map = local_map
@@ -84,7 +86,8 @@ class ScanStage:
         self._channel = channel
         self._config = config
         self._work = work
-        self._segmenter = GroundSegmenter(local_map.camera, ground)
+        self._view = WideView(rectifier, ground)
+        self._segmenter = GroundSegmenter(self._view.camera, ground)
         self._stripes = DisparityStripes(self._segmenter.camera, ground) if local_map.camera.stereo else None
         self._begun: _Begun | None = None
         self._last_T_o_c: F64 | None = None  # of the newest scan of another view
@@ -141,7 +144,7 @@ class ScanStage:
         """Match the next stripe; True if there was none left, and the disparity is whole."""
         assert self._stripes is not None
         if begun.stripe == self._stripes.stripes:
-            begun.disparity = self._stripes.finish()
+            begun.disparity = self._view.mask(self._stripes.finish())
             return True
         self._stripes.match(begun.stripe)
         self._work.matched_px += self._stripes.stripe_px
@@ -171,7 +174,9 @@ class ScanStage:
         elif images.right is None or self._stripes is None:
             return
         else:
-            self._stripes.begin(images.half(), images.right.half())
+            pair = self._view.pair(images.raw_half(), images.right.raw_half())
+            self._stripes.begin(*pair)
+            self._work.rectified_px += 2 * pair[0].size
         up = self._camera.motion.up()
         up_c = self._camera.pose.T_m_c[2, :3].copy() if up is None else up[0]  # z of a submap points up
         T_o_c, self._last_ns = self._T_o_c(), ctx.t_ns
@@ -195,7 +200,7 @@ class ScanStage:
         )  # fmt: skip
         self._work.segmented_px += disparity.size
         if not begun.repeats:
-            labels = segmenter.label_of(begun.uv)
+            labels = segmenter.label_of(self._view.at(begun.uv))
             labels = labels[:0] if self._channel.profile.thin else labels
             record = KeyframeScan(begun.keyframe, seen.scan, labels, begun.part, begun.T_k_s)
             self._take(self._ground.note(record, Seen(begun.T_o_c, *seen)))

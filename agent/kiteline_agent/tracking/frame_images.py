@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -51,11 +52,9 @@ class RightImage:
                 self._coarse = (self._rectifier.blank, *build_pyramid(half, self._levels - 1))
         return self._coarse
 
-    def half(self) -> U8:
-        """Level 1 of the rectified image alone."""
-        if self._coarse is not None:
-            return self._coarse[1]
-        return self._rectifier.half(1, self._image) if self._raw is None else self._rectifier.halved(1, self._raw[1])
+    def raw_half(self) -> U8:
+        """Level 1 of the image as it came, alone."""
+        return np.asarray(cv2.pyrDown(self._image), np.uint8) if self._raw is None else self._raw[1]
 
     def refine(
         self, left: Pyramid, left_grid: F32, uv: F64, octave: U8, sure: NDArray[np.bool_], config: StereoConfig,
@@ -115,11 +114,9 @@ class FrameImages:
         """The whole level 0, and coarser levels rectified at half size, as the right image's: for templates."""
         return self.left if self.rectifier is None else (self.left[0], *self._halves(self.rectifier))
 
-    def half(self) -> U8:
-        """The left image at level 1, rectified at half size, as the right one's: for disparities."""
-        if self.rectifier is None or self._coarse is not None:
-            return self.sampled[1] if self._coarse is None else self._coarse[0]
-        return self.rectifier.halved(0, self.sampled[1])
+    def raw_half(self) -> U8:
+        """Level 1 of the left image as it came."""
+        return self.sampled[1]
 
     def _halves(self, rectifier: Rectifier) -> Pyramid:
         """Level 1 of the raw pyramid, rectified, and its coarser levels."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,6 +21,7 @@ from kiteline_core.ground.config import GroundConfig
 from kiteline_core.ground.disparity import DisparityStripes
 from kiteline_core.ground.ground_height import GroundHeight, Seen, without_ground
 from kiteline_core.ground.segmentation import GroundSegmenter
+from kiteline_core.ground.wide_view import WideView
 from kiteline_lab.grids.files import FREE, OCCUPIED, GridFile
 
 F32 = NDArray[np.float32]
@@ -49,7 +51,8 @@ class Scanner:
         self._believed: set[int] = set()
         self._rectifier = Rectifier(rig)
         self.camera = self._rectifier.camera
-        self._segmenter = GroundSegmenter(self.camera, GroundConfig())
+        self._view = WideView(self._rectifier, GroundConfig())
+        self._segmenter = GroundSegmenter(self._view.camera, GroundConfig())
         self._stripes = DisparityStripes(self._segmenter.camera, GroundConfig())
         self._damage = damage
 
@@ -57,7 +60,8 @@ class Scanner:
         """Make the scan of a frame whose true body pose (4,4) tells which way is up."""
         assert frame.right is not None
         T_w_c = T_w_b @ self.camera.T_b_c
-        disparity = self._stripes.measure(self._rectifier.half(0, frame.left), self._rectifier.half(1, frame.right))
+        halves = (np.asarray(cv2.pyrDown(image), np.uint8) for image in (frame.left, frame.right))
+        disparity = self._view.mask(self._stripes.measure(*self._view.pair(*halves)))
         if self._damage is not None:
             disparity = self._damage(disparity)
         if self._start_z is not None and not self._made:

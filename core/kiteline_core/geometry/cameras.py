@@ -5,6 +5,7 @@ Optical frames: x right, y down, z forward. Pixel (0, 0) is the centre of the fi
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 
@@ -99,6 +100,15 @@ class RectifiedCamera:
         return self.fx * self.baseline_m
 
 
+@dataclass(frozen=True, slots=True)
+class RawSide:
+    """A raw camera of a pair that is rectified. rotation: (3,3) from it to the rectified one, whose matrix is (3,3)."""
+
+    lens: CameraModel
+    rotation: F64
+    matrix: F64
+
+
 class Rectifier:
     """Rectifies raw images. Images that are already rectified are passed through."""
 
@@ -107,7 +117,8 @@ class Rectifier:
         self._size = (left.width, left.height)
         self.readout_s = left.readout_s
         self._maps: list[tuple[NDArray[np.int16], NDArray[np.uint16]] | None] = [None, None]
-        self._right: tuple[CameraModel, F64, F64] | None = None  # lens, rotation and camera matrix for its maps
+        self.raw_sides: tuple[RawSide, ...] = ()  # left and right, of a pair that is remapped
+        self.right_rows: Callable[[F64], F64] | None = None  # see set_right_rows
         self._depth_map: NDArray[np.int16] | None = None
         self._halves: list[tuple[NDArray[np.int16], NDArray[np.uint16]] | None] = [None, None]
         self._told_right_grid: NDArray[np.float32] | None = None  # that of the calibration, once rows were set
@@ -116,8 +127,8 @@ class Rectifier:
         self.right_grid: NDArray[np.float32] | None = None
         if rig.right is None:
             if left.lens is not Lens.NONE:
-                self._maps[0] = _undistortion_maps(left, np.eye(3), left.matrix())
-                self.left_grid = _grid(left, np.eye(3), left.matrix())
+                alone = RawSide(left, np.eye(3), left.matrix())
+                self._maps[0], self.left_grid = _fixed_maps(alone), _grid(alone)
             self.camera = RectifiedCamera(
                 left.width, left.height, left.fx, left.fy, left.cx, left.cy,
                 VIRTUAL_BASELINE_M, False, rig.T_b_c.copy(),
@@ -138,9 +149,9 @@ class Rectifier:
             )
             return
         r_left, r_right, new = _stereo_rotations(rig)
-        self._maps[0] = _undistortion_maps(left, r_left, new)
-        self._right = (rig.right, r_right, new)
-        self.left_grid, self.right_grid = _grid(left, r_left, new), _grid(rig.right, r_right, new)
+        self.raw_sides = sides = RawSide(left, r_left, new), RawSide(rig.right, r_right, new)
+        self._maps[0] = _fixed_maps(sides[0])
+        self.left_grid, self.right_grid = _grid(sides[0]), _grid(sides[1])
         # r_left rotates points of the raw left camera into the rectified one.
         t_b_c = rig.T_b_c @ se3.from_rt(r_left.T, np.zeros(3))
         self.camera = RectifiedCamera(
@@ -160,23 +171,21 @@ class Rectifier:
         """True if images must be remapped."""
         return self._maps[0] is not None
 
-    @property
-    def grid_shape(self) -> tuple[int, int]:
-        """Rows and columns of a grid of raw pixels."""
-        return (self._size[1] + GRID_STEP - 1) // GRID_STEP + 1, (self._size[0] + GRID_STEP - 1) // GRID_STEP + 1
+    def set_right_rows(self, offset_px: Callable[[F64], F64]) -> None:
+        """Read the right image lower than its calibration says, where points are read singly.
 
-    def set_right_rows(self, offset_px: F64) -> None:
-        """Read the right image so much lower (`grid_shape`) than its calibration says, where points are read singly.
-
-        Level 1 of its pyramid follows if images are remapped at all; a whole right image does not.
+        offset_px: by how much (n,) at pixels (n,2) of the rectified image. Level 1 of its pyramid follows if images are
+        remapped at all; a whole right image does not.
         """
+        self.right_rows = offset_px
+        columns, rows = ((side + GRID_STEP - 1) // GRID_STEP + 1 for side in self._size)
+        x, y = np.meshgrid(GRID_STEP * np.arange(columns), GRID_STEP * np.arange(rows))
+        pixels = np.stack([x, y], -1)
         if self._told_right_grid is None:
-            rows, columns = self.grid_shape
-            x, y = np.meshgrid(GRID_STEP * np.arange(columns), GRID_STEP * np.arange(rows))
-            plain = np.stack([x, y], -1).astype(np.float32)
-            self._told_right_grid = plain if self.right_grid is None else self.right_grid
+            self._told_right_grid = pixels.astype(np.float32) if self.right_grid is None else self.right_grid
         told = self._told_right_grid.astype(np.float64)
-        lower = np.gradient(told, float(GRID_STEP), axis=0) * offset_px[:, :, None]
+        offset = offset_px(pixels.reshape(-1, 2).astype(np.float64)).reshape(rows, columns, 1)
+        lower = np.gradient(told, float(GRID_STEP), axis=0) * offset
         self.right_grid = np.ascontiguousarray(told + lower, np.float32)
         if self.remaps:
             fixed = cv2.convertMaps(*_level_maps(self.right_grid, self._size, 1), cv2.CV_16SC2)
@@ -198,11 +207,6 @@ class Rectifier:
         if maps is None:
             return image
         return np.asarray(cv2.remap(image, maps[0], maps[1], cv2.INTER_LINEAR), np.uint8)
-
-    def half(self, side: int, image: U8) -> U8:
-        """Rectify level 1 of the pyramid, ((h+1)//2, (w+1)//2), from the full raw image."""
-        self.check_size(image)
-        return self.halved(side, np.asarray(cv2.pyrDown(image), np.uint8))
 
     def halved(self, side: int, small: U8) -> U8:
         """Rectify level 1 of a raw image's pyramid, ((h+1)//2, (w+1)//2)."""
@@ -249,8 +253,8 @@ class Rectifier:
 
     def _full_maps(self, side: int) -> tuple[NDArray[np.int16], NDArray[np.uint16]] | None:
         """Maps of a full image. Those of the right image are kept only once `rectify` needs them."""
-        if self._maps[side] is None and side == 1 and self._right is not None:
-            return _undistortion_maps(*self._right)
+        if self._maps[side] is None and side == 1 and self.raw_sides:
+            return _fixed_maps(self.raw_sides[1])
         return self._maps[side]
 
 
@@ -267,20 +271,26 @@ def _is_rectified(rig: CameraRig) -> bool:
     )
 
 
-def _undistortion_maps(camera: CameraModel, rotation: F64, new: F64) -> tuple[NDArray[np.int16], NDArray[np.uint16]]:
-    size = (camera.width, camera.height)
-    d = np.array(camera.distortion, np.float64)
-    if camera.lens is Lens.EQUIDISTANT:
-        return cv2.fisheye.initUndistortRectifyMap(camera.matrix(), d, rotation, new, size, cv2.CV_16SC2)  # type: ignore[return-value]
-    return cv2.initUndistortRectifyMap(camera.matrix(), d, rotation, new, size, cv2.CV_16SC2)  # type: ignore[return-value]
+def undistortion_maps(
+    lens: CameraModel, rotation: F64, matrix: F64, size: tuple[int, int], kind: int
+) -> tuple[NDArray[np.generic], NDArray[np.generic]]:
+    """OpenCV's maps, of a kind of its own, from pixels of a camera matrix (3,3) and an image size to raw pixels."""
+    d = np.array(lens.distortion, np.float64)
+    undistort = cv2.fisheye.initUndistortRectifyMap if lens.lens is Lens.EQUIDISTANT else cv2.initUndistortRectifyMap
+    x, y = undistort(lens.matrix(), d, rotation, matrix, size, kind)
+    return np.asarray(x), np.asarray(y)
 
 
-def _grid(camera: CameraModel, rotation: F64, new: F64) -> NDArray[np.float32]:
+def _fixed_maps(raw: RawSide) -> tuple[NDArray[np.int16], NDArray[np.uint16]]:
+    size = (raw.lens.width, raw.lens.height)
+    xy, rest = undistortion_maps(raw.lens, raw.rotation, raw.matrix, size, cv2.CV_16SC2)
+    return xy.astype(np.int16, copy=False), rest.astype(np.uint16, copy=False)
+
+
+def _grid(raw: RawSide) -> NDArray[np.float32]:
     """Raw pixels (gh, gw, 2) float32 of every GRID_STEP-th rectified pixel, the far border included."""
-    size = (camera.width + GRID_STEP, camera.height + GRID_STEP)
-    d = np.array(camera.distortion, np.float64)
-    undistort = cv2.fisheye.initUndistortRectifyMap if camera.lens is Lens.EQUIDISTANT else cv2.initUndistortRectifyMap
-    x, y = undistort(camera.matrix(), d, rotation, new, size, cv2.CV_32FC1)
+    size = (raw.lens.width + GRID_STEP, raw.lens.height + GRID_STEP)
+    x, y = undistortion_maps(raw.lens, raw.rotation, raw.matrix, size, cv2.CV_32FC1)
     return np.ascontiguousarray(np.stack([x, y], axis=-1)[::GRID_STEP, ::GRID_STEP], np.float32)
 
 

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 class GroundConfig:
     """Ground segmentation and column scans. Pixels are those of the half-size image."""
 
+    wider: float = 0.085  # of the rectified width that scans see more of to both sides, where raw images hold more
+    lower: float = 0.067  # of its height by which their view lies lower: 15 to 70 px of 480 are cut off at the bottom
     disparities: int = 48  # px searched, a multiple of 16: from 0.5 m on with 0.11 m of baseline; less CPU if fewer
     block_px: int = 7  # px, side of a matched block: smaller ones are noisier, larger ones widen obstacles
     small_step: int = 1  # cost of a step of one pixel of disparity, times the block's pixels: slanted ground has many

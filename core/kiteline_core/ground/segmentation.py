@@ -96,6 +96,7 @@ class GroundSegmenter:
         """camera: rectified, of the full image."""
         self.config = config
         self.camera = view = DisparityCamera.of(camera)
+        self._last_uv = np.array([camera.width - 1.0, camera.height - 1.0])
         fx, cx, h, w = view.fx, view.cx, view.height, view.width
         self._camera, self.bf = np.array([fx, view.fy, cx, view.cy]), view.bf
         self.sigma_px = config.sigma_px if camera.stereo else config.depth_sigma * self.bf
@@ -162,8 +163,9 @@ class GroundSegmenter:
         return _REFINED * self.sigma_px
 
     def label_of(self, uv: F64) -> U8:
-        """Labels (n,) of pixels (n,2) of the full image."""
-        return np.asarray(self.labels[self.camera.at(uv)])
+        """Labels (n,) of pixels (n,2) of the full image; unknown outside of it."""
+        outside = (uv < 0.0).any(1) | (uv > self._last_uv).any(1)
+        return np.where(outside, label_kernels.UNKNOWN, self.labels[self.camera.at(uv)]).astype(np.uint8)
 
     def _find_ground(self, up_c: F64, expected: ExpectedGround | None, lowest_m: float) -> Ground | None:
         """The ground by u- and v-disparity, and by what is expected; None if too little of it is seen."""

@@ -277,3 +277,10 @@ def test_surfaces_are_refined_by_their_images() -> None:
     errors = [np.median(np.abs((s.obstacle_m * np.cos(s.azimuths_rad))[seen] - 3.0)) for s in (plain, refined)]
     assert errors[0] > 0.05
     assert errors[1] < 0.015
+
+
+def test_labels_outside_of_the_image_are_unknown() -> None:
+    segmenter, disparity = view(up(0.0, 0.0), level_ground)
+    segmenter.segment(disparity, None, up(0.0, 0.0), expected=ExpectedGround(HEIGHT_M, 0.1))
+    uv = np.array([[375.0, 460.0], [375.0, 480.5], [-3.0, 460.0], [760.0, 460.0], [375.0, -20.0]])
+    assert segmenter.label_of(uv).tolist() == [GROUND, UNKNOWN, UNKNOWN, UNKNOWN, UNKNOWN]
