@@ -34,6 +34,7 @@ from kiteline_core.ids import NO_KEYFRAME, KeyframeId
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
+U8 = NDArray[np.uint8]
 
 _MOST_PARTS = 2  # of a scan in one frame, after a gap too
 
@@ -89,6 +90,7 @@ class ScanStage:
         self._view = WideView(rectifier, ground)
         self._segmenter = GroundSegmenter(self._view.camera, ground)
         self._stripes = DisparityStripes(self._segmenter.camera, ground) if local_map.camera.stereo else None
+        self._raw: tuple[U8, U8] | None = None  # images of the scan that was begun, until they are matched
         self._begun: _Begun | None = None
         self._last_T_o_c: F64 | None = None  # of the newest scan of another view
         self._last_ns = 0  # when the newest scan was begun
@@ -146,6 +148,12 @@ class ScanStage:
         if begun.stripe == self._stripes.stripes:
             begun.disparity = self._view.mask(self._stripes.finish())
             return True
+        if begun.stripe == 0:  # not in the frame of the keyframe
+            assert self._raw is not None
+            left, right = self._view.pair(*self._raw)
+            self._work.rectified_px += 2 * left.size
+            self._stripes.begin(left, right)
+            self._raw = None
         self._stripes.match(begun.stripe)
         self._work.matched_px += self._stripes.stripe_px
         begun.stripe += 1
@@ -174,9 +182,7 @@ class ScanStage:
         elif images.right is None or self._stripes is None:
             return
         else:
-            pair = self._view.pair(images.raw_half(), images.right.raw_half())
-            self._stripes.begin(*pair)
-            self._work.rectified_px += 2 * pair[0].size
+            self._raw = images.raw_half(), images.right.raw_half()
         up = self._camera.motion.up()
         up_c = self._camera.pose.T_m_c[2, :3].copy() if up is None else up[0]  # z of a submap points up
         T_o_c, self._last_ns = self._T_o_c(), ctx.t_ns
