@@ -35,12 +35,12 @@ class WideView:
         self._rectifier = rectifier
         self._reach = config.block_px // 2 + 1  # px of a matched block beyond its middle, and of what was interpolated
         self.camera, self._corner = rectifier.camera, np.zeros(2)
-        self._maps: list[Fixed] = []  # of both eyes' half-size images; empty: nothing is remapped
+        self._maps: list[Fixed] = []  # of both eyes' half-size images; empty: those of the rectified images
         self._left_seen: Bool | None = None  # (h,w) of a disparity image: there is a raw pixel
         self._right_seen = np.zeros((0, 1), np.bool_)  # (h,1+w) the same, and a first column beyond the view
         self._rows = rectifier.right_rows  # those of the right image in its map
         self._raw_size = rectifier.camera.width, rectifier.camera.height
-        if not rectifier.camera.stereo or not rectifier.remaps:
+        if not rectifier.camera.stereo or not rectifier.remaps or not (config.wider or config.lower):
             return
         side, lower = (
             _STEP_PX * round(share * size / _STEP_PX)
@@ -62,7 +62,7 @@ class WideView:
     def pair(self, left: U8, right: U8) -> tuple[U8, U8]:
         """Half-size images (h,w) of the view, from level 1 of the raw images' pyramids."""
         if not self._maps:
-            return left, right
+            return self._rectifier.halved(0, left), self._rectifier.halved(1, right)
         if self._rows is not self._rectifier.right_rows:
             self._read_right()
         both = [

@@ -15,6 +15,7 @@ from kiteline_core.ground.config import GroundConfig
 from kiteline_core.ground.disparity import DisparityCamera
 from kiteline_core.ground.wide_view import WideView
 
+WIDE = replace(GroundConfig(), wider=0.085, lower=0.067)
 WIDTH, HEIGHT = 640, 400
 SIDE, LOWER = 56, 24  # px of the full image, by the shares of the configuration
 K1_K2 = (-0.28, 0.07)
@@ -56,7 +57,7 @@ def kept(view: WideView, disparity_px: float) -> tuple[NDArray[np.float64], NDAr
 
 def test_the_view_goes_on_where_the_rectified_images_end() -> None:
     rectifier = Rectifier(rig(camera()))
-    view = WideView(rectifier, GroundConfig())
+    view = WideView(rectifier, WIDE)
     told = rectifier.camera
     assert (view.camera.width, view.camera.height) == (WIDTH + 2 * SIDE, HEIGHT)
     assert (view.camera.cx, view.camera.cy) == (told.cx + SIDE, told.cy - LOWER)
@@ -71,14 +72,14 @@ def test_the_view_goes_on_where_the_rectified_images_end() -> None:
 
 
 def test_pixels_of_the_full_image_keep_their_rays() -> None:
-    view = WideView(Rectifier(rig(camera())), GroundConfig())
+    view = WideView(Rectifier(rig(camera())), WIDE)
     uv = np.array([[0.0, 0.0], [100.0, 300.0], [639.0, 399.0]])
     assert np.array_equal(view.at(uv), uv + [SIDE, -LOWER])
 
 
 def test_the_right_image_is_read_at_its_rows() -> None:
     rectifier = Rectifier(rig(camera()))
-    view = WideView(rectifier, GroundConfig())
+    view = WideView(rectifier, WIDE)
     halves = cv2.pyrDown(texture(1)), cv2.pyrDown(texture(2))
     before = view.pair(*halves)
     rectifier.set_right_rows(lambda uv: 4.0 + 0.005 * uv[:, 0])
@@ -89,14 +90,14 @@ def test_the_right_image_is_read_at_its_rows() -> None:
     error = np.abs(after[1][: len(told), at[1]].astype(int) - told)[8:-8, 8:-8]
     assert error.mean() < 1.0
     assert np.abs(before[1][: len(told), at[1]].astype(int) - told).mean() > 10.0
-    moved = WideView(rectifier, GroundConfig())  # a view that begins with the rows sees the same
+    moved = WideView(rectifier, WIDE)  # a view that begins with the rows sees the same
     assert np.array_equal(moved.pair(*halves)[1], after[1])
 
 
 @pytest.mark.parametrize("disparity_px", [1.0, 12.0, 40.0])
 def test_what_either_eye_did_not_see_is_masked_with_its_border(disparity_px: float) -> None:
     rectifier = Rectifier(rig(camera()))
-    view = WideView(rectifier, GroundConfig())
+    view = WideView(rectifier, WIDE)
     left, right, some = kept(view, disparity_px)
     inside = np.ones(len(left), np.bool_)
     for side, uv in zip(rectifier.raw_sides, (left, right), strict=True):
@@ -117,7 +118,7 @@ def test_a_lens_model_that_folds_back_shows_nothing_beyond() -> None:
     """A polynomial of the third degree bends rays beyond its summit back into the raw image."""
     lens = camera((-0.3, 0.0), focal=480.0)
     rectifier = Rectifier(rig(lens))
-    view = WideView(rectifier, replace(GroundConfig(), wider=0.25))
+    view = WideView(rectifier, replace(WIDE, wider=0.25))
     summit = np.sqrt(1.0 / 0.9)
     small = DisparityCamera.of(view.camera)
     u, v = np.meshgrid(np.arange(small.width), np.arange(small.height))
@@ -137,11 +138,12 @@ def test_images_that_are_rectified_or_have_depth_are_taken_as_they_are(right: bo
     beside = se3.from_rt(np.eye(3), np.array([0.1, 0.0, 0.0]))
     one = CameraRig(plain, plain, np.eye(4), beside) if right else CameraRig(camera(), None, np.eye(4), None, True)
     rectifier = Rectifier(one)
-    view = WideView(rectifier, GroundConfig())
+    view = WideView(rectifier, WIDE if right else GroundConfig())
     assert view.camera is rectifier.camera
     uv = np.array([[3.0, 5.0]])
     assert np.array_equal(view.at(uv), uv)
     disparity = np.full((100, 320), 2.0, np.float32)
     assert (view.mask(disparity) == 2.0).all()
     halves = cv2.pyrDown(texture(1)), cv2.pyrDown(texture(2))
-    assert all(a is b for a, b in zip(view.pair(*halves), halves, strict=True))
+    told = (rectifier.halved(side, half) for side, half in enumerate(halves))
+    assert all(np.array_equal(a, b) for a, b in zip(view.pair(*halves), told, strict=True))
