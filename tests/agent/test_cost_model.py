@@ -60,7 +60,7 @@ def test_the_first_search_counts_the_keyframes_that_it_enters(recording: Path) -
     held = np.count_nonzero(agent.map.keyframe != NO_KEYFRAME)
     for entered in (held, 0):
         agent.work.clear()
-        relocaliser._enter_keyframes()
+        relocaliser.enter_keyframes()
         assert agent.work.places == entered
     slots = len(agent.map.keyframe)
     for k in range(5 * slots):  # a long flight without a search: evicted keyframes do not wait

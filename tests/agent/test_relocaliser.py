@@ -156,7 +156,7 @@ def test_out_of_the_wall_at_another_place(room: Recording, words: Vocabulary, re
     assert room.error_m(flown, shown, 1) < 0.04
     young = [e.quality for e in flown.estimates if e.tracked and e.submap % MAX_SUBMAPS == 1]
     assert max(young) < AgentConfig().covariance.flagged_below, "nobody knows how it lies to where the flight began"
-    opened = next(h for h in flown.heads if h.keyframe >> 20 == flown.estimates[-1].submap)
+    opened = next(h for h in flown.heads if submap_of_keyframe(h.keyframe) == flown.estimates[-1].submap)
     assert opened.parent == NO_KEYFRAME
 
 
@@ -204,7 +204,7 @@ def test_a_full_map_gives_up_old_submaps_first_and_still_flies(room: Recording, 
     config = AgentConfig(local_map=LocalMapConfig(keyframes=6))
     shown = [*BEFORE, *WALL, *range(110, 150), *WALL, *range(58, 63)]
     flown = fly(room.rig, room.show(shown, 120.0), words, config)
-    held = {int(k) >> 20 for k in flown.agent.map.keyframe if k != NO_KEYFRAME}
+    held = {submap_of_keyframe(k) for k in flown.agent.map.keyframe if k != NO_KEYFRAME}
     assert np.count_nonzero(flown.agent.map.keyframe != NO_KEYFRAME) <= 6
     assert flown.submaps[-1] in (0, 1, 2) and flown.estimates[-1].submap in held
     assert all(e.tracked for e in flown.estimates[-3:])

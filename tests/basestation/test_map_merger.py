@@ -19,7 +19,7 @@ from kiteline_basestation.station import Station
 from kiteline_codec.channel import plain_pair
 from kiteline_codec.schema import CameraIntrinsics, Key, SubmapPlacement
 from kiteline_core.geometry import se3
-from kiteline_core.ids import submap_of_keyframe
+from kiteline_core.ids import SEQUENCE_BITS, submap_of_keyframe
 from tests.basestation.feeding import STEP_NS, feed
 
 F64 = NDArray[np.float64]
@@ -113,8 +113,8 @@ def test_submap_after_a_loss_is_merged_and_split_again(make_flight: MakeFlight, 
     output = mapper.step(MapperInput(((a.agent, ()),), (), (Command(1, "split", '{"map": "0.1.1"}'),)), 10**12)
     table, sparse_map = mapper.map.keypoints, mapper.map
     slots = np.flatnonzero(table.root[: sparse_map.slots] >= 0)
-    here = sparse_map.keyframes.id[table.row[slots]] >> 20
-    there = sparse_map.keyframes.id[table.row[table.root[slots]]] >> 20
+    here = sparse_map.keyframes.id[table.row[slots]] >> SEQUENCE_BITS
+    there = sparse_map.keyframes.id[table.row[table.root[slots]]] >> SEQUENCE_BITS
     assert np.array_equal(here, there)  # no point of one is seen from the other
     assert mapper.summary()["maps"] == 2
     young = submap_of_keyframe(b.keyframes[0])

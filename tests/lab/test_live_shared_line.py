@@ -26,6 +26,7 @@ class Listening(FlightController):
 def test_packets_for_the_base_go_through_the_controllers_connection(
     recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     monkeypatch.setattr(live, "_DRAIN_S", 0.5)  # no base will ever answer
     model = Listening("ardupilot")
     with UdpFlightController(model) as controller:
@@ -36,4 +37,4 @@ def test_packets_for_the_base_go_through_the_controllers_connection(
         live.fly_live(spec, None, stop)
     assert len(model.accepted) > 10 and not model.dropped
     assert model.packets > 3
-    assert (tmp_path / "last_pose.json").exists()
+    assert (process.kept_folder("agent0") / "last_pose.json").exists()

@@ -83,7 +83,7 @@ class Relocaliser:
                 held = set(self._map.keyframe.tolist())
                 self._waiting = [waiting for waiting in self._waiting if waiting in held]
 
-    def _enter_keyframes(self) -> None:
+    def enter_keyframes(self) -> None:
         """Enter the keyframes that wait into the place index; evicted ones leave it."""
         waiting, self._waiting = self._waiting, []
         if self._index is None or not waiting:
@@ -144,7 +144,7 @@ class Relocaliser:
         self.has_texture = seen is not None
         if seen is None:
             return None
-        self._enter_keyframes()
+        self.enter_keyframes()
         # 2. Candidates, each verified by P3P, by the tracker and against the motion.
         for keyframe in self._candidates(seen, reference, exclude):
             fit = self._pose_from(keyframe, seen, ctx.number)

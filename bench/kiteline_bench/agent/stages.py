@@ -33,7 +33,6 @@ STAGES: tuple[tuple[str, str], ...] = (
     ("kiteline_agent.imaging.stereo_kernels:search_rows", "stereo, search"),
     ("kiteline_agent.tracking.frame_images:RightImage.coarse", "right image, half"),
     ("kiteline_agent.imaging.alignment_kernels:cut_templates", "templates"),
-    ("kiteline_agent.relocalisation.relocaliser:Relocaliser.enter_keyframes", "visual words"),
     ("kiteline_codec.channel:CodedChannel.receive", "codec, in"),
     ("kiteline_codec.channel:CodedChannel.put", "codec, records"),
     ("kiteline_codec.channel:CodedChannel.poll", "codec, packets"),
