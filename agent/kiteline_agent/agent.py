@@ -180,6 +180,7 @@ class Agent:
         else:
             # 5. Fuse the pose with IMU and odometer.
             self.work.fused = int(camera.motion.tracker is not None)
+            by_images = track
             track, events = camera.fuse(ctx, track)
             if self._was_lost:
                 camera.resume_after_loss(ctx, track)
@@ -191,7 +192,8 @@ class Agent:
                 self._two_view_start.note_depths(track.depth_m[track.inlier])
             if self._inertial_start is not None:
                 self._inertial_start.clear()
-            self._depth.update_landmarks(ctx, track)
+            # By images: what a fused pose differs by is in all pixels alike, and would move all depths together.
+            self._depth.update_landmarks(ctx, by_images)
             self._depth.search_seeds(ctx, track)
             if self.right_camera is not None:
                 events += self.right_camera.add(track)

@@ -23,6 +23,7 @@ from kiteline_agent.runtime.frame_counts import live_line, odometry_line
 from kiteline_agent.step import Estimate, Identity, StepInput
 from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_agent.tracking.frame_images import FrameImages
+from kiteline_agent.tracking.track import Track
 from kiteline_codec.channel import plain_pair
 from kiteline_codec.schema import NewLandmarks
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration
@@ -139,6 +140,29 @@ def test_bearings_find_their_true_depth() -> None:
     ratio = np.concatenate(ratios)
     assert len(ratios) >= 4 and len(ratio) > 80
     assert np.mean(np.abs(ratio / np.median(ratio) - 1.0) < 0.05) > 0.9
+
+
+def test_depths_follow_the_pose_by_images_not_the_fused_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What moves the fused pose is in the pixels of all landmarks: taken for depth it would stretch the whole map."""
+    flights = [agent(), agent()]
+    for k in range(41):
+        for one in flights:
+            step(one, frame(k))
+    alone, fused = flights
+    known = alone.map.usable.copy()
+    before = alone.map.rho[known].copy()
+    fuse = fused._camera.motion.fuse
+
+    def ahead(track: Track, t_ns: int) -> Track:
+        track = fuse(track, t_ns)
+        return replace(track, T_c_m=se3.from_rt(np.eye(3), np.array([-0.02, 0.0, 0.0])) @ track.T_c_m)
+
+    monkeypatch.setattr(fused._camera.motion, "fuse", ahead)
+    a, b = (step(one, frame(41)) for one in flights)
+    assert a.T_m_b is not None and b.T_m_b is not None
+    assert np.linalg.norm(a.T_m_b[:3, 3] - b.T_m_b[:3, 3]) == pytest.approx(0.02, abs=1e-9)
+    np.testing.assert_array_equal(alone.map.rho[known], fused.map.rho[known])
+    assert (alone.map.rho[known] != before).any()
 
 
 def test_points_too_far_for_stereo_get_their_depth_from_motion() -> None:
