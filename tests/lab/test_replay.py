@@ -161,9 +161,9 @@ def test_what_no_packet_carried_cannot_be_replayed(recording: Path, tmp_path: Pa
 
 @pytest.mark.parametrize("role", ["agent", "base"])
 def test_a_later_part_of_a_log_is_no_beginning(tmp_path: Path, role: str) -> None:
-    log = LogWriter(tmp_path / "boot00007.mcap", {"role": role}, budget=LogBudget(tmp_path, "boot", 800))
+    log = LogWriter(tmp_path / "boot00007.mcap", {"role": role}, budget=LogBudget(tmp_path, "boot", 80_000))
     for i in range(3):
-        log.blob("/step", i, bytes(90))
+        log.blob("/step", i, bytes(9_000))
     log.close()
     with pytest.raises(SourceError, match="part 1 of a log: a replay begins with its first part"):
         main([str(tmp_path / "boot00007_1.mcap"), "--verify"])
