@@ -33,9 +33,9 @@ $(STAMP): pyproject.toml | $(BIN)/python
 demo: $(STAMP) ## simulate a flight, fly it over a real link, judge the result
 	@$(BIN)/python -m kiteline_lab.demo
 
-test: $(STAMP) ## run the tests: three at a time, as some only wait, then those that need the machine to themselves
+test: $(STAMP) ## run the tests: four at a time, as some only wait, then those that need the machine to themselves
 	@$(BIN)/kiteline doctor --warm >/dev/null
-	$(BIN)/python -m pytest -q -n 3 --dist loadfile --no-loadscope-reorder -m "not alone"
+	$(BIN)/python -m pytest -q -n 4 --dist loadfile --no-loadscope-reorder -m "not alone"
 	$(BIN)/python -m pytest -q -m alone
 
 check: lint types contracts test ## everything that a change must pass
