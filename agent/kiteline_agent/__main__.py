@@ -12,6 +12,7 @@ from kiteline_agent.runtime.options import (
     AgentOptions,
     options_of,
     parser,
+    unused_by_filter,
 )
 from kiteline_core import config as configuration
 from kiteline_core.ids import MAX_AGENTS
@@ -37,6 +38,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         p.error("a SOURCE is required")
     if not 0 <= a.agent < MAX_AGENTS:
         p.error(f"--agent {a.agent}: expected 0 to {MAX_AGENTS - 1}")
+    if unused := unused_by_filter(a):
+        p.error(f"--tracker ekf uses no {' and no '.join(unused)}: leave them out, or fly --tracker map")
     sealing = sealing_of(a.link, "agent", a.agent, a.key, insecure=a.insecure)
     a.key, a.told = sealing.key, sealing.lines
     kept = process.kept_folder(f"agent{a.agent}")

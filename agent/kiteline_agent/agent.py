@@ -238,7 +238,8 @@ class Agent:
         """Track from the predicted pose, then retry if most landmarks were missed; None if the pose is not credible."""
         config = ctx.config.pose
         by_imu = self._camera.motion.running and not self._was_lost
-        track = self._tracker.track_by_imu(ctx) if by_imu else self._tracker.track(ctx, ctx.T_c_m)
+        near = self._tracker.track_by_imu(ctx) if by_imu else None
+        track = self._tracker.track(ctx, ctx.T_c_m) if near is None else near
         if not track.holds(config):
             track = self._retry_with_image_shift(ctx, track)
         if not track.holds(config) and track.inliers >= config.min_inliers and self._governor.may(Extra.SEARCH):
@@ -248,7 +249,7 @@ class Agent:
             ctx, track.T_c_m, submap, relocalised=False
         ):
             return None
-        return self._tracker.nearer(ctx, track) if by_imu else track
+        return self._tracker.nearer(ctx, track) if by_imu and near is None else track
 
     def _retry_with_image_shift(self, ctx: FrameContext, track: Track) -> Track:
         """The better of a track and another one that starts from the rotation that the image-shift estimate gives."""
@@ -355,7 +356,7 @@ class Agent:
 
         pose: of the last frame, or predicted since. T_b_f: (4,4) vehicle (forward, right, down) in the body.
         """
-        T_w_b, bands_m = self._report.in_world(pose.T_o_b), self._full_config.ground.bands_m
+        T_w_b, bands_m = self._report.in_base_map(pose.T_o_b), self._full_config.ground.bands_m
         T_w_f = None if T_w_b is None else T_w_b @ T_b_f
         return self._local_grid.around(pose.T_o_b @ T_b_f, T_w_f, self.tiles, bands_m)
 

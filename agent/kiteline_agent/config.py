@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
 
+from kiteline_agent.ekf_config import EkfConfig
 from kiteline_agent.imaging.features import DetectorConfig
 from kiteline_agent.imaging.row_alignment import RowConfig
 from kiteline_agent.inertial.controller_imu import ControllerImuConfig
@@ -232,6 +234,7 @@ class RelocalisationConfig:
     cell_px: int = 16  # px: one corner a cell; four times as many as in a keyframe, so that its own are among them
     max_corners: int = 600  # 0.5 ms of descriptors
     min_corners: int = 60  # with fewer there is no texture in view, and a search would prove nothing
+    entered: int = 16  # keyframes that a frame's search enters into the place index, the newest first; 0.65 ms each
     candidates: int = 3  # places tried in a frame; each costs about 1 ms
     beyond: float = 0.2  # of the image width: landmarks so far beyond a keyframe's border are matched, too
     min_pnp_inliers: int = 12  # of P3P; chance matches reach 8
@@ -303,10 +306,12 @@ class SmoothingConfig:
     """How corrections reach the live pose in the world. They never move the odometry frame."""
 
     max_m_s: float = 0.03  # m/s at which the odometry frame moves in w: 3 mm a frame at 10 Hz; 0: at once
-    time_s: float = 10.0  # s in which a larger correction is done, but for the last e-th: it moves faster
+    time_s: float = 10.0  # s for all but an e-th of a correction that is larger, or whose lengths accelerations told
     max_rad_s: float = 0.0  # rad/s at which it rotates about the vehicle; 0: at once, which moves nothing
     snap_m: float = 1.0  # m: a correction that moves the vehicle farther at once is a map merge, and not smoothed
     scale_sigma: float = 0.03  # relative deviation of a monocular map's scale before the base tells one
+    whole_rad: float = 0.005  # rad by which the base may turn the whole map unnoticed; 0: live poses follow all of it
+    whole_m: float = 0.02  # m, the same of its shift at the vehicle; twice that while no correction comes
 
 
 @dataclass(frozen=True, slots=True)
@@ -386,3 +391,5 @@ class AgentConfig:
     local_grid: LocalGridConfig = field(default_factory=LocalGridConfig)
     ground: GroundConfig = field(default_factory=GroundConfig)
     log: LogConfig = field(default_factory=LogConfig)
+    tracker: Literal["map", "ekf"] = "map"  # ekf: the Kalman filter, for one camera with odometry and little CPU
+    ekf: EkfConfig = field(default_factory=EkfConfig)

@@ -36,6 +36,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         )
     sealing = sealing_of(a.link, "base", 0, a.key, insecure=a.insecure)
     a.key, a.told = sealing.key, sealing.lines
+    if a.paired_only and not (a.key and a.link.startswith("zenoh:")):
+        p.error("--paired-only needs an IP link that is sealed: --link zenoh:… beyond this machine, or --key FILE")
+    if a.paired_only and a.link.startswith("zenoh:router/"):
+        p.error("--paired-only: whom a router lets in is told to that router, not to this base")
     # Time since a fixed date: a base on another machine, without this one's files, still begins a later session.
     least = max(0, int(time.time()) - _EPOCH_S) // _UNIT_S << _DRAWN_BITS | secrets.randbelow(1 << _DRAWN_BITS)
     start = numbers_in(process.kept_folder("base")).next(max(1, least))

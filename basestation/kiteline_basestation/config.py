@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from kiteline_core.ground.config import GroundConfig as ScanConfig
 from kiteline_core.imaging.matching import MatchConfig
 from kiteline_core.optimisation.bundle import BundleConfig
 from kiteline_core.pose.pnp import RansacConfig
@@ -19,6 +20,10 @@ class IntakeConfig:
     tie_m: float = 0.2  # m; deviation of the motion over a loss up to which it places a submap: half a metre at worst
     tie_rad: float = 0.03  # rad; the same of the rotation
     max_per_step: int = 4  # keyframes; used in one step, so that a backlog does not delay the rest
+    confirmed_px: float = 5.0  # px; from the projection of an older landmark to where a keyframe observes it, at most
+    min_confirmed: int = (
+        10  # such landmarks; with them a keyframe is of use, and its agent may claim memory for another
+    )
     max_pending: int = 20_000  # sections kept without their header: only a faulty agent has more
 
 
@@ -132,6 +137,9 @@ class LoopConfig:
     drift_m: float = 0.3  # m; correction of a loop that drift explains
     drift_path: float = 0.02  # added share of the path between the two keyframes
     drift_rad: float = 0.1  # rad; correction of a loop that drift explains
+    drift_votes: int = 12  # keyframes in a row, none against them, that outvote this expectation in one submap
+    drift_votes_apart: float = 1.0  # of the median depth; from the first to the farthest one: they see other things
+    most_drift: float = 5.0  # times the expected drift; no votes suffice beyond: two storeys that look alike
     tilt_rad: float = 0.05  # rad; by which gravity of two maps may differ that are merged: cameras on worn mounts
     tilt_deviations: float = 4.0  # added, of what their agents know gravity to
     drift_rad_m: float = 0.002  # rad/m; added for each metre of the path
@@ -235,6 +243,7 @@ class PublishConfig:
     pose_rad: float = 0.0002  # rad; a tenth of a pixel at 500 px of focal length
     depth_px: float = 0.1  # px; of projection or disparity, the largest of a keyframe's landmarks
     batch_s: float = 2.0  # s that a thin link takes to carry a batch of corrections, about; the next one waits so long
+    batch_values: int = 1000  # values of a batch, which take 30 ms to code: a loop over a large map moves them all
     batch_wait_s: float = 10.0  # s after which a batch that has not arrived is waited for no more: nobody listens
 
 
@@ -376,4 +385,5 @@ class BaseConfig:
     publish: PublishConfig = field(default_factory=PublishConfig)
     map_cache: MapCacheConfig = field(default_factory=MapCacheConfig)
     grid: GridConfig = field(default_factory=GridConfig)
+    scan: ScanConfig = field(default_factory=ScanConfig)
     tiles: TileConfig = field(default_factory=TileConfig)

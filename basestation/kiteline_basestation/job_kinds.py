@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from kiteline_basestation.grid.scan_job import SCAN
 from kiteline_basestation.jobs import Job, JobDone
 from kiteline_basestation.merging.graph_job import POSE_GRAPH
 from kiteline_basestation.refinement.bundle_job import FULL_BUNDLE, LOCAL_BUNDLE
 
-KINDS = {kind.name: kind for kind in (LOCAL_BUNDLE, FULL_BUNDLE, POSE_GRAPH)}
+KINDS = {kind.name: kind for kind in (LOCAL_BUNDLE, FULL_BUNDLE, POSE_GRAPH, SCAN)}
 
 
 def run_job(job: Job) -> JobDone:

@@ -40,8 +40,10 @@ class JobKind:
     """A kind of job, defined beside the inputs that it takes.
 
     run: pure; the same inputs give the same result, bit for bit. cost_ops: cost of a run in arithmetic operations.
+    rank: jobs of a lower one are begun first; those of rank 0 are short, and a worker is kept for them.
     """
 
     name: str
     run: Callable[[Any], Any]
     cost_ops: Callable[[Any, Any], int]
+    rank: int = 0

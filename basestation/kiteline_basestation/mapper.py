@@ -6,7 +6,7 @@ Method: "DS-PTAM: a distributed stereo PTAM", the mapper of chapter 3, with the 
 from __future__ import annotations
 
 import itertools
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import asdict, dataclass, replace
 
@@ -17,7 +17,10 @@ from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.exchange.publisher import Published, Publisher, apply_record
 from kiteline_basestation.grid.grid_updates import GridUpdates
 from kiteline_basestation.grid.grid_view import GridViews
+from kiteline_basestation.grid.image_scans import ImageScans
 from kiteline_basestation.grid.scan_grid import ScanGrid
+from kiteline_basestation.grid.scan_job import SCAN
+from kiteline_basestation.intake.confirmation import is_confirmed
 from kiteline_basestation.intake.intake import Intake
 from kiteline_basestation.intake.placements import SubmapPlacements
 from kiteline_basestation.jobs import Job, JobDone
@@ -33,7 +36,7 @@ from kiteline_basestation.refinement.bundle_job import FULL_BUNDLE, LOCAL_BUNDLE
 from kiteline_basestation.refinement.local_bundles import LocalBundles
 from kiteline_codec.schema import CulledLandmarks, DisparityCalibration, Key, LivePose, Record, SubmapPlacement
 from kiteline_core.geometry import sim3
-from kiteline_core.ids import AgentId, KeyframeId, SubmapId, agent_of_submap, submap_of_keyframe
+from kiteline_core.ids import AgentId, KeyframeId, SubmapId, agent_of_keyframe, agent_of_submap, submap_of_keyframe
 from kiteline_core.places.place_index import Vocabulary
 
 F64 = NDArray[np.float64]
@@ -74,15 +77,18 @@ class Mapper:
         self.names: dict[SubmapId, str] = {}  # of maps, by map id
         self.counts = MapperCounts()
         self.jobs_failed = 0  # since the process began
+        self._confirmed: Counter[AgentId] = Counter()  # keyframes since `take_confirmed`
         self.cpu_ns: Callable[[], int] = lambda: 0  # clock of `grid_ns`, which no output depends on
         self.grid_ns: deque[int] = deque(maxlen=_TIMED_UPDATES)  # time of the updates of the grid
         job_ids = itertools.count(1)
         self._intake = Intake(self.config.intake, self.map)
-        self._publisher = Publisher(self.map)
+        self._publisher = Publisher(self.map, self.config.publish)
         self._placements = SubmapPlacements(self.config.intake, self.map, self._intake, self._publisher)
         self._local_bundles = LocalBundles(self.config, self.map, self._publisher, job_ids)
         self.grid_updates = GridUpdates(self.config, self.map, self.placements)
+        self.image_scans = ImageScans(self.config.scan, self.map, job_ids)
         self.views = GridViews(self.grid)  # of the grid, for the status page
+        self._forgotten: set[SubmapId] = set()  # deleted in the step before, which told the agents
         self._sent_offsets: dict[AgentId, F64] = {}  # disparity offsets that the agents have
         self.merger: MapMerger | None = None
         if vocabulary is not None and self.config.loops.enabled:
@@ -90,6 +96,7 @@ class Mapper:
         self._manager = MapManager(self.map, self.names, self.placements, self._intake, self.merger, self._delete)
         self._finish: dict[str, Callable[[JobDone, int], MergeResult]] = {
             LOCAL_BUNDLE.name: self._finish_local_bundle,
+            SCAN.name: self._finish_scan,
         }
         if self.merger is not None:
             self._finish[POSE_GRAPH.name] = self.merger.finish_graph
@@ -97,6 +104,7 @@ class Mapper:
 
     def step(self, given: MapperInput, now_ns: int) -> MapperOutput:
         """Take inputs in; return records to publish and jobs to run."""
+        self._forget_deleted()
         # 1. Put the received records into the map, and align w with gravity and metres where an agent reports them.
         for agent, records in given.arrivals:
             self._intake.take(agent, records, now_ns)
@@ -127,9 +135,9 @@ class Mapper:
         withdrawn = self._apply_merges(changes)
         # 5. Draw the grid where keyframes are new or moved.
         self._draw_grid()
-        # 6. Start jobs: local bundles, pose graphs, full bundles.
+        # 6. Start jobs: local bundles, scans of images, pose graphs, full bundles.
         self._send_calibrations()
-        jobs = self._local_bundles.jobs()
+        jobs = self._local_bundles.jobs() + self.image_scans.jobs()
         if self.merger is not None:
             jobs += self.merger.jobs(now_ns)
         # 7. Publish the values that changed and for which there is room.
@@ -138,6 +146,11 @@ class Mapper:
     def adopt(self, record: Record) -> None:
         """Replace a published value by its quantised code, as the agent will hold it."""
         apply_record(self.map, record)
+
+    def take_confirmed(self) -> dict[AgentId, int]:
+        """How many keyframes of each agent were found to agree with older ones since the last call."""
+        confirmed, self._confirmed = self._confirmed, Counter()
+        return confirmed
 
     # -- state and numbers -------------------------------------------------------------------------------------------
 
@@ -169,7 +182,7 @@ class Mapper:
         """True if no job is due or pending, all keyframes that arrived are used, and no change waits to be sent."""
         merged = self.merger is None or self.merger.idle
         waiting = self._intake.backlog or self._publisher.waiting
-        return merged and self._local_bundles.idle and not waiting
+        return merged and self._local_bundles.idle and self.image_scans.idle and not waiting
 
     def live(self, agent: AgentId) -> LivePose | None:
         """The newest live pose of an agent."""
@@ -180,7 +193,7 @@ class Mapper:
         return MapperState(
             replace(self.counts), dict(self.names), self._local_bundles.waiting, map_state(self.map),
             self._intake.state(), self._placements.state(),
-            MergerState() if self.merger is None else self.merger.state(),
+            MergerState() if self.merger is None else self.merger.state(), dict(self.image_scans.made),
         )  # fmt: skip
 
     def restore(
@@ -200,9 +213,11 @@ class Mapper:
         self.names.update(state.names)
         restore_map(self.map, state.map)
         self._intake.restore(state.intake)
+        self._intake.forget(self.deleted)  # logs and copies hold values of deleted maps, too
+        self.map.forget(self.deleted)
         self._placements.restore(state.placements)
         self._local_bundles.restore(state.unbundled)
-        for record in self._intake.take_scans():
+        for record in (*self._intake.take_scans(), *self.image_scans.restore(state.made_scans)):
             self.grid_updates.add_scan(record)
         self.grid_updates.rebuild()
         if self.merger is not None:
@@ -223,11 +238,11 @@ class Mapper:
                 "quality": live.quality if live else None,
                 "T_w_c": self._live_pose(agent),
             }
-        pending = self._local_bundles.pending + (merger.pending_jobs if merger else 0)
+        pending = self._local_bundles.pending + self.image_scans.pending + (merger.pending_jobs if merger else 0)
         return {
             **asdict(self.counts),
             "keyframes": len(self.map),
-            "points": len(self.map.live_landmarks()),
+            "points": self.map.count_live(),
             "observations": int(np.count_nonzero(self.map.keypoints.usable[: self.map.slots])),
             "map_bytes": self.map.nbytes(),
             "agents": agents,
@@ -247,6 +262,8 @@ class Mapper:
         """Match, triangulate and cull landmarks around a new keyframe, then search for its place in all maps."""
         config, publisher = self.config, self._publisher
         self._placements.place_new(keyframe)
+        if is_confirmed(self.map, keyframe, config.intake):
+            self._confirmed[agent_of_keyframe(keyframe)] += 1
         self.counts.found += landmark_matching.match_landmarks(self.map, keyframe, config.landmark_matching, publisher)
         self.counts.triangulated += triangulation.triangulate_landmarks(
             self.map, keyframe, config.triangulation, publisher
@@ -267,6 +284,8 @@ class Mapper:
         """Update bundles, placements and the grid after whole maps moved. Returns placements that are void."""
         for keyframe in changes.requeried:
             self._local_bundles.add(keyframe)
+        if changes.bent:
+            self._local_bundles.cancel_around(changes.bent)
         withdrawn = self._placements.separate(changes.split)
         self._placements.rescale(changes.rescaled, changes.scale_sigma)
         for map_id in sorted(changes.moved):
@@ -283,10 +302,16 @@ class Mapper:
         self.counts.bundles += self._local_bundles.finish(done)
         return NOTHING
 
+    def _finish_scan(self, done: JobDone, now_ns: int) -> MergeResult:
+        for scan in self.image_scans.finish(done):
+            self.grid_updates.add_scan(scan)
+        return NOTHING
+
     def _set_aside(self, done: JobDone, now_ns: int) -> None:
         """Forget a job that failed: the map stays as it is until another job of its kind is due."""
         self.jobs_failed += 1
         self._local_bundles.forget(done.id)
+        self.image_scans.forget(done.id)
         if self.merger is not None:
             self.merger.forget_job(done.id, now_ns)
 
@@ -294,6 +319,8 @@ class Mapper:
         begin_ns = self.cpu_ns()
         for record in self._intake.take_scans():
             self.grid_updates.add_scan(record)
+        for images in self._intake.take_images():
+            self.image_scans.add(images)
         before = self.grid_updates.grid.revision
         self.grid_updates.update()
         if self.grid_updates.grid.revision != before:
@@ -328,10 +355,20 @@ class Mapper:
             self.grid_updates.remove(keyframes)
             self.names.pop(submap, None)
             self.map.root_submaps.pop(submap, None)
+        self._forgotten.update(submaps)
+        self._intake.forget(submaps)
         self._local_bundles.delete(submaps)
+        self.image_scans.delete(submaps)
         if self.merger is not None:
             self.merger.delete(submaps)
         self.grid_updates.rebuild()
+
+    def _forget_deleted(self) -> None:
+        """Free the memory of what was deleted, now that it is published."""
+        if self._forgotten:
+            self._publisher.forget(self._forgotten)
+            self.map.forget(self._forgotten)
+            self._forgotten = set()
 
     def _live_pose(self, agent: AgentId) -> list[list[float]] | None:
         """T_w_c (4,4) of an agent's last live pose in the world; None without one or while its keyframe is unknown."""

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from kiteline_basestation.grid.image_scans import MadeScan
 from kiteline_basestation.intake.intake import IntakeState
 from kiteline_basestation.intake.placements import PlacementState
 from kiteline_basestation.map.sparse_map import SparseMap
@@ -48,7 +49,9 @@ class MapState:
 
 @dataclass(frozen=True, slots=True)
 class MapperState:
-    """State of a `Mapper`. names: of maps. unbundled: keyframes that wait for a local bundle, by submap."""
+    """State of a `Mapper`. names: of maps. unbundled: keyframes that wait for a local bundle, by submap. made_scans: of
+    images, by keyframe and part.
+    """
 
     counts: MapperCounts = field(default_factory=MapperCounts)
     names: Mapping[SubmapId, str] = field(default_factory=dict)
@@ -57,6 +60,7 @@ class MapperState:
     intake: IntakeState = field(default_factory=IntakeState)
     placements: PlacementState = field(default_factory=PlacementState)
     merger: MergerState = field(default_factory=MergerState)
+    made_scans: Mapping[tuple[int, int], MadeScan] = field(default_factory=dict)
 
 
 def map_state(sparse_map: SparseMap) -> MapState:

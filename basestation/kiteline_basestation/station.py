@@ -13,7 +13,8 @@ from kiteline_basestation.jobs import Job, JobDone
 from kiteline_basestation.management import Answer, Command
 from kiteline_basestation.mapper import Mapper, MapperInput
 from kiteline_codec.channel import CodedChannel, RecordChannel
-from kiteline_codec.schema import Key, LivePose, Record, WireError, messages
+from kiteline_codec.schema import PASSING_KINDS, Key, LivePose, Record, WireError, messages
+from kiteline_codec.schema.owners import KEYFRAME_BYTES, submap_of
 from kiteline_core.ids import AgentId
 from kiteline_core.places.place_index import Vocabulary
 
@@ -56,7 +57,9 @@ class Station:
     def join(self, agent: AgentId) -> RecordChannel:
         """The channel to an agent; opened on first use."""
         if agent not in self.channels:
-            self.channels[agent] = self._open_channel(agent)
+            self.channels[agent] = channel = self._open_channel(agent)
+            if isinstance(channel, CodedChannel):
+                channel.endpoint.earlier.is_gone = lambda key: submap_of(key) in self.mapper.deleted
             self._batches[agent] = CorrectionBatches(agent, self._publish)
         return self.channels[agent]
 
@@ -88,6 +91,9 @@ class Station:
         rooms = [(agent, self._batches[agent].room_bytes(end, now_ns)) for agent, end in sorted(self.channels.items())]
         limits = tuple((agent, room) for agent, room in rooms if room is not None)
         output = self.mapper.step(MapperInput(tuple(arrivals), tuple(done), commands, limits), now_ns)
+        for agent, keyframes in self.mapper.take_confirmed().items():
+            if isinstance(end := self.channels.get(agent), CodedChannel):
+                end.endpoint.claims.earned += KEYFRAME_BYTES * keyframes
         for agent, records in output.publish:
             self.join(agent)
             self._put(agent, self._batches[agent].numbered(records, now_ns))
@@ -118,7 +124,8 @@ class Station:
     def _track(self, agent: AgentId, own: bool, records: Sequence[Record]) -> None:
         if self.changed is not None:
             for record in records:
-                self.changed[agent, own, messages.key(record)] = None
+                if record.KIND not in PASSING_KINDS:
+                    self.changed[agent, own, messages.key(record)] = None
 
     def _imported(self, order: Import) -> tuple[Record, ...]:
         """The records of an import that are not here yet."""
@@ -135,6 +142,6 @@ class Station:
             if key.kind == LivePose.KIND and self.mapper.live(order.agent) is not None:
                 records.pop()  # of an earlier flight
                 continue
-            if self.changed is not None:
+            if self.changed is not None and key.kind not in PASSING_KINDS:
                 self.changed[order.agent, False, key] = code
         return tuple(records)

@@ -29,8 +29,10 @@ BENCHMARKS = {
     "link": "kiteline_bench.link.link",
     "fuzz": "kiteline_bench.trust.fuzz",
     "trust": "kiteline_bench.trust.trust",
+    "scale": "kiteline_bench.scale.scale",
     "places": "kiteline_bench.base.places",
     "mapper": "kiteline_bench.base.mapper",
+    "papers": "kiteline_bench.papers.papers",
     "map-cache": "kiteline_bench.base.map_cache",
 }  # name -> module
 
@@ -73,6 +75,10 @@ def main(argv: list[str]) -> int:
     p.add_argument("--starts", metavar="N", type=int, default=0,
                    help="of the benches over several starts or seeds only N, for a quick look")  # fmt: skip
     p.add_argument("--inputs", metavar="N", type=int, default=0, help="of `fuzz`: how many (default: 200,000)")
+    p.add_argument(
+        "--seconds", metavar="S", type=float, default=0.0, help="of the flood of `trust/stranger` (default: 30)"
+    )
+    p.add_argument("--full", action="store_true", help="of `scale`: the whole size, which takes half an hour")
     a = p.parse_args(argv)
     chosen: list[tuple[str, str, Run]] = []
     for name in a.names or BENCHMARKS:
@@ -86,7 +92,9 @@ def main(argv: list[str]) -> int:
     all_met = True
     for name, title, run in chosen:
         with tempfile.TemporaryDirectory(prefix="kiteline-bench-") as scratch:
-            bench = Bench(data, a.keep or Path(scratch), _say, starts=a.starts, inputs=a.inputs)
+            bench = Bench(
+                data, a.keep or Path(scratch), _say, starts=a.starts, inputs=a.inputs, seconds=a.seconds, full=a.full
+            )  # fmt: skip
             bars = run(bench)
         text = section(name, title, bars, bench.more)
         print("\n" + text)

@@ -1,5 +1,5 @@
 """`python -m kiteline_cli` is `kiteline`."""
 
-from kiteline_cli.main import run
+from kiteline_cli.entry import run
 
 run()

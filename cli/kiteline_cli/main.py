@@ -10,10 +10,11 @@ import difflib
 import importlib
 import os
 import pkgutil
+import signal
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
-from types import ModuleType
+from types import FrameType, ModuleType
 
 from kiteline_cli import commands
 from kiteline_core.errors import KitelineError
@@ -22,6 +23,7 @@ from kiteline_hw.sources.kinds import source_table
 
 EXIT_ERROR = 2  # as argparse uses for a wrong command line
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells report it
+_IMPORTER = "<frozen importlib._bootstrap>"  # the file of frames that load a module
 
 # Which extra brings a package that the plain install leaves out.
 EXTRAS = {"gtsam": "base", "websockets": "base", "matplotlib": "lab"}
@@ -90,8 +92,29 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(argv: Sequence[str]) -> int:
-    """Run one command line; the exit status."""
-    rest = list(argv)
+    """Run one command line; the exit status. A reader of the output that goes away, as `head` does, ends it quietly."""
+    try:
+        try:
+            return _run(list(argv))
+        finally:
+            sys.stdout.flush()  # here, where a closed pipe can be caught
+    except KeyboardInterrupt:
+        return EXIT_INTERRUPTED
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python complains again at exit
+        return EXIT_ERROR
+
+
+def _on_interrupt(number: int, frame: FrameType | None) -> None:
+    """Raise KeyboardInterrupt; while modules load, end at once: libraries swallow it there, or end with a traceback."""
+    while frame is not None:
+        if frame.f_code.co_filename == _IMPORTER:
+            os._exit(EXIT_INTERRUPTED)
+        frame = frame.f_back
+    raise KeyboardInterrupt
+
+
+def _run(rest: list[str]) -> int:
     debug = rest[:1] == ["--debug"]
     if debug:
         rest = rest[1:]
@@ -104,11 +127,6 @@ def main(argv: Sequence[str]) -> int:
     command = known[rest[0]].load()
     try:
         return command.run(rest[1:]) or 0
-    except KeyboardInterrupt:
-        return EXIT_INTERRUPTED
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python complains again at exit
-        return EXIT_ERROR
     except Exception as error:
         text = explanation(error)
         if debug or text is None:
@@ -149,5 +167,6 @@ def _without_command(rest: list[str], names: list[str]) -> int:
 
 
 def run() -> None:
-    """Entry point of the installed script."""
+    """The command line of this process."""
+    signal.signal(signal.SIGINT, _on_interrupt)
     sys.exit(main(sys.argv[1:]))

@@ -9,12 +9,29 @@ from typing import Protocol
 from kiteline_codec.pacing.pacer import Pacer
 from kiteline_codec.pacing.profiles import EXACT, PROFILES, Profile
 from kiteline_codec.residuals.residual_coding import ResidualCoder
-from kiteline_codec.schema import Key, KeyframeHeader, LivePose, Observations, Record, WireError, messages, owners
+from kiteline_codec.schema import (
+    AGENT_KINDS,
+    PASSING_KINDS,
+    CachedKeyframe,
+    CachedLandmarks,
+    GridTile,
+    Key,
+    KeyframeHeader,
+    LivePose,
+    Record,
+    WireError,
+    messages,
+    owners,
+)
 from kiteline_codec.sync.archive import Spill
 from kiteline_codec.sync.config import SyncConfig, SyncStats
 from kiteline_codec.sync.endpoint import Endpoint
 from kiteline_codec.transport.link_traits import LinkTraits
 from kiteline_core.ids import AgentId
+
+# Kinds that their writer does not use as the other side holds them. Of what the agent writes it uses poses alone: its
+# map holds what was measured.
+_SENT_ALONE = AGENT_KINDS - {KeyframeHeader.KIND} | {CachedKeyframe.KIND, CachedLandmarks.KIND, GridTile.KIND}
 
 
 class RecordChannel(Protocol):
@@ -40,7 +57,7 @@ class RecordChannel(Protocol):
     def put(self, record: Record) -> Record:
         """Share a record. Returns it as the other side will hold it: compute on with that.
 
-        A live pose and observations, with which nobody computes, are returned as they are.
+        Those with which nobody computes are returned as they are: see `_SENT_ALONE`.
         """
         ...
 
@@ -80,8 +97,8 @@ class PlainChannel:
         return None
 
     def arrived(self, key: Key) -> bool:
-        """Always true."""
-        return True
+        """True once the partner has received it."""
+        return all(messages.key(record) != key for record in self._partner._arrived)
 
     def put(self, record: Record) -> Record:
         """Hand over a record."""
@@ -188,14 +205,12 @@ class CodedChannel:
         self.endpoint.put(key, code)
         if isinstance(record, KeyframeHeader):
             self._pacer.keyframe(record.t_ns)
-        if isinstance(record, LivePose):
-            return record
-        if self.noting:
+        if self.noting and not isinstance(record, LivePose) and key.kind not in PASSING_KINDS:
             self._noted[key] = code
-        return record if isinstance(record, Observations) else messages.decode(key, code)
+        return record if record.KIND in _SENT_ALONE else messages.decode(key, code)
 
     def take_noted(self) -> dict[Key, bytes]:
-        """The codes that were put since the last call, without live poses: for a log, while `noting`."""
+        """The codes that were put since the last call, without those used up at arrival: for a log, while `noting`."""
         noted, self._noted = self._noted, {}
         return noted
 
@@ -246,6 +261,7 @@ def settled(channel: RecordChannel) -> tuple[bool, bool]:
     return True, True
 
 
+UNUSED_BYTES = 32 << 20  # memory of a base for an agent of whose keyframes none was of use: some 300 of them
 _SPILLED_BYTES = 2 << 20  # memory for own values: some 140 keyframes, three times a local map
 _SPILLED_INBOX_BYTES = 1 << 20  # memory for the peer's values: some 400 keyframes
 _UNSPILLED_BYTES = 7 << 20  # memory for own values if old ones are lost: five minutes without a link
@@ -282,5 +298,6 @@ def coded_channel(
         heartbeat_ns=shape.heartbeat_ns,
         resident_inbox_bytes=_SPILLED_INBOX_BYTES if bounded else None,
         resident_bytes=None if not bounded else _UNSPILLED_BYTES if spill is None else _SPILLED_BYTES,
+        unused_inbox_bytes=None if peer is None else UNUSED_BYTES,
     )
     return CodedChannel(config, session, named, spill, peer)

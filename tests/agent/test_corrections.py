@@ -133,3 +133,19 @@ def test_time_without_a_placement_does_not_add_up_to_a_jump(corrections: Correct
     corrections.take([SubmapPlacement(SECOND, se3.from_rt(np.eye(3), np.array([0.2, 0.0, 0.0])))], [])
     told = corrections.in_world(SECOND, np.eye(4), np.eye(4), 600_000_000, metric=True)
     assert told is not None and 0.0 < told[0, 3] < 0.003
+
+
+@pytest.mark.parametrize("scale_sigma", [0.0, 0.001])
+def test_places_are_corrected_by_shares_where_lengths_rest_on_accelerations(
+    corrections: Corrections, scale_sigma: float
+) -> None:
+    """4 cm: within 2 s at the least speed, else a tenth of what is left a second. The filter of scales takes all."""
+    corrections.take([SubmapPlacement(FIRST, np.eye(4), scale_sigma=scale_sigma)], [])
+    moved = se3.from_rt(np.eye(3), np.array([0.04, 0.0, 0.0]))
+    told = None
+    for k in range(1, 43):
+        if k == 3:
+            corrections.take([SubmapPlacement(FIRST, moved, scale_sigma=scale_sigma)], [])
+        told = corrections.in_world(FIRST, np.eye(4), np.eye(4), 50_000_000 * k, metric=True)
+    assert told is not None
+    assert told[0, 3] == pytest.approx(0.04 if scale_sigma == 0.0 else 0.04 * (1.0 - np.exp(-0.2)), rel=0.02)

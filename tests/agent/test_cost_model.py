@@ -51,7 +51,7 @@ def test_a_flight_costs_what_was_counted(recording: Path) -> None:
     assert costs[0] > max(cost for cost, work in zip(costs[1:], works[1:]) if not work.keyframes)
 
 
-def test_the_first_search_counts_the_keyframes_that_it_enters(recording: Path) -> None:
+def test_a_search_counts_the_keyframes_that_it_enters(recording: Path) -> None:
     source = open_source(str(recording))
     agent = Agent(source.rig, None, AgentConfig(), Identity(AgentId(0), 0), NoBaseChannel(), shipped_vocabulary())
     relocaliser = agent._relocaliser
@@ -66,6 +66,23 @@ def test_the_first_search_counts_the_keyframes_that_it_enters(recording: Path) -
     for k in range(5 * slots):  # a long flight without a search: evicted keyframes do not wait
         relocaliser.add_keyframe(KeyframeId(1_000 + k))
         assert len(relocaliser._waiting) <= 2 * slots
+
+
+def test_a_search_enters_a_few_keyframes_the_newest_first(recording: Path) -> None:
+    source = open_source(str(recording))
+    config = AgentConfig()
+    config = replace(config, relocalisation=replace(config.relocalisation, entered=1))
+    agent = Agent(source.rig, None, config, Identity(AgentId(0), 0), NoBaseChannel(), shipped_vocabulary())
+    relocaliser = agent._relocaliser
+    for frame in [item for item in source if isinstance(item, Frame)][:12]:
+        agent.step(StepInput(frame), frame.t_ns)
+    held = sorted(agent.map.keyframe[agent.map.keyframe != NO_KEYFRAME].tolist(), reverse=True)
+    assert len(held) > 1
+    for entered in range(1, len(held) + 2):
+        agent.work.clear()
+        relocaliser.enter_keyframes()
+        assert agent.work.places == (entered <= len(held))
+        assert relocaliser._index is not None and relocaliser._index.keys == held[:entered]
 
 
 def test_less_effort_is_counted_as_less(recording: Path) -> None:

@@ -8,6 +8,7 @@ import pytest
 from kiteline_agent.inertial.gravity_alignment import GravityAligner, level_rotation
 from kiteline_agent.inertial.inertial_tracker import InertialTracker
 from kiteline_agent.step import Estimate
+from kiteline_codec.schema import GravityAlignment, SubmapPlacement, messages
 from kiteline_core.frame import ImuBatch, ImuCalibration
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
@@ -57,7 +58,14 @@ def test_the_base_is_told_once_and_the_place_stays() -> None:
     knows.up = lean.T
     level = aligner.update(10**8, T_m_b, np.eye(3), SubmapId(0), first=True)
     assert level is not None
-    np.testing.assert_allclose((level.T_l_m @ T_m_b)[:3, 3], T_m_b[:3, 3], atol=1e-12)
+    np.testing.assert_allclose((level.T_l_m @ T_m_b)[:3, 3], T_m_b[:3, 3], atol=1e-4)  # rounded as on the wire
+    told = messages.decode(messages.key(level), messages.encode(level))
+    assert isinstance(told, GravityAlignment)
+    np.testing.assert_array_equal(told.T_l_m, level.T_l_m)
+    placed = SubmapPlacement(SubmapId(0), told.T_l_m)
+    echo = messages.decode(messages.key(placed), messages.encode(placed))
+    assert isinstance(echo, SubmapPlacement)
+    np.testing.assert_array_equal(echo.S_w_m, level.T_l_m)
     assert aligner.R_l_o is not None
     np.testing.assert_allclose(aligner.R_l_o @ lean @ [0.0, 0.0, 1.0], [0.0, 0.0, 1.0], atol=1e-9)
     assert aligner.tilt_rad == pytest.approx(np.hypot(0.2, 0.3))

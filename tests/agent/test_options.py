@@ -14,3 +14,10 @@ def test_a_number_that_no_agent_can_have_is_refused_before_anything_else(
     with pytest.raises(SystemExit, match="2"):
         main(["nothing", f"--agent={agent}", "--link", "zenoh:tcp/10.0.0.1:7447"])
     assert "expected 0 to 63" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("given", [["--obstacles"], ["--imu", "controller"], ["--grid", "base"]], ids=" ".join)
+def test_what_the_filter_has_no_use_for_is_refused(given: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main(["nothing", "--tracker", "ekf", *given])
+    assert f"--tracker ekf uses no {' '.join(given).removesuffix(' controller')}" in capsys.readouterr().err

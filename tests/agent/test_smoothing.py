@@ -85,3 +85,24 @@ def test_what_adds_up_to_more_than_a_merge_is_no_jump() -> None:
         left = goal[0, 3] - last[0, 3]
         assert 0.0 <= told[0, 3] - last[0, 3] <= max(limits.max_m_s, left / limits.time_s) * 0.05 + 1e-12
     assert goal[0, 3] - told[0, 3] < goal[0, 3] * np.exp(-14.0 / limits.time_s)
+
+
+@given(st.floats(0.02, 0.9), st.floats(0.2, 2.0))
+def test_where_lengths_are_uncertain_no_window_is_stretched_by_more_than_a_share_of_the_correction(
+    size_m: float, speed_m_s: float
+) -> None:
+    """A correction along the path: in 5 s no more than 1 - exp(-5 s / time_s) of it, in 30 s all but a twentieth."""
+    limits = SmoothingConfig()
+    smoothing = Smoothing(limits)
+    goal = se3.from_rt(np.eye(3), np.array([size_m, 0.0, 0.0]))
+    said, flown = [], []
+    smoothing.follow(np.eye(4), np.zeros(3), 0, by_share=True)
+    for n in range(1, 601):  # 30 s
+        here = np.array([speed_m_s * n * 0.05, 0.0, 0.0])
+        said.append(se3.transform(smoothing.follow(goal, here, n * TICK_NS, by_share=True), here[None])[0, 0])
+        flown.append(here[0])
+    window = 100  # frames in 5 s
+    longer = (np.array(said)[window:] - said[:-window]) - (np.array(flown)[window:] - flown[:-window])
+    assert longer.min() >= -1e-9
+    assert longer.max() <= size_m * (1.0 - np.exp(-5.0 / limits.time_s)) * 1.01
+    assert said[-1] - flown[-1] >= 0.95 * size_m

@@ -80,7 +80,7 @@ def fly(
     keyframes: int = 20, points: int = 700, seed: int = 0, memory: int = 4, noise_px: float = 0.3,
     drift_m: float = 0.004, outliers: float = 0.01, stereo: bool = True, agent: int = 0, turns: float = 1.0,
     missed: float = 0.1, no_depth: float = 0.0, submap: int = 0, start: float = 0.0, variant: int = 0,
-    T_w_m: F64 | None = None, scene: Scene | None = None,
+    T_w_m: F64 | None = None, scene: Scene | None = None, boot: int = 1,
 ) -> Flight:  # fmt: skip
     """Fly a circle of 1.2 m radius, looking outwards. memory: keyframes after which the tracker forgets a point.
 
@@ -97,7 +97,7 @@ def fly(
         rng = np.random.default_rng([seed, variant])
     T_m_w = np.eye(4) if T_w_m is None else se3.inverse(T_w_m)
     flight = Flight(camera, AgentId(agent), world)
-    in_submap = submap_id(agent, 1, submap)
+    in_submap = submap_id(agent, boot, submap)
     tracked: dict[int, tuple[int, int]] = {}  # row of world -> point id, number of the keyframe that last saw it
     for n in range(keyframes):
         in_world = path(start + turns * n / keyframes)

@@ -10,12 +10,13 @@ from kiteline_basestation.config import BaseConfig, GraphConfig
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.merging.correction_jobs import CorrectionJobs
 from kiteline_basestation.refinement.bundle_job import FULL_BUNDLE
-from kiteline_basestation.refinement.full_bundle_schedule import FullBundleSchedule
+from kiteline_basestation.refinement.full_bundle_schedule import FullBundleSchedule, Part
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
-from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, SubmapId, keyframe_id, submap_id
+from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, keyframe_id, submap_id
 
-ONE, TWO = submap_id(0, 0, 0), submap_id(1, 0, 0)
+MAP = submap_id(0, 0, 0)
+ONE, TWO = (MAP, 0), (submap_id(1, 0, 0), 0)
 CONFIG = GraphConfig(full_share=0.1)
 SECOND = 1_000_000_000
 
@@ -38,7 +39,7 @@ def test_the_worker_rests_in_between() -> None:
 
 
 def test_the_map_that_grew_most_is_next_unless_it_is_busy() -> None:
-    sizes: dict[SubmapId, int] = {ONE: 40, TWO: 20}
+    sizes: dict[Part, int] = {ONE: 40, TWO: 20}
     whole = FullBundleSchedule(CONFIG)
     whole.bundled.update({ONE: 36, TWO: 15})  # a tenth and a quarter
     assert whole.next(sizes, (TWO,), 0) == ONE
@@ -56,7 +57,7 @@ def test_observations_that_arrive_long_after_their_keyframes_are_bundled() -> No
     n, rng, sparse_map = 40, np.random.default_rng(3), SparseMap()
     camera = RectifiedCamera(752, 480, 430.0, 430.0, 376.0, 240.0, 0.11, True, np.eye(4))
     sparse_map.set_camera(AgentId(0), camera)
-    keyframes = [keyframe_id(ONE, k) for k in range(3)]
+    keyframes = [keyframe_id(MAP, k) for k in range(3)]
     jobs = CorrectionJobs(BaseConfig(), sparse_map, itertools.count(1))
     none, index = np.zeros(n, np.uint8), np.arange(n, dtype=np.uint16)
     for k, keyframe in enumerate(keyframes):

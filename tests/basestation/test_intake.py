@@ -94,7 +94,7 @@ def test_every_kind_of_an_agent_names_its_owner() -> None:
     """A new kind is checked by its key, whatever it holds."""
     kinds = {t for t in RECORD_TYPES.values() if t.written_by_agent()}
     assert {type(r) for r in RECORDS} <= kinds
-    assert all(t.ID.name in ("AGENT", "SUBMAP", "KEYFRAME") for t in kinds)
+    assert all(t.ID.name in ("AGENT", "SUBMAP", "KEYFRAME", "PASSING_KEYFRAME") for t in kinds)
 
 
 def test_every_record_of_agents_has_a_handler() -> None:

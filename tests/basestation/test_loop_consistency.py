@@ -1,12 +1,19 @@
-"""Which matches agree on one correction, against plain similarities."""
+"""Which matches agree on one correction, against plain similarities; which outvote the expected drift."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
+import pytest
 
 from kiteline_basestation.config import LoopConfig
 from kiteline_basestation.map.sparse_map import SparseMap
+from kiteline_basestation.merging import loop_consistency
 from kiteline_basestation.merging.loop_consistency import agreeing
+from kiteline_basestation.merging.loop_detector import LoopClosure, LoopDetector
 from kiteline_basestation.merging.loop_edges import LoopMatch, correction_of, depth_of
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import NO_KEYFRAME, KeyframeId, keyframe_id, submap_id, submap_of_keyframe
@@ -68,3 +75,50 @@ def test_those_agree_that_imply_one_correction() -> None:
             assert expected[-1] is matches[last]
             counted.append(len(expected))
     assert min(counted) < 6 < max(counted) < 24  # some agree, some do not
+
+
+@pytest.fixture
+def drifted(monkeypatch: pytest.MonkeyPatch) -> Callable[[Sequence[float]], tuple[SparseMap, list[LoopMatch]]]:
+    """Makes a map in which an agent comes back to its straight path of ten metres, and its matches."""
+    monkeypatch.setattr(loop_consistency, "has_depth_relief", lambda *_: True)
+
+    def make(way_m: Sequence[float]) -> tuple[SparseMap, list[LoopMatch]]:
+        """way_m: positions of the keyframes that come back. They lie a metre beside where they truly are."""
+        sparse_map = SparseMap()
+        for k in range(20):
+            T = se3.from_rt(np.eye(3), np.array([0.5 * k, 0.0, 0.0]))
+            sparse_map.add_keyframe(keyframe_id(A, k), k, NO_KEYFRAME, T, 0)
+        matches = []
+        for n, x_m in enumerate(way_m):
+            new, old = keyframe_id(A, 40 + n), keyframe_id(A, n)
+            sparse_map.add_keyframe(new, 40 + n, NO_KEYFRAME, se3.from_rt(np.eye(3), np.array([x_m, 1.0, 0.0])), 0)
+            T_old_new = se3.from_rt(np.eye(3), np.array([x_m - 0.5 * n, 0.0, 0.0]))
+            matches.append(LoopMatch(new, old, T_old_new, 60, 3.0))
+        return sparse_map, matches
+
+    return make
+
+
+def weighed(sparse_map: SparseMap, matches: Sequence[LoopMatch], words: Any) -> list[object]:
+    """What a detector makes of matches, one after the other."""
+    detector = LoopDetector(LoopConfig(), sparse_map, words)
+    return [detector._weigh(match) for match in matches]
+
+
+def test_keyframes_along_a_path_outvote_the_expected_drift(drifted: Any, words: Any) -> None:
+    sparse_map, matches = drifted([0.5 * n for n in range(12)])
+    found = weighed(sparse_map, matches, words)
+    assert found[:-1] == [None] * 11 and isinstance(found[-1], LoopClosure)
+
+
+def test_keyframes_that_go_to_and_fro_are_one_vote(drifted: Any, words: Any) -> None:
+    sparse_map, matches = drifted([0.5 * (n % 3) for n in range(20)])
+    assert weighed(sparse_map, matches, words) == [None] * 20
+
+
+def test_keyframes_that_see_two_places_are_no_votes(drifted: Any, words: Any) -> None:
+    sparse_map, matches = drifted([0.5 * n for n in range(12)])
+    away = se3.from_rt(np.eye(3), np.array([0.0, 0.0, 2.0]))
+    elsewhere = [replace(m, old=keyframe_id(A, 0), T_old_new=away @ m.T_old_new) for m in matches]
+    both = [m for pair in zip(elsewhere, matches, strict=True) for m in pair]
+    assert weighed(sparse_map, both, words) == [None] * 24

@@ -80,6 +80,22 @@ def test_loop_is_closed_while_keyframes_arrive(around: Any, late: int) -> None:
         assert np.allclose(last[keyframe], mapper.map.pose(keyframe), atol=1e-9)
 
 
+@pytest.mark.parametrize(
+    ("votes", "most_drift", "closed"), [(12, 1000.0, True), (1000, 1000.0, False), (12, 1.0, False)]
+)
+def test_many_votes_close_a_loop_that_drifted_more_than_expected(
+    make_flight: MakeFlight, ring: Any, words: Any, votes: int, most_drift: float, closed: bool
+) -> None:
+    flight = make_flight(keyframes=100, turns=1.35, scene=ring, drift_m=0.02, seed=3, noise_px=0.7, memory=2)
+    strict = replace(BaseConfig().loops, drift_m=0.001, drift_path=0.0, drift_votes=votes, most_drift=most_drift)
+    mapper = Mapper(replace(BaseConfig(), loops=strict), words)
+    feed(mapper, [flight])
+    assert mapper.merger is not None and mapper.merger.detector.rejected > 0
+    assert bool(mapper.merger.edges) == closed
+    if closed:
+        assert np.mean(errors_m(mapper, flight)[-8:]) < 0.1
+
+
 def test_loop_without_drift_is_counted_and_the_same_flight_gives_the_same_map(
     make_flight: MakeFlight, words: Any
 ) -> None:

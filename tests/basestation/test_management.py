@@ -15,7 +15,7 @@ from kiteline_basestation.jobs import JobDone
 from kiteline_basestation.management import VERBS, Answer, Command, submap_name
 from kiteline_basestation.mapper import Mapper, MapperInput
 from kiteline_basestation.store.integrity import contradictions
-from kiteline_codec.schema import CameraIntrinsics, CulledLandmarks, LivePose, Record
+from kiteline_codec.schema import CameraIntrinsics, CulledLandmarks, LivePose, Record, SubmapPlacement
 from kiteline_core.geometry import se3
 from kiteline_core.ids import KeyframeId, SubmapId, submap_id, submap_of_keyframe
 
@@ -168,6 +168,34 @@ def test_deleted_map_is_culled_and_later_records_ignored(make_flight: MakeFlight
     assert ids(base.ask("list")) == ["0.1.0"]
     assert "no map" in base.ask("get", map="1.1.0")["error"]
     assert base.mapper.idle
+
+
+def test_a_placement_that_waits_for_room_is_deleted_with_its_map(make_flight: MakeFlight) -> None:
+    mapper, flight = Mapper(BaseConfig()), make_flight(keyframes=6)
+    full = ((flight.agent, 0),)
+    records = (CameraIntrinsics(flight.agent, flight.camera), *(r for group in flight.records for r in group))
+    command = Command(1, "delete", '{"map": "0.1.0"}')
+    output = mapper.step(MapperInput(((flight.agent, records),), room_bytes=full), STEP_NS)
+    assert not any(isinstance(r, SubmapPlacement) for _, out in output.publish for r in out)
+    assert mapper.placements
+    assert mapper.step(MapperInput((), commands=(command,), room_bytes=full), 2 * STEP_NS).answers[0].ok
+    output = mapper.step(MapperInput(()), 3 * STEP_NS)
+    assert not any(isinstance(r, SubmapPlacement) for _, out in output.publish for r in out)
+    assert not mapper.state().placements.unmerged
+
+
+def test_a_keyframe_that_comes_as_its_map_is_deleted_is_deleted_with_it(make_flight: MakeFlight, words: Any) -> None:
+    base = Base(words)
+    goes, again = make_flight(keyframes=12, seed=21), make_flight(keyframes=12, agent=1, seed=21)
+    late = tuple(goes.records.pop())
+    base.fly([goes])
+    base.rest()
+    command = Command(1, "delete", '{"map": "0.1.0"}')
+    assert all(answer.ok for answer in base.step([(goes.agent, late)], [command]))
+    base.fly([again])  # the same place
+    base.rest()
+    assert ids(base.ask("list")) == ["1.1.0"]
+    assert base.mapper.placements.keys().isdisjoint(base.mapper.deleted)
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,11 @@ from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.mapper_state import map_state, restore_map
 from kiteline_basestation.refinement.bundle_window import bundle_window
 from kiteline_basestation.refinement.disparity_calibration import with_border
-from kiteline_basestation.refinement.odometry_factors import with_odometry_factors, without_odometry_factors
+from kiteline_basestation.refinement.odometry_factors import (
+    median_depths,
+    with_odometry_factors,
+    without_odometry_factors,
+)
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, keyframe_id, submap_id
@@ -299,3 +303,17 @@ def test_a_keyframe_without_observations_stays_tied_to_its_parent() -> None:
     linked = with_odometry_factors(sparse_map, part, config.odometry_factors)
     added = linked.camera[len(part.problem.camera) :]
     assert {0, 1} <= set(added.tolist())
+
+
+def test_median_depths_are_those_of_each_camera_s_disparities() -> None:
+    sparse_map, _ = flight(0.3, 40, unseen=3)
+    config, keyframes = BaseConfig(), [keyframe_id(SUBMAP, k) for k in range(KEYFRAMES)]
+    part = bundle_window(sparse_map, keyframes, config.bundle_window, config.measurement)
+    assert part is not None
+    problem = part.problem
+    measured = problem.measured.copy()
+    measured[problem.camera == 2, 2] = -1.0
+    depth = median_depths(replace(problem, measured=measured))
+    for k in range(KEYFRAMES):
+        disparity = measured[(problem.camera == k) & (measured[:, 2] > 0), 2]
+        assert depth[k] == pytest.approx(CAMERA.bf / np.median(disparity) if k != 2 else 3.0, rel=1e-9)

@@ -13,6 +13,7 @@ import pytest
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.job_kinds import run_job
 from kiteline_basestation.jobs import JobDone
+from kiteline_basestation.management import Command
 from kiteline_basestation.station import Import, Station
 from kiteline_basestation.store.combine import combine
 from kiteline_basestation.store.integrity import check, contradictions
@@ -128,6 +129,40 @@ def test_restored_map_is_equal_to_the_last_bit(joined: tuple[Agents, Station], w
     for channel, before in zip(second.channels.values(), first.channels.values(), strict=True):
         assert isinstance(channel, CodedChannel) and isinstance(before, CodedChannel)
         assert channel.endpoint.own_values() == before.endpoint.own_values()
+
+
+def test_a_deleted_map_does_not_come_back(make_flight: MakeFlight, words: Any) -> None:
+    flights = [make_flight(keyframes=12, turns=0.2), make_flight(keyframes=12, turns=0.2, seed=9, agent=1)]
+    agents, first = Agents(flights), new_station(words)
+    agents.fly(first, 0, 40)
+    order = Command(1, "delete", '{"map": "1.1.0"}')
+    for orders in ([order], []):
+        output = first.step({}, agents.done, agents.now_ns, orders)
+        assert all(answer.ok for answer in output.answers)
+        agents.done = [run_job(job) for job in output.jobs]
+    kept = snapshot(first, SavedMap())
+    second = new_station(words, session=2)
+    assert restore(second, kept, 0).keyframes == len(first.mapper.map) == 12
+    assert whole(second) == whole(first)
+    assert second.mapper.map.count_live() == first.mapper.map.count_live()
+
+
+def test_what_an_agent_said_of_deleted_maps_ends_with_its_session(make_flight: MakeFlight, words: Any) -> None:
+    station, held, now_ns = new_station(words), [], 0
+    for number in range(3):
+        flight = make_flight(keyframes=6, turns=0.1, submap=number)
+        agents = Agents([flight])
+        agents.ends[flight.agent] = CodedChannel(SyncConfig(), number + 1)
+        agents.now_ns = now_ns
+        agents.fly(station, 0, 20)
+        order = Command(1, "delete", f'{{"map": "0.1.{number}"}}')
+        assert all(answer.ok for answer in station.step({}, agents.done, agents.now_ns, [order]).answers)
+        now_ns = agents.now_ns + STEP_NS
+        end = station.channels[flight.agent]
+        assert isinstance(end, CodedChannel)
+        held.append(end.endpoint.earlier.bytes)
+        assert sum(map(len, end.endpoint.peer_values().values())) > 2000
+    assert max(held) < 2000
 
 
 def test_map_survives_six_restarts(make_flight: MakeFlight, words: Any, tmp_path: Path) -> None:

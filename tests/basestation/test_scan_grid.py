@@ -213,6 +213,76 @@ def test_hits_are_marked_as_in_the_reference_and_leave_no_trace(seed: int) -> No
     assert not hits.any()
 
 
+def freed(
+    x: float, y: float, first: float, step: float, columns: dict[str, NDArray[np.float64]], camera_band: int,
+    near: float, weights: tuple[int, int, int], hits: NDArray[np.uint16],
+) -> NDArray[np.int64]:  # fmt: skip
+    """What `draw_free` takes from the planes (4,rows,columns): each cell asked for its column and its range."""
+    rows, cells = np.indices(hits.shape)
+    dx, dy = cells + 0.5 - x, rows + 0.5 - y
+    distance, angle = np.hypot(dx, dy), np.arctan2(dy, dx)
+    n = len(columns["begin"])
+    place = np.mod(angle - first, 2.0 * np.pi) / step
+    i = np.minimum(place.astype(int), n - 1)
+    end = columns["end"][i]
+    left = np.cos(first + i * step) * dy - np.sin(first + i * step) * dx
+    right = np.sin(first + (i + 1) * step) * dx - np.cos(first + (i + 1) * step) * dy
+    part = left / (left + right)
+    surface = np.where(
+        part < 0.5, end[..., 0] + 2.0 * part * (end[..., 1] - end[..., 0]),
+        end[..., 1] + (2.0 * part - 1.0) * (end[..., 2] - end[..., 1]),
+    )  # fmt: skip
+    least, most = np.maximum(end.min(-1), 0.0), np.maximum(end.max(-1), 0.0)
+    begun = distance >= columns["begin"][i]
+    whole = begun & ((distance <= least) | ((distance <= most) & (distance <= surface)))
+    below = begun & ~whole & (distance <= columns["low"][i])
+    bands = np.where(whole, 7, np.where(below, columns["under"][i].astype(int), 0))
+    if camera_band >= 0:
+        bands |= np.where(distance <= columns["clear"][i], 1 << camera_band, 0)
+    bands = np.where(place < n, bands & ~hits.astype(int), 0)
+    seen = columns["start"][i] <= distance
+    sure = distance <= np.maximum(columns["sure"][i], columns["start"][i])
+    value = np.where(seen & (distance <= near), weights[0], np.where(sure, weights[1], weights[2]))
+    out = np.zeros((4, *hits.shape), np.int64)
+    out[0] = np.where(bands == 7, value, 0)
+    for b in range(3):
+        out[1 + b] = np.where((bands != 7) & (bands >> b & 1 > 0), value, 0)
+    return out
+
+
+@given(st.integers(0, 2**31))
+def test_free_space_is_drawn_as_in_the_reference(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    n, step, first = 20, float(rng.uniform(0.02, 0.12)), float(rng.uniform(-7.0, 7.0))
+    x, y, near, camera_band = (
+        *rng.uniform(20.0, 170.0, 2).tolist(),
+        float(rng.uniform(10, 60)),
+        int(rng.integers(-1, 3)),
+    )
+    ends = rng.uniform(-10.0, 90.0, (n, 1)) * (1.0 + rng.uniform(-0.1, 0.1, (n, 3)))
+    ends[rng.random(n) < 0.2] = 0.0
+    start = rng.uniform(0.0, 40.0, n)
+    columns = {
+        "begin": start * rng.uniform(0.6, 1.0, n), "start": start, "end": ends, "low": rng.uniform(0.0, 90.0, n),
+        "under": rng.integers(0, 2, n).astype(np.uint8), "clear": rng.uniform(-1.0, 100.0, n),
+        "sure": rng.uniform(0.0, 80.0, n),
+    }  # fmt: skip
+    hits = np.where(rng.random((192, 192)) < 0.02, rng.integers(1, 8, (192, 192)), 0).astype(np.uint16)
+    slots, pool = np.full((3, 3), -1, np.int32), np.zeros((9, 4, 64, 64), np.int16)
+    touched, used = np.zeros((3, 3), np.uint8), np.zeros(1, np.int64)
+    kernels.draw_free(
+        x, y, first, step, columns["begin"], columns["start"], ends, columns["low"], columns["under"],
+        columns["clear"], camera_band, near, columns["sure"], (3, 2, 1), hits, 1, slots,
+        np.arange(9, dtype=np.int32), used, pool, touched,
+    )  # fmt: skip
+    whole = np.zeros((4, 192, 192), np.int64)
+    for r, c in np.argwhere(slots >= 0):
+        whole[:, r * 64 : r * 64 + 64, c * 64 : c * 64 + 64] = pool[slots[r, c]]
+    wanted = freed(x, y, first, step, columns, camera_band, near, (3, 2, 1), hits)
+    assert np.array_equal(-whole, wanted)
+    assert np.array_equal(touched > 0, wanted.any(0).reshape(3, 64, 3, 64).any((1, 3)))
+
+
 def test_a_surface_that_juts_out_within_a_column_has_no_gaps() -> None:
     """Its edges are equally far: the samples follow the way there and back."""
     hits, cells = np.zeros((192, 192), np.uint16), np.zeros((400, 2), np.int32)

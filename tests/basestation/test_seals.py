@@ -7,10 +7,12 @@ from pathlib import Path
 
 import pytest
 
+from kiteline_basestation.__main__ import main
 from kiteline_basestation.runtime.options import BaseOptions
-from kiteline_basestation.runtime.seals import BaseSeals
+from kiteline_basestation.runtime.seals import BaseSeals, logins_of
 from kiteline_codec.transport.seal import Direction, Sealer, Suite
 from kiteline_hw.links.ends import OneLinkHub
+from kiteline_hw.ports import LinkError
 from kiteline_hw.system import key_store
 from kiteline_hw.system.key_store import new_code, new_maps_key, pair, read_keys
 
@@ -97,3 +99,18 @@ def test_a_file_of_keys_keeps_its_owner(base: Base) -> None:
     key_store.pair(base.path, 4, new_code())
     status = base.path.stat()
     assert (status.st_uid, status.st_gid, status.st_mode & 0o777) == (1234, 1235, 0o600)
+
+
+def test_a_base_for_paired_agents_alone_refuses_what_would_open_it_to_anyone(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "keys"
+    path.write_text("# nobody yet\n")
+    path.chmod(0o600)
+    with pytest.raises(LinkError, match="nobody has a key"):
+        logins_of(path)
+    new_maps_key(path)
+    assert list(logins_of(path)) == [key_store.MAPS]
+    with pytest.raises(SystemExit):
+        main(["--paired-only", "--key", str(path), "--link", "zenoh:router/tcp/127.0.0.1:7447"])
+    assert "router" in capsys.readouterr().err

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from kiteline_basestation.map import sparse_map_kernels as kernels
+from kiteline_core.geometry import se3
 
 
 def test_links_and_fusions_agree_with_plain_sets() -> None:
@@ -54,3 +55,28 @@ def test_links_and_fusions_agree_with_plain_sets() -> None:
         a, b = rng.choice(10, 2, replace=False).tolist()
         both = {int(row[s]) for s in members[a] if usable[s]} & {int(row[s]) for s in members[b] if usable[s]}
         assert kernels.share_keyframe(a, b, first, next_, row, usable) == bool(both)
+
+
+def test_positions_agree_with_matrices() -> None:
+    rng = np.random.default_rng(7)
+    keyframes, slots, n = 5, 200, 90
+    pose = np.stack([se3.exp(rng.normal(size=6)) for _ in range(keyframes)])
+    camera = rng.uniform(300, 500, (keyframes, 5))
+    camera[2, :2] = 0.0  # its camera is not known yet: any finite position will do
+    scale = rng.uniform(0.5, 2.0, keyframes)
+    row = rng.integers(0, keyframes, slots).astype(np.int32)
+    uv = rng.uniform(0, 600, (slots, 2)).astype(np.float32)
+    offset = rng.normal(size=(slots, 2)).astype(np.float32)
+    landmarks = rng.permutation(slots)[:n].astype(np.int32)
+    inv = rng.uniform(0.05, 2.0, n)
+    out = np.full((n, 3), np.nan)
+    kernels.positions(landmarks, inv, row, uv, offset, scale, camera, pose, out)
+    assert np.isfinite(out).all()
+    for i, s in enumerate(landmarks.tolist()):
+        k = row[s]
+        if k == 2:
+            continue
+        K = np.array([[camera[k, 0], 0, camera[k, 2]], [0, camera[k, 1], camera[k, 3]], [0, 0, 1]])
+        seen = np.append(uv[s].astype(float) + offset[s], 1.0)
+        local = np.linalg.solve(K, seen) * scale[k] / inv[i]
+        np.testing.assert_allclose(out[i], (pose[k] @ np.append(local, 1.0))[:3], rtol=1e-9, atol=1e-9)

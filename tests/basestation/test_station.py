@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,8 +11,9 @@ import numpy as np
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.job_kinds import run_job
 from kiteline_basestation.station import Station
-from kiteline_codec.channel import CodedChannel, RecordChannel, plain_pair
-from kiteline_codec.schema import CameraIntrinsics, KeyframePose, Record, RefinedLandmarks
+from kiteline_codec.channel import CodedChannel, RecordChannel, coded_channel, plain_pair
+from kiteline_codec.schema import CameraIntrinsics, KeyframePose, Observations, Record, RefinedLandmarks
+from kiteline_codec.schema.owners import KEYFRAME_BYTES
 from kiteline_codec.sync.config import SyncConfig
 from kiteline_core.ids import AgentId
 
@@ -66,3 +68,24 @@ def test_plain_channels_and_order_of_agents(make_flight: Callable[..., Any]) -> 
     assert [agent for agent, _ in output.packets] == [0, 2]
     assert len(station.mapper.map.submaps) == 2
     assert len(station.mapper.placements) == 1  # where the second agent began is not known
+
+
+def test_keyframes_that_agree_with_older_ones_earn_their_agent_memory(make_flight: Callable[..., Any]) -> None:
+    flight = make_flight(keyframes=12, turns=0.4)
+    base_end = coded_channel(1, peer=flight.agent)
+    station = Station(BaseConfig(), lambda agent: base_end)
+    fly(station, CodedChannel(SyncConfig(), 1), flight)
+    assert base_end.endpoint.claims.earned >= 11 * KEYFRAME_BYTES  # all but the first
+
+
+def test_keyframes_that_are_made_up_earn_nothing(make_flight: Callable[..., Any]) -> None:
+    flight, draw = make_flight(keyframes=12, turns=0.4), np.random.default_rng(1)
+    for records in flight.records:
+        for i, record in enumerate(records):
+            if isinstance(record, Observations):
+                records[i] = replace(record, uv=draw.uniform(0.0, 470.0, record.uv.shape).astype(np.float32))
+    base_end = coded_channel(1, peer=flight.agent)
+    station = Station(BaseConfig(), lambda agent: base_end)
+    fly(station, CodedChannel(SyncConfig(), 1), flight)
+    assert station.mapper.counts.keyframes == 12
+    assert base_end.endpoint.claims.earned <= KEYFRAME_BYTES

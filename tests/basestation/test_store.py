@@ -17,6 +17,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from kiteline_basestation.store import checksums
 from kiteline_basestation.store.checksums import StoreError, sum_of
 from kiteline_basestation.store.saved_map import SavedMap, SavedValues, pack, unpack
 from kiteline_basestation.store.store import FILE, Batch, DiskError, Store, backup, batch_of, read, repair
@@ -267,6 +268,16 @@ def test_a_store_with_views_or_other_tables_is_refused(tmp_path: Path) -> None:
     db.close()
     with pytest.raises(StoreError, match="other tables"):
         read(tmp_path)
+
+
+@pytest.mark.parametrize("column", ["type", "name", "tbl_name", "sql"])
+def test_a_schema_whose_text_became_bytes_is_refused(column: str) -> None:
+    db = sqlite3.connect(":memory:", isolation_level=None)
+    checksums.make_tables(db)
+    db.execute("PRAGMA writable_schema = ON")
+    db.execute(f"UPDATE sqlite_master SET {column} = CAST({column} AS BLOB) WHERE name = 'code'")
+    with pytest.raises(StoreError, match="other tables"):
+        checksums.check_tables(db, Path("kept.kiteline"))
 
 
 def test_a_backup_equals_its_store_also_while_a_base_writes(tmp_path: Path) -> None:

@@ -84,3 +84,14 @@ def test_a_loop_is_reported_with_its_length_and_error(make_flight: MakeFlight, r
     assert found is not None
     path_m = np.linalg.norm(np.diff(np.array(flight.true_T_w_k)[:, :3, 3], axis=0), axis=1).sum()
     assert 0.02 < float(found[1]) < 5.0 and 0.5 * path_m < float(found[2]) < path_m
+
+
+def test_an_idle_base_says_nothing_twice() -> None:
+    """It repeated one line every ten seconds."""
+    station = Station(BaseConfig(), lambda _: CodedChannel(SyncConfig(), 1))
+    reporter = TerminalReporter(station)
+    lines = [line for s in range(0, 120, 5) for line in reporter.lines((), s * 10**9, 100.0 + s, None)]
+    assert len(lines) == 1 and "0 agents connected" in lines[0]
+    assert "1 agent connected" in reporter.lines((2,), 130 * 10**9, 300.0, None)[-1]
+    assert "0 agents connected" in reporter.lines((), 140 * 10**9, 300.0, None)[-1]
+    assert reporter.lines((), 150 * 10**9, 300.0, None) == []

@@ -60,6 +60,15 @@ def test_status_says_what_the_snapshot_holds_in_json() -> None:
     assert (second["agent"], second["link"], second["silent_s"]) == (3, "never", None)
 
 
+def test_the_quality_of_an_agent_that_was_not_heard_for_long_is_not_shown() -> None:
+    """The page showed 100 % beside "no link for 2 min"."""
+    old = agent(quality=100, last_packet_ns=100 * S - 120 * S)
+    quiet = agent(1, quality=100, last_packet_ns=97 * S)
+    first, second = messages.status(snapshot(old, quiet))["agents"]
+    assert (first["link"], first["quality"]) == ("lost", None)
+    assert (second["link"], second["quality"]) == ("quiet", 100)
+
+
 def test_a_pose_that_is_not_finite_is_no_pose() -> None:
     assert messages.status(snapshot(agent(T_w_c=np.full((4, 4), np.nan))))["agents"][0]["position"] is None
 

@@ -16,13 +16,16 @@ import pytest
 
 from kiteline_basestation import job_kinds
 from kiteline_basestation.config import BaseConfig, GraphConfig
+from kiteline_basestation.grid.scan_job import SCAN
 from kiteline_basestation.job_kinds import run_job
 from kiteline_basestation.jobs import Job, JobDone, JobKind, set_aside
 from kiteline_basestation.mapper import Mapper
 from kiteline_basestation.merging.essential_graph import GraphInputs
+from kiteline_basestation.merging.graph_job import POSE_GRAPH
+from kiteline_basestation.refinement.bundle_job import FULL_BUNDLE, LOCAL_BUNDLE
 from kiteline_basestation.runtime import worker as worker_module
 from kiteline_basestation.runtime.flight_log import fingerprint
-from kiteline_basestation.runtime.worker import LockstepJobs, Worker
+from kiteline_basestation.runtime.worker import LockstepJobs, Worker, Workers
 from kiteline_hw.system.process import is_stopped
 from tests.basestation.feeding import feed
 
@@ -81,23 +84,28 @@ class BadInputs:
 def _bad(inputs: BadInputs) -> str:
     if inputs.what == "raise":
         raise ZeroDivisionError("no landmarks")
+    if inputs.what.startswith("sleep"):
+        time.sleep(float(inputs.what.removeprefix("sleep")))
     if inputs.what == "die":
         os._exit(9)
     return inputs.what
 
 
 BAD = JobKind("bad", _bad, lambda inputs, result: 1)
+LONG = JobKind("long", _bad, lambda inputs, result: 1, rank=2)
+MIDDLE = JobKind("middle", _bad, lambda inputs, result: 1, rank=1)
 
 
-def _work_with_bad_jobs(pipe: Any) -> None:
+def _work_with_bad_jobs(pipe: Any, nice: int) -> None:
     job_kinds.KINDS[BAD.name] = BAD
-    worker_module._work(pipe)
+    worker_module._work(pipe, nice)
 
 
 @pytest.fixture
 def bad_jobs(monkeypatch: pytest.MonkeyPatch) -> None:
     """Workers that know jobs which fail, and start quickly."""
-    monkeypatch.setitem(job_kinds.KINDS, BAD.name, BAD)
+    for kind in (BAD, MIDDLE, LONG):
+        monkeypatch.setitem(job_kinds.KINDS, kind.name, kind)
     context = multiprocessing.get_context("fork")
     monkeypatch.setattr(multiprocessing, "get_context", lambda _: context)
     monkeypatch.setattr(worker_module, "warm", lambda: None)
@@ -186,3 +194,44 @@ def test_a_mapper_forgets_jobs_that_failed_and_goes_on(words: Any, make_flight: 
     feed(mapper, [make_flight()], run=run)
     assert mapper.jobs_failed == tried // 3 > 0
     assert mapper.counts.bundles > 0 and mapper.summary()["jobs_open"] == 0
+
+
+def test_short_jobs_do_not_wait_for_long_ones_and_those_that_come_first_are_begun_first(bad_jobs: None) -> None:
+    workers = Workers(2)
+    try:
+        workers.add([Job(1, "bad", BadInputs("a"))], 0)
+        assert _collected(workers, 1) == [1]
+        jobs = [Job(n, "long", BadInputs("sleep0.5")) for n in (2, 3)]
+        workers.add([*jobs, Job(4, "middle", BadInputs("a")), Job(5, "bad", BadInputs("a"))], 0)
+        assert not workers.idle
+        assert set(_collected(workers, 2)) == {4, 5}
+        workers.add([Job(6, "bad", BadInputs("a"))], 0)
+        assert _collected(workers, 3) == [6, 2, 3]
+        assert workers.idle
+    finally:
+        workers.close()
+
+
+def test_one_worker_is_kept_for_local_bundles_alone() -> None:
+    ranks = [kind.rank for kind in (LOCAL_BUNDLE, POSE_GRAPH, FULL_BUNDLE, SCAN)]
+    assert ranks == sorted(set(ranks)) and len(ranks) == len(job_kinds.KINDS)
+
+
+def test_a_worker_that_dies_does_not_hold_up_the_others(bad_jobs: None) -> None:
+    workers = Workers(2)
+    try:
+        workers.add([Job(1, "long", BadInputs("die")), *(Job(n, "bad", BadInputs("a")) for n in (2, 3))], 0)
+        assert sorted(_collected(workers, 3)) == [1, 2, 3]
+        assert any("set aside" in note for note in workers.take_notes())
+    finally:
+        workers.close()
+
+
+def _collected(workers: Workers, number: int) -> list[int]:
+    done: list[int] = []
+    deadline_s = time.monotonic() + 30.0
+    while len(done) < number:
+        assert time.monotonic() < deadline_s
+        done += [job.id for job in workers.done(0)]
+        time.sleep(0.005)
+    return done

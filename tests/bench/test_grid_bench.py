@@ -139,10 +139,12 @@ def test_a_loop_that_leaves_traces_is_told(monkeypatch: pytest.MonkeyPatch) -> N
 
 def test_half_of_a_disparity_image_goes_missing_in_blocks() -> None:
     disparity = np.random.default_rng(1).uniform(1, 40, (120, 376)).astype(np.float32)
-    damaged = robust._without_half(disparity)
+    damaged = robust._without_half(3)(disparity)
     assert 0.35 < (damaged == 0).mean() < 0.65
     assert np.array_equal(damaged[damaged > 0], disparity[damaged > 0])
-    assert np.array_equal(damaged, robust._without_half(disparity))
+    assert np.array_equal(damaged, robust._without_half(3)(disparity))
+    other = robust._without_half(4)(disparity)
+    assert 0.15 < ((damaged == 0) & (other == 0)).mean() < 0.35, "each draw misses other blocks"
 
 
 def test_poses_that_face_walls_stand_before_them() -> None:
@@ -169,7 +171,11 @@ def test_free_cells_inside_a_box_and_out_of_sight_are_told(tmp_path: Path) -> No
         def grid(self) -> GridFile:
             return GridFile(0.05, (-0.5, -0.5, 0.0), np.full((20, 60), FREE, np.int8))  # x to 2.5, y from -.5 to .5
 
-    wrong, unseen = robust._bars("case", Case([], seen, 1.0))
+    case = Case([], seen, 1.0)
+    assert [bar.measured for bar in robust._bars("case", case, case)] == [
+        b.measured for b in robust._bars("case", case)
+    ]
+    wrong, unseen = robust._bars("case", case)
     assert not wrong.met and float(wrong.measured.split()[0]) == pytest.approx(100 / 3, abs=3)
     assert not unseen.met and float(unseen.measured.split()[0]) == pytest.approx(100 / 3, abs=3)
 

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import os
 import re
 import subprocess
 import sys
@@ -100,3 +101,46 @@ def test_ctrl_c_exits_130(monkeypatch: pytest.MonkeyPatch) -> None:
 
     _stand_in(monkeypatch, interrupt)
     assert cli.main(["fly"]) == 130
+
+
+@pytest.mark.parametrize("words", [("base", "--help"), ("fly", "--help"), ("--help",), ("config",)])
+def test_a_reader_that_goes_away_ends_a_command_quietly(words: tuple[str, ...]) -> None:
+    """As `kiteline base --help | head -1` does; it ended in a traceback."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    done = subprocess.run(
+        [sys.executable, "-m", "kiteline_cli", *words], stdout=writer, stderr=subprocess.PIPE, text=True, check=False
+    )
+    os.close(writer)
+    assert done.stderr == ""
+    assert done.returncode in (0, 2)  # argparse swallows the error where its text is longer than a buffer
+
+
+def test_ctrl_c_while_a_command_loads_exits_130(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupt(self: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli.Command, "load", interrupt)
+    assert cli.main(["fly"]) == 130
+
+
+LOADS = """
+import os, signal, sys
+class Finder:
+    def find_spec(self, name, path=None, target=None):
+        if name == "kiteline_lab.replay.replay":
+            try:
+                os.kill(os.getpid(), signal.SIGINT)
+            except KeyboardInterrupt:
+                print("swallowed")
+sys.meta_path.insert(0, Finder())
+sys.argv[1:] = ["replay", "none.mcap"]
+from kiteline_cli.entry import run
+run()
+"""
+
+
+def test_ctrl_c_is_not_swallowed_by_what_loads() -> None:
+    """A library that does so while it is imported let the command go on."""
+    done = subprocess.run([sys.executable, "-c", LOADS], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "")

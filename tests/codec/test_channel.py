@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
-from kiteline_codec.channel import CodedChannel, RecordChannel, plain_pair
+from kiteline_codec.channel import CodedChannel, RecordChannel, coded_channel, plain_pair
 from kiteline_codec.schema import (
     CachedKeyframe,
     CachedLandmarks,
     GridTile,
     Key,
     KeyframePose,
+    LivePose,
     Observations,
     Record,
     RemovedObservations,
@@ -19,7 +21,7 @@ from kiteline_codec.schema import (
 )
 from kiteline_codec.sync.config import SyncConfig
 from kiteline_core.geometry import se3
-from kiteline_core.ids import KeyframeId, SubmapId
+from kiteline_core.ids import AgentId, KeyframeId, SubmapId
 
 POSE = KeyframePose(KeyframeId(7), se3.exp(np.array([1.00003, 2.0, 3.0, 0.1, 0.2, 0.3])))
 
@@ -123,3 +125,25 @@ def test_a_thin_link_carries_corrections_then_cached_keyframes_then_tiles() -> N
     assert a.arrived(messages.key(CachedKeyframe(KeyframeId(0), SubmapId(0), POSE.T_m_k)))
     a.put(CachedKeyframe(KeyframeId(0), SubmapId(3), POSE.T_m_k))
     assert not a.arrived(Key(CachedKeyframe.KIND, 0)), "a newer version is not there yet"
+
+
+@pytest.mark.parametrize("lost_after", range(20, 60, 3))
+def test_three_packets_lost_in_a_row_leave_no_gap_of_a_second_between_poses(lost_after: int) -> None:
+    a, b = coded_channel(1, 1000, "radio"), coded_channel(1, 500, "radio")
+    cross(a, b)
+    rng = np.random.default_rng(0)
+    arrived_ns: list[int] = []
+    sent = 0
+    for tick in range(20, 420):  # frames at 20 Hz, and more corrections than the link carries
+        now_ns = tick * 50_000_000
+        a.put(LivePose(AgentId(0), now_ns, KeyframeId(7), se3.exp(rng.normal(size=6)), 50))
+        for k in range(4):
+            a.put(KeyframePose(KeyframeId(100 * tick + k), POSE.T_m_k))
+        for packet in a.poll(now_ns):
+            sent += 1
+            if not lost_after < sent <= lost_after + 3:
+                arrived_ns += [now_ns for r in b.receive([packet], now_ns) if isinstance(r, LivePose)]
+        a.receive(b.poll(now_ns), now_ns)
+    gaps = np.diff(arrived_ns) / 1e9
+    assert sent > lost_after + 20
+    assert 0.5 < gaps.max() <= 0.95

@@ -305,6 +305,12 @@ def read_code(kind: int, id_: int, data: bytes, part: int = 0) -> dict[str, Any]
         out["free_m"] = ranges([step * c for c in rows["free"]])
         out["clear_m"], out["bands"] = ranges(rows["clear"]), rows["bands"]
         out["free_from_m"] = ranges([2 * c for c in rows["from"]])
+    elif kind == 12:
+        out["T_o_c"], out["stretch"] = s.pose(), s.varint()
+        out["up_c"] = direction(s.u8(), s.signed() / 8191, s.signed() / 8191)
+        if part:
+            out["T_k_s"] = s.pose()
+        out["images"] = list(s.raw(len(data) - s.at))
     elif kind == 21:
         scale = struct.unpack("<f", s.raw(4))[0]
         S = np.array(s.pose())
@@ -367,7 +373,7 @@ def assert_agree(read: dict[str, Any], record: Record) -> None:
             ours: Any = {"size": (c.width, c.height), "floats": floats, "stereo": c.stereo, "T_b_c": c.T_b_c[:3]}[name]
         else:
             ours = getattr(record.scan if hasattr(record, "scan") and hasattr(record.scan, name) else record, name)
-            ours = ours.reshape(-1) if name == "cells" else ours
+            ours = ours.reshape(-1) if name == "cells" else list(ours) if name == "images" else ours
         assert ours is value is None or np.allclose(ours, value, rtol=1e-7, atol=1e-12, equal_nan=True), name
 
 

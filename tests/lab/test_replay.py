@@ -13,7 +13,7 @@ from mcap.writer import CompressionType, Writer
 from kiteline_core.frame import Frame, OdometryBatch
 from kiteline_hw.logs.log_budget import LogBudget
 from kiteline_hw.logs.mcap_file import McapFile
-from kiteline_hw.logs.mcap_log import ODOMETER, LogReader, LogWriter
+from kiteline_hw.logs.mcap_log import ODOMETER, LogMessage, LogReader, LogWriter
 from kiteline_hw.logs.mcap_repair import repair
 from kiteline_hw.ports import SourceError
 from kiteline_hw.sources.open import open_source
@@ -54,6 +54,28 @@ def rewritten(log: Path, to: Path, topic: str, number: int, change: bytes) -> Pa
         writer.finish()
     assert seen > number
     return to
+
+
+class Parts(LogBudget):
+    """A budget that deletes nothing."""
+
+    def make_room(self, writing: Path | None = None) -> None:
+        """Do nothing."""
+
+
+def logged_again(log: LogWriter, m: LogMessage) -> None:
+    """Write a message as it was logged."""
+    if m.schema == "kiteline.Blob":
+        log.blob(m.topic, m.t_ns, m.blob())
+    elif m.topic.endswith("/image"):
+        log.image(m.topic, m.t_ns, m.image(), "left")
+    elif m.schema == "kiteline.Imu":
+        log.imu(m.topic, m.t_ns, m.imu())
+    elif m.schema == "kiteline.Fields":
+        values = {k: np.array(v) if isinstance(v, list) else v for k, v in m.json().items()}
+        log.fields(m.topic, m.t_ns, values)
+    elif m.schema.startswith("kiteline."):
+        log.json(m.topic, m.t_ns, m.json(), m.schema)
 
 
 @pytest.mark.parametrize("half", ["agent0", "base"])
@@ -157,6 +179,35 @@ def test_what_no_packet_carried_cannot_be_replayed(recording: Path, tmp_path: Pa
     fly(Options((str(recording),), tmp_path, "monolith", seconds=0.3), quiet=True)
     with pytest.raises(SourceError, match="monolith"):
         main([str(tmp_path / half / "log.mcap"), "--verify"])
+
+
+@pytest.mark.parametrize("half", ["agent0", "base"])
+def test_a_log_in_parts_replays_through_all_of_them(
+    flown: Path, tmp_path: Path, half: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with LogReader(flown / half / "log.mcap") as reader:
+        steps = reader.topics["/step"]
+        messages = list(reader.messages())
+        budget = Parts(tmp_path, "boot", 2 * sum(len(m.data) for m in messages), 0)  # a part is an eighth
+        with LogWriter(tmp_path / "boot00007.mcap", reader.metadata, budget=budget, part_topic="/step") as log:
+            for m in messages:
+                logged_again(log, m)
+    parts = sorted(tmp_path.glob("boot00007_*.mcap"))
+    assert len(parts) >= 3
+    assert main([str(tmp_path / "boot00007.mcap"), "--verify"]) == 0
+    assert capsys.readouterr().out.startswith(f"{steps} steps")
+    # what stands in a later part is compared, too
+    wrong = rewritten(
+        parts[-1], tmp_path / "wrong.mcap", "/packets/out" if half == "agent0" else "/agent0/packets/out", 0, b"!"
+    )
+    whole = parts[-1].read_bytes()
+    wrong.replace(parts[-1])
+    assert main([str(tmp_path / "boot00007.mcap"), "--verify"]) == 1
+    parts[-1].write_bytes(whole)
+    capsys.readouterr()
+    parts[1].unlink()
+    assert main([str(tmp_path / "boot00007.mcap"), "--verify"]) == 0
+    assert "part 2 is missing" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("role", ["agent", "base"])

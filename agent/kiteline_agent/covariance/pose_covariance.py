@@ -385,9 +385,9 @@ def probability_good(cov: F64, good_m: float, good_rad: float) -> float:
     """
     both = 1.0
     for block, limit in ((cov[:3, :3], good_m), (cov[3:, 3:], good_rad)):
-        mean, square = float(block.trace()), float((block * block).sum())
-        if mean > 1e-18:
-            k = mean * mean / square
+        v = block.ravel().tolist()
+        if (mean := sum(v[::4])) > 1e-18:  # the trace
+            k = mean * mean / sum(x * x for x in v)
             z = ((limit * limit / mean) ** (1.0 / 3.0) - 1.0 + 2.0 / (9.0 * k)) / math.sqrt(2.0 / (9.0 * k))
             both *= 0.5 * math.erfc(-z / math.sqrt(2.0))
     return both

@@ -12,6 +12,7 @@ from kiteline_agent.config import SmoothingConfig
 from kiteline_agent.exchange.correction_batches import CorrectionBatches
 from kiteline_agent.exchange.correction_filter import CorrectionFilter
 from kiteline_agent.exchange.smoothing import Smoothing
+from kiteline_agent.exchange.whole_map_motion import WholeMapMotion
 from kiteline_agent.local_map.fused_landmarks import FusedInMap
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.relocalisation.map_cache import MapCache
@@ -32,7 +33,7 @@ from kiteline_codec.schema import (
     SubmapPlacement,
 )
 from kiteline_core.geometry import se3, sim3
-from kiteline_core.ids import SubmapId
+from kiteline_core.ids import NO_KEYFRAME, SEQUENCE_BITS, SubmapId
 
 F64 = NDArray[np.float64]
 
@@ -56,6 +57,7 @@ class Corrections:
         self._cache = cache
         self._smoothing = Smoothing(smoothing)
         self._filter = CorrectionFilter(smoothing)
+        self._whole = WholeMapMotion(smoothing)
         self._scale_sigma: dict[SubmapId, float] = {}  # relative deviation of lengths in w, by submap
         self._batches = CorrectionBatches()
         self._fused = FusedInMap(local_map)
@@ -112,6 +114,8 @@ class Corrections:
         """Take over the corrections that wait, if they matter in the last frame. Returns whether the map moved."""
         if not self._map.due:
             return False
+        slots = self._slots_of_active()
+        poses = self._map.T_m_k[slots]
         if anchor is not None and self._map.holds_landmarks:
             before = self._map.save()
             self._map.try_corrections(anchor.keyframes)
@@ -122,7 +126,16 @@ class Corrections:
         self._map.apply_corrections()
         self._map.compose_unplaced()
         self._fused.corrected()
+        S_w_m = self._S_w_m.get(self._map.active)
+        if S_w_m is not None:
+            self._whole.add(poses, self._map.T_m_k[slots], S_w_m)
         return True
+
+    def _slots_of_active(self) -> NDArray[np.int64]:
+        """Slots of the keyframes of the active submap, the one seen last at the end."""
+        m = self._map
+        slots = np.flatnonzero((m.keyframe != NO_KEYFRAME) & (m.keyframe >> SEQUENCE_BITS == m.active))
+        return np.asarray(slots[np.argsort(m.last_seen[slots], kind="stable")])
 
     def _place(self, record: SubmapPlacement) -> bool:
         if not record.recognised and self._contradicts_gravity(record.submap, record.S_w_m):
@@ -133,6 +146,7 @@ class Corrections:
             lost_before = record.submap == self._map.active and record.submap != self._continued
             if record.submap not in self._recognised and lost_before:
                 self._filter.clear()
+                self._whole.clear()
                 self._smoothing.snap()  # a merge: until now the submap lay where odometry put it
             self._recognised.add(record.submap)
         else:
@@ -177,7 +191,7 @@ class Corrections:
         return float(up @ told) < _SAME_TILT
 
     def in_world(self, submap: SubmapId, T_m_b: F64, T_o_m: F64, t_ns: int, *, metric: bool) -> F64 | None:
-        """T_w_b (4,4), with corrections smoothed; None if the submap is not placed.
+        """T_w_b (4,4), with corrections smoothed, but for what moved the map as a whole; None if it is not placed.
 
         A new submap in metres continues where odometry puts it in the world, until it is placed.
         m and o share a unit of length; if w has another one, as with a monocular camera, the placement has a scale.
@@ -193,8 +207,16 @@ class Corrections:
             return self._body_in_world(S_w_m, T_m_b)
         T_o_b = T_o_m @ T_m_b
         here = T_o_b[:3, 3]
-        T_w_o = self._filter.weigh(S_w_m @ se3.inverse(T_o_m), here, self._scale_sigma.get(submap, 0.0))
-        return self._body_in_world(self._smoothing.follow(T_w_o, here, t_ns), T_o_b)
+        S_v_m = self._whole.leave_out(S_w_m, T_m_b[:3, 3])
+        scale_sigma = self._scale_sigma.get(submap, 0.0)
+        T_w_o = self._filter.weigh(S_v_m @ se3.inverse(T_o_m), here, scale_sigma)
+        # Where lengths are uncertain, a faster correction would stretch the path while it lasts by more than they are.
+        return self._body_in_world(self._smoothing.follow(T_w_o, here, t_ns, by_share=scale_sigma > 0.0), T_o_b)
+
+    def in_base_map(self, submap: SubmapId, T_m_b: F64) -> F64 | None:
+        """T_w_b (4,4) as corrected last, for what the base tells of w, such as tiles; None if it is not placed."""
+        S_w_m = self._S_w_m.get(submap)
+        return None if S_w_m is None else self._body_in_world(S_w_m, T_m_b)
 
     def _body_in_world(self, S_w_x: F64, T_x_b: F64) -> F64:
         """T_w_b (4,4). S_w_x scales the camera's position, but not the lever arm to the body, which is in metres."""

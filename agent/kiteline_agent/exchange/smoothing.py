@@ -38,11 +38,11 @@ class Smoothing:
         """The held pose is reported once more: nothing moved until this time."""
         self._t_ns = t_ns
 
-    def follow(self, T_w_o: F64, here_o: F64, t_ns: int) -> F64:
+    def follow(self, T_w_o: F64, here_o: F64, t_ns: int, *, by_share: bool = False) -> F64:
         """The pose (4,4) to report for the corrected T_w_o (4,4). here_o: (3,) m, vehicle in o.
 
         The frame rotates about the vehicle, and its speed is measured there. A scale, if w has another unit of length
-        than o, is applied at once.
+        than o, is applied at once. by_share: the same share of what is left in every second, without a least speed.
         """
         dt_s, self._t_ns = (t_ns - self._t_ns) * 1e-9, t_ns
         limits, before = self._config, self._goal
@@ -62,7 +62,8 @@ class Smoothing:
         distance, angle = float(np.linalg.norm(left)), float(np.linalg.norm(rotation))
         shift_share = turn_share = 1.0  # of what is left of the correction, applied in this time
         if limits.max_m_s > 0.0 and distance > 0.0:
-            shift_share = min(1.0, max(limits.max_m_s / distance, 1.0 / limits.time_s) * dt_s)
+            least = 0.0 if by_share else limits.max_m_s / distance
+            shift_share = min(1.0, max(least, 1.0 / limits.time_s) * dt_s)
         if limits.max_rad_s > 0.0 and angle > 0.0:
             turn_share = min(1.0, limits.max_rad_s * dt_s / angle)
         if shift_share >= 1.0 and turn_share >= 1.0:

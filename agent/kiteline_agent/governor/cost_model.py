@@ -29,6 +29,7 @@ class Work:
     window_keyframes: int = 0
     matched_px: int = 0
     segmented_px: int = 0
+    coded_px: int = 0
 
     def clear(self) -> None:
         """Reset all counts for a new step."""
@@ -57,10 +58,11 @@ PRICES_NS: dict[str, float] = {
     "observations": 1_600,  # code
     "bearings": 7_500,  # an epipolar segment searched for a landmark without depth
     "searches": 5_000_000,  # a relocalisation attempt
-    "places": 650_000,  # a keyframe entered into the place index: the first search enters all
+    "places": 650_000,  # a keyframe entered into the place index: the first searches enter all
     "window_keyframes": 3_500_000,  # a keyframe of a solved window of the inertial start
     "matched_px": 75,  # semi-global matching, at the size of disparity images
     "segmented_px": 35,  # ground, labels and scan
+    "coded_px": 9,  # a pixel reduced and coded for the base
 }
 
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from kiteline_agent.inertial import inertial_kernels
 from kiteline_agent.inertial.fixed_lag import InertialState
 from kiteline_agent.inertial.inertial_tracker import InertialTracker
+from kiteline_codec.coding import quantise
 from kiteline_codec.schema import GravityAlignment
 from kiteline_core.frame import ImuBatch
 from kiteline_core.geometry import se3
@@ -22,7 +23,7 @@ from kiteline_core.ids import SubmapId
 F64 = NDArray[np.float64]
 
 _ATTITUDE_TILT = np.array([0, 1, 2, 15, 16])  # in the covariance of a state
-_AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # R_m_c of a level camera that looks along x
+AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # R_m_c of a level camera that looks along x
 
 
 def level_rotation(accel: F64) -> F64:
@@ -72,7 +73,7 @@ class GravityAligner:
         if self._inertial is not None and imu is not None and len(imu.t_ns):
             R_m_b = level_rotation(imu.accel.mean(axis=0))
         else:
-            R_m_b = _AHEAD @ self._camera.T_b_c[:3, :3].T
+            R_m_b = AHEAD @ self._camera.T_b_c[:3, :3].T
         return se3.from_rt(R_m_b, np.zeros(3)) @ self._camera.T_b_c
 
     def update(self, t_ns: int, T_m_b: F64, R_o_m: F64, submap: SubmapId, *, first: bool) -> GravityAlignment | None:
@@ -95,4 +96,6 @@ class GravityAligner:
             return None
         # Rotate about the vehicle, so that its position in the world does not jump.
         here = T_m_b[:3, 3]
-        return GravityAlignment(submap, se3.from_rt(R_l_m, here - R_l_m @ here))
+        T_l_m = se3.from_rt(R_l_m, here - R_l_m @ here)
+        # Rounded as on the wire: the base places the submap exactly there, and its placement moves nothing.
+        return GravityAlignment(submap, quantise.pose(quantise.pose_codes(T_l_m)))

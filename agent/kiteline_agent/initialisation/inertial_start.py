@@ -128,7 +128,8 @@ class InertialStart:
         all_corners = self._tracks.observations()
         if len(all_corners.ids) < self._config.local_map.first_points:
             return None
-        observations = all_corners.part(_covering(all_corners, config.landmarks, config.landmarks_each))
+        columns = _covering(all_corners, config.landmarks, config.landmarks_each)
+        observations = all_corners.part(columns)
         before, stamps = self._before, tuple(k.t_ns for k in keyframes)
         if self._noise is None:
             self._noise = self._measured_noise()
@@ -142,11 +143,12 @@ class InertialStart:
         solution, modelled = found.solution, self._noise
         noise, sigma = self._seen_noise(solution)
         if sigma < _NEARLY * config.scale_sigma:
-            self._noise = noise
             aligned = realigned(
                 keyframes, observations, solution.state, found.xyz, found.first, self._camera, self._config.align
             )
+            all_corners = _with_found(all_corners, columns, aligned)
             keep = aligned.seen.sum(axis=0) >= _MIN_VIEWS
+            self._noise = noise
             again = self._bundle(aligned.part(keep), intervals, prior)
             solution = again.solve(WarmStart(solution.state, found.xyz[keep])) or solution
             noise, sigma = self._seen_noise(solution)
@@ -160,8 +162,9 @@ class InertialStart:
         if not known or not agrees:
             return None
         placed = self._bundle(all_corners, intervals, prior).place_landmarks(solution.state)
-        points = None if placed is None else self._points(ctx, keyframes[-1], all_corners, placed)
+        points = None if placed is None else self._points(ctx, all_corners, placed)
         if points is None or len(points.sigma_rho) < self._config.local_map.first_points:
+            self._tried_ns = None  # the next keyframe may see more of the landmarks
             return None
         cov = config.state_inflation**2 * solution.cov
         duration_s = (stamps[-1] - stamps[0]) * 1e-9
@@ -223,16 +226,15 @@ class InertialStart:
         length_a, length_b = (float(np.linalg.norm(p - p.mean(axis=0))) for p in (a, b))
         return bool(abs(np.log(length_b / length_a)) < self._config.inertial_start.agreement)
 
-    def _points(
-        self, ctx: FrameContext, newest: TrackedKeyframe, corners: CornerObservations, solution: WindowSolution
-    ) -> MetricPoints | None:
+    def _points(self, ctx: FrameContext, corners: CornerObservations, solution: WindowSolution) -> MetricPoints | None:
         """The corners of the newest keyframe whose depth is known."""
         config = self._config.inertial_start
         seen = corners.seen[-1] & (solution.depth_m > _MIN_DEPTH_M) & (solution.depth_sigma < config.depth_sigma)
         fits = bool(seen.any()) and np.isfinite(solution.depth_sigma[seen]).all()
         if not fits:
             return None
-        uv = newest.uv[np.searchsorted(newest.ids, corners.ids[seen])]
+        camera = self._camera
+        uv = corners.xy[-1, seen] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
         octave = np.zeros(len(uv), np.uint8)
         return metric_points_at(ctx, uv, octave, solution.depth_m[seen], solution.depth_sigma[seen], self._camera)
 
@@ -264,6 +266,17 @@ def _covering(corners: CornerObservations, longest: int, each: int) -> NDArray[n
     for seen in corners.seen:
         chosen[np.flatnonzero(seen)[:each]] = True
     return np.flatnonzero(chosen)
+
+
+def _with_found(
+    corners: CornerObservations, columns: NDArray[np.int64], aligned: CornerObservations
+) -> CornerObservations:
+    """The corners, and where alignment found those in `columns` in keyframes in which they were not followed."""
+    xy, seen = corners.xy.copy(), corners.seen.copy()
+    found = aligned.seen & ~seen[:, columns]
+    row, column = np.nonzero(found)
+    xy[row, columns[column]], seen[row, columns[column]] = aligned.xy[found], True
+    return CornerObservations(xy, seen, corners.ids)
 
 
 def _warm(before: _Window, t_ns: tuple[int, ...], corners: CornerObservations) -> WarmStart | None:

@@ -13,6 +13,7 @@ from kiteline_agent.config import AgentConfig
 from kiteline_agent.governor.cost_model import Work
 from kiteline_agent.imaging import alignment_kernels
 from kiteline_agent.imaging.epipolar_kernels import search_segments
+from kiteline_agent.keyframes import seed_kernels as kernels
 from kiteline_agent.local_map.local_map import Candidates, LocalMap
 from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_agent.tracking.frame_images import FrameImages
@@ -56,17 +57,23 @@ class DepthFromMotion:
             return 0
         self._work.bearings += len(chosen)
         rows, warp = seeds.rows[chosen], seeds.warp[chosen]
-        bearing, rho, sigma = self._state(rows)
+        m, n = self._map, len(rows)
+        rho, sigma = m.rho.take(rows), m.sigma_rho.take(rows)
         # The landmark is (direction + centre * rho) / rho in the camera: gives its pixel for any inverse depth.
-        direction, centre = self._rays(track.T_c_m, rows, bearing)
-        reach = config.reach * sigma
-        start = self._pixels(direction, centre, np.maximum(rho - reach, 1e-6))
-        end = self._pixels(direction, centre, np.minimum(rho + reach, ceiling))
+        direction, centre = np.empty((2, n, 3))
+        start, end = np.empty((2, n, 2))
+        kernels.seed_segments(
+            track.T_c_m, m.intrinsics, rows, m.T_m_k, m.bearing, rho, sigma, config.reach, ceiling,
+            direction, centre, start, end,
+        )  # fmt: skip
         uv, found = self._search(images, rows, warp, start, end)
         if ctx.shutter is not None:
             at_frame = ctx.shutter.to_frame(uv, rho / np.maximum(direction[:, 2] + centre[:, 2] * rho, 1e-3))[:, :2]
             uv = np.where(self._map.rolled[rows // self._map.slot_size, None], uv, at_frame)
-        measured, variance, off_line = self._intersect(direction, centre, uv, rows)
+        measured, variance, off_line = np.empty((3, n))
+        kernels.intersect(
+            direction, centre, uv, m.octave.take(rows), m.intrinsics, config.sigma_px, measured, variance, off_line
+        )  # fmt: skip
         agree = np.square(measured - rho) < config.gate**2 * (variance + sigma**2)
         scale = (1 << self._map.octave[rows]).astype(np.float64)
         hit = (found == 1) & agree & (off_line < config.off_line_px * scale) & np.isfinite(variance)
@@ -87,24 +94,6 @@ class DepthFromMotion:
         order = np.lexsort((-fine, self._map.tried.take(rows), -self._map.hits.take(rows)))
         return np.sort(fine[order[:limit]])
 
-    def _state(self, rows: I64) -> tuple[F64, F64, F64]:
-        m = self._map
-        return m.bearing.reshape(-1, 2).take(rows, 0), m.rho.take(rows), m.sigma_rho.take(rows)
-
-    def _rays(self, T_c_m: F64, rows: I64, bearing: F64) -> tuple[F64, F64]:
-        """Directions (n,3) of the seeds, and centres (n,3) of their keyframes, in the camera."""
-        T_c_k = T_c_m @ self._map.T_m_k.take(rows // self._map.slot_size, 0)
-        ray = np.empty((len(rows), 3))
-        ray[:, :2], ray[:, 2] = bearing, 1.0
-        return np.einsum("nij,nj->ni", T_c_k[:, :3, :3], ray), T_c_k[:, :3, 3]
-
-    def _pixels(self, direction: F64, centre: F64, rho: F64) -> F64:
-        """Pixels (n,2) at inverse depths (n,); one behind the camera is taken far out on its side."""
-        p = direction + centre * rho[:, None]
-        z = np.maximum(p[:, 2], 0.05)
-        f, c = self._map.intrinsics[:2], self._map.intrinsics[2:4]
-        return np.asarray(p[:, :2] / z[:, None] * f + c)
-
     def _search(self, images: FrameImages, rows: I64, warp: F64, start: F64, end: F64) -> tuple[F64, NDArray[np.int8]]:
         """Find the templates: correlation along the segment, then alignment. Pixels (n,2), found (n,) 1 or 0."""
         config, align = self._config.depth_from_motion, self._config.align
@@ -123,23 +112,6 @@ class DepthFromMotion:
         uv[seen] = place
         found[seen[~aligned]] = 0
         return uv, found
-
-    def _intersect(self, direction: F64, centre: F64, uv: F64, rows: I64) -> tuple[F64, F64, F64]:
-        """Inverse depths (n,) nearest to the rays through uv, their variances, and px off the epipolar line."""
-        f, c = self._map.intrinsics[:2], self._map.intrinsics[2:4]
-        across = (uv - c) / f
-        gain = centre[:, :2] - across * centre[:, 2:]
-        want = across * direction[:, 2:] - direction[:, :2]
-        power = np.einsum("ni,ni->n", gain, gain)
-        rho = np.einsum("ni,ni->n", gain, want) / np.maximum(power, 1e-18)
-        p = direction + centre * rho[:, None]
-        z = np.maximum(p[:, 2], 1e-3)
-        slope = f * (centre[:, :2] - p[:, :2] / z[:, None] * centre[:, 2:]) / z[:, None]  # px per 1/m
-        sigma = self._config.depth_from_motion.sigma_px * (1 << self._map.octave[rows])
-        with np.errstate(divide="ignore"):
-            variance = np.where(p[:, 2] > 0.05, sigma**2 / np.einsum("ni,ni->n", slope, slope), np.inf)
-        off = np.hypot(*(p[:, :2] / z[:, None] * f + c - uv).T)
-        return rho, variance, off
 
     def _count(self, rows: I64, hit: Bool, failed: Bool) -> None:
         """Count tries and hits; drop seeds that keep failing or never get a depth."""

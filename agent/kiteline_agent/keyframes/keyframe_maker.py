@@ -68,8 +68,8 @@ class KeyframeMaker:
         if self._rows is None or right is None:
             return points
         raw = np.where(points.disparity > 0.0, points.disparity + self._map.offset_px(points.uv), -1.0)
-        self._rows.add(ctx.images.aligned, right.raw(), points.uv, points.octave, raw)
-        if self._rows.apply() > 0.0:
+        measured = self._rows.add(ctx.images.aligned, right.raw(), points.uv, points.octave, raw)
+        if measured and self._rows.apply() > 0.0:
             points = new_points(ctx.images, taken, self._camera, ctx.config)
         return points
 

@@ -30,6 +30,7 @@ class PoseReport:
         self._agent, self._camera, self._corrections, self._channel = agent, camera, corrections, channel
         self._has_depth = has_depth
         self._last: Estimate | None = None
+        self._T_w_b: F64 | None = None  # of the last frame, as corrected last
         self._recent = RecentMotion()
 
     def report(self, ctx: FrameContext, outcome: FrameOutcome) -> Estimate:
@@ -48,6 +49,10 @@ class PoseReport:
         if keyframe != NO_KEYFRAME:
             self._channel.put(LivePose(self._agent, ctx.t_ns, keyframe, T_k_c, quality))
         T_w_b = self._corrections.in_world(submap, T_m_b, T_o_m, ctx.t_ns, metric=camera.motion.metric)
+        self._T_w_b = None
+        if tracked and T_w_b is not None:
+            in_base_map = self._corrections.in_base_map(submap, T_m_b)
+            self._T_w_b = T_w_b if in_base_map is None else in_base_map
         self._last = Estimate(
             ctx.t_ns, tracked, outcome.bridged, T_m_b if tracked else None, T_o_m @ T_m_b, keyframe, T_k_c.copy(),
             submap, outcome.inliers, quality, cov_m, cov_o, camera.gravity.R_l_o, T_w_b if tracked else None,
@@ -68,11 +73,14 @@ class PoseReport:
         """`quality` of T_o_b, which no map corrects: for a flight controller."""
         return min(estimate.quality, self._camera.covariance.quality(estimate.cov_o, None))
 
-    def in_world(self, T_o_b: F64) -> F64 | None:
-        """T_w_b (4,4) of a pose since the last frame; None while that frame's is not known."""
-        if self._last is None or self._last.T_w_b is None:
+    def in_base_map(self, T_o_b: F64) -> F64 | None:
+        """T_w_b (4,4) of a pose since the last frame, for the base's tiles; None while that frame's is not known.
+
+        Not smoothed as live poses are: the base draws tiles where its map lies now.
+        """
+        if self._last is None or self._T_w_b is None:
             return None
-        return np.asarray(self._last.T_w_b @ se3.inverse(self._last.T_o_b) @ T_o_b)
+        return np.asarray(self._T_w_b @ se3.inverse(self._last.T_o_b) @ T_o_b)
 
     def predict(self, t_ns: int, imu: ImuBatch | None, max_s: float) -> PredictedPose | None:
         """Predict the pose at t_ns. imu: samples since the last frame. Changes no state.

@@ -76,7 +76,7 @@ class Relocaliser:
         self.has_texture = True  # the last frame that was searched had enough corners
 
     def add_keyframe(self, keyframe: KeyframeId) -> None:
-        """Note a keyframe of the local map. It enters the place index at the next search: most flights need none."""
+        """Note a keyframe of the local map. Searches enter it into the place index: most flights need none."""
         if self._index is not None:
             self._waiting.append(keyframe)
             if len(self._waiting) > 2 * len(self._map.keyframe):
@@ -84,17 +84,17 @@ class Relocaliser:
                 self._waiting = [waiting for waiting in self._waiting if waiting in held]
 
     def enter_keyframes(self) -> None:
-        """Enter the keyframes that wait into the place index; evicted ones leave it."""
-        waiting, self._waiting = self._waiting, []
-        if self._index is None or not waiting:
+        """Enter keyframes that wait into the place index, the newest first, so many in a frame; evicted ones leave."""
+        if self._index is None or not self._waiting:
             return
         for key in self._index.keys:
             if self._map.slot_of(key) < 0:
                 self._index.remove(key)
-        for keyframe in waiting:
-            if self._map.slot_of(keyframe) >= 0:
-                self._work.places += 1
-                self._enter(self._index, keyframe)
+        waiting, most = [k for k in self._waiting if self._map.slot_of(k) >= 0], self._config.relocalisation.entered
+        self._waiting = waiting[:-most]
+        for keyframe in waiting[-most:]:
+            self._work.places += 1
+            self._enter(self._index, keyframe)
 
     def _enter(self, index: PlaceIndex, keyframe: KeyframeId) -> None:
         slot = self._map.slot_of(keyframe)
@@ -139,12 +139,12 @@ class Relocaliser:
 
     def _search(self, ctx: FrameContext, reference: KeyframeId, exclude: SubmapId | None) -> Relocalisation | None:
         """Try the reference keyframe, the most similar places, and the map cache, in this order."""
+        self.enter_keyframes()  # also where nothing can be seen: frames without texture are cheap
         # 1. Corners and descriptors.
         seen = frame_features(ctx.images, self._detector, self._config.relocalisation.min_corners)
         self.has_texture = seen is not None
         if seen is None:
             return None
-        self.enter_keyframes()
         # 2. Candidates, each verified by P3P, by the tracker and against the motion.
         for keyframe in self._candidates(seen, reference, exclude):
             fit = self._pose_from(keyframe, seen, ctx.number)

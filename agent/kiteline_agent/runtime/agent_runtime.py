@@ -11,10 +11,11 @@ from typing import Any
 
 import cv2
 
-from kiteline_agent.agent import Agent
 from kiteline_agent.config import AgentConfig
+from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_agent.governor.cost_model import cost_ns
 from kiteline_agent.governor.virtual_cpu import VirtualCpu
+from kiteline_agent.onboard import onboard_agent
 from kiteline_agent.runtime.camera_reader import CameraReader
 from kiteline_agent.runtime.flight_log import STEP
 from kiteline_agent.runtime.flight_record import FlightRecord, metadata
@@ -71,7 +72,8 @@ class AgentRuntime:
         self.counts = FrameCounts()
         self.flight_counts: dict[str, int | float] | None = None  # when the last frame had been flown
         self.rss_mib = 0.0
-        config = config or agent_config(options.config, options.cpu_percent, options.rig, options.grid)
+        grid = "agent" if options.grid == "base" and isinstance(channel, NoBaseChannel) else options.grid
+        config = config or agent_config(options.config, options.cpu_percent, options.rig, grid, options.tracker)
         self._rig_file = RigFile(options.rig) if options.rig else None
         if whole_process:
             kernel_cache.fill(WARMING)
@@ -95,7 +97,7 @@ class AgentRuntime:
         self._lines: tuple[LineFile, ...] = ()
         self._notices = Notices()
         self._record = self._open_record(config) if options.log_name else None
-        self.agent = Agent(
+        self.agent = onboard_agent(
             source.rig,
             source.imu,
             config,
@@ -307,7 +309,8 @@ class AgentRuntime:
 
 def opened(options: AgentOptions) -> FrameSource:
     """The source of a flight. Raises SourceError."""
-    return open_source(options.source, mono=options.mono, imu=options.imu, calibration=options.calibration)
+    mono = options.mono or options.tracker == "ekf"
+    return open_source(options.source, mono=mono, imu=options.imu, calibration=options.calibration)
 
 
 def channel_with_spill(options: AgentOptions) -> RecordChannel:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from contextlib import ExitStack
 
-from kiteline_agent.agent import Agent
+from kiteline_agent.onboard import OnboardAgent
 from kiteline_agent.runtime.options import (
     AgentOptions,
     agent_config,
@@ -67,7 +67,7 @@ def with_controller_imu(options: AgentOptions, source: FrameSource) -> FrameSour
     return with_other_imu(source, own.noise, own.camera())
 
 
-def pose_sample(agent: Agent, output: StepOutput, t_ns: int, epoch: int) -> PoseSample | None:
+def pose_sample(agent: OnboardAgent, output: StepOutput, t_ns: int, epoch: int) -> PoseSample | None:
     """The pose of a step for a flight controller, as of t_ns of its clock; None without a gravity-aligned one."""
     pose: Estimate | PredictedPose | None = output.estimate or output.predicted
     if pose is None or pose.T_l_b is None:
@@ -78,7 +78,7 @@ def pose_sample(agent: Agent, output: StepOutput, t_ns: int, epoch: int) -> Pose
 
 
 def push_obstacles(
-    controller: ControllerLink, agent: Agent, output: StepOutput | None, due: PoseSchedule, now_ns: int
+    controller: ControllerLink, agent: OnboardAgent, output: StepOutput | None, due: PoseSchedule, now_ns: int
 ) -> None:
     """Send what stands around the vehicle if that is due, by the pose of a step, while the vehicle is tracked."""
     pose = None if output is None else output.estimate or output.predicted

@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
-from kiteline_agent.agent import Agent
+from kiteline_agent.onboard import OnboardAgent
 from kiteline_agent.runtime.agent_runtime import PROGRESS_FRAMES, AgentRuntime, channel_with_spill, opened
 from kiteline_agent.runtime.controller import (
     OBSTACLES_HZ,
@@ -38,7 +38,7 @@ from kiteline_hw.ports import ByteLink, ControllerLink, LinkError
 from kiteline_hw.system import kernel_cache, process
 from kiteline_hw.system.clock import MonotonicClock
 from kiteline_hw.system.cpu import CpuQuota
-from kiteline_hw.system.key_store import read_keys
+from kiteline_hw.system.key_store import login_of, read_keys
 from kiteline_hw.system.long_work import starting
 from kiteline_hw.system.start_numbers import Start, StartNumbers
 
@@ -76,7 +76,10 @@ def fly_live(
         clock = MonotonicClock()
         controller = controller_link(options, source, clock, stack)
         shared = None if controller is None else controller.tunnel_link()
-        link = shared or open_link(options.link, "agent", options.agent, framer=StreamFramer, required=False)
+        link = shared or open_link(
+            options.link, "agent", options.agent, framer=StreamFramer, required=False,
+            logins=None if key is None else login_of(options.agent, key),
+        )  # fmt: skip
         stack.callback(link.close)
         sealer: Sealer | None = None
         session = agent_session(options.order, options.boot)
@@ -160,7 +163,12 @@ def _measured(by_controller: _Batch | None, by_source: _Batch | None, shift_ns: 
 
 
 def _push(
-    controller: ControllerLink, agent: Agent, captured_ns: int, boot: int, clock: MonotonicClock, output: StepOutput
+    controller: ControllerLink,
+    agent: OnboardAgent,
+    captured_ns: int,
+    boot: int,
+    clock: MonotonicClock,
+    output: StepOutput,
 ) -> None:
     """Send the pose of a step to the flight controller, if there is one."""
     pose = pose_sample(agent, output, captured_ns, boot)

@@ -16,7 +16,9 @@ from kiteline_codec.transport.link_traits import LinkTraits
 from kiteline_codec.transport.seal import seal_bytes, suite_for
 from kiteline_core import config as configuration
 
+GRIDS = ("agent", "base", "off")  # who makes scans of ground and obstacles
 LOG_STEM = "boot"  # of the names of logs of `kiteline agent --log`
+TRACKERS = ("map", "ekf")
 LOG_MIB = 8000  # MiB of logs by default: half an hour of flight with images at least
 
 
@@ -59,7 +61,8 @@ class AgentOptions:
     origin: str = ""  # LAT,LON,ALT to set in the flight controller; "": none
     obstacles: bool = False  # send OBSTACLE_DISTANCE
     mavlink_key: str = ""  # a file with the key of MAVLink's signatures; "": none
-    grid: str = "agent"  # who makes scans of ground and obstacles: agent, or off
+    tracker: str = ""  # map, or ekf; "": what the configuration says
+    grid: str = "agent"  # who makes scans of ground and obstacles: agent, base, or off
     imu_of: str = ""  # whose IMU is used: controller; "": the source's, if it has one
     kill_at_s: float | None = None  # end like a crash at this flight time
     await_base_at_s: float | None = None  # look for a base again at this flight time
@@ -76,15 +79,18 @@ def options_of(a: argparse.Namespace, folder: Path) -> AgentOptions:
         cpu_percent=a.cpu, mavlink=a.mavlink, axes=a.axes,
         odometry=a.odometry, imu_of=a.imu, offset=a.offset, heading=a.heading, pose_messages=a.pose_messages,
         origin=a.origin, mavlink_key=a.mavlink_key, obstacles=a.obstacles,
-        grid=a.grid,
+        grid=a.grid, tracker=a.tracker,
     )  # fmt: skip
 
 
-def agent_config(path: str, cpu_percent: float = 0.0, rig: str = "", grid: str = "agent") -> AgentConfig:
+def agent_config(
+    path: str, cpu_percent: float = 0.0, rig: str = "", grid: str = "agent", tracker: str = ""
+) -> AgentConfig:
     """The configuration, with the [agent] table of a TOML file in place of the defaults. Raises ConfigError.
 
     cpu_percent: of one core, overrides the governor's budget; 0: what the file says. rig: a rig file.
-    grid: "off" for no scans, whatever the file says.
+    grid: "off" for no scans, "base" for those of stereo pairs made by the base, whatever the file says.
+    tracker: "map" or "ekf", likewise; "": what the file says.
     """
     config = AgentConfig()
     if path:
@@ -93,9 +99,21 @@ def agent_config(path: str, cpu_percent: float = 0.0, rig: str = "", grid: str =
         config = replace(config, known_rig=rig_file.load(rig))
     if grid == "off":
         config = replace(config, scan=replace(config.scan, on=False))
+    elif grid == "base":
+        config = replace(config, scan=replace(config.scan, by_base=True))
+    if tracker:
+        config = configuration.apply(config, {"tracker": tracker})
     if cpu_percent <= 0.0:
         return config
     return replace(config, governor=replace(config.governor, cpu_percent=cpu_percent))
+
+
+def unused_by_filter(a: argparse.Namespace) -> list[str]:
+    """Arguments that `--tracker ekf` has no use for: it makes no scans and reads no IMU."""
+    if a.tracker != "ekf":
+        return []
+    given = {"--obstacles": a.obstacles, "--imu": bool(a.imu), "--grid base": a.grid == "base"}
+    return [name for name, is_given in given.items() if is_given]
 
 
 def channel_for(options: AgentOptions, link: LinkTraits, spill: Spill | None = None) -> RecordChannel:
@@ -168,8 +186,15 @@ def parser(forms: str = "") -> argparse.ArgumentParser:
         help="send distances to obstacles around the vehicle (OBSTACLE_DISTANCE)",
     )  # fmt: skip
     p.add_argument(
-        "--grid", choices=("agent", "off"), default="agent",
-        help="who looks for ground and obstacles: the agent, where CPU time is left (default), or nobody",
+        "--grid", choices=GRIDS, default="agent",
+        help="who looks for ground and obstacles: the agent, where CPU time is left (default); the base, in images of "
+        "some 25 kB that a wide link carries (else the agent; obstacles for a flight controller then come from the "
+        "base's grid); or nobody",
+    )  # fmt: skip
+    p.add_argument(
+        "--tracker", choices=TRACKERS, default="",
+        help="map (default), or ekf: a Kalman filter over pose and landmarks, for one camera with odometry and hardly "
+        "any CPU; it shares no keyframes",
     )  # fmt: skip
     p.add_argument("--mavlink-key", metavar="FILE", default="", help="sign MAVLink messages, and take none unsigned")
     p.add_argument("--log", metavar="DIR", default="", help="log each start to DIR/agentN/bootNNNNN.mcap, …_1.mcap")
@@ -183,7 +208,7 @@ def parser(forms: str = "") -> argparse.ArgumentParser:
     p.add_argument("--key", metavar="FILE", default="", help="seal packets; take none but sealed ones "
                    "(default: the file of `kiteline keys pair`)")  # fmt: skip
     p.set_defaults(told=())
-    p.add_argument("--insecure", action="store_true", help="use an IP link without seals")
+    p.add_argument("--insecure", action="store_true", help="use the link without seals")
     p.add_argument("--profile", choices=("wifi", "radio"), default="", help="default: as the link allows")
     p.add_argument("--mono", action="store_true", help="the left camera alone")
     p.add_argument("--no-imu", action="store_true", help="without inertial samples")

@@ -7,12 +7,14 @@ from numpy.typing import NDArray
 
 from kiteline_agent.agent import Agent
 from kiteline_agent.config import AgentConfig, TwoViewConfig
+from kiteline_agent.ekf.filter_warm import warm_filter
 from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_agent.imaging.alignment_kernels import TEMPLATE, TEMPLATE_LEVELS
 from kiteline_agent.imaging.epipolar_kernels import search_segments
 from kiteline_agent.imaging.features import build_pyramid
 from kiteline_agent.initialisation.two_view import two_view
 from kiteline_agent.initialisation.window_kernels import add_observations
+from kiteline_agent.keyframes.seed_kernels import intersect, seed_segments
 from kiteline_agent.local_map.disparity_kernels import linearise_pair, move_points
 from kiteline_agent.scan_config import LocalGridConfig
 from kiteline_agent.scans.local_grid import LocalGrid
@@ -24,7 +26,7 @@ from kiteline_core.frame import Frame, ImuBatch, ImuCalibration
 from kiteline_core.geometry.cameras import CameraModel, CameraRig, Rectifier
 from kiteline_core.geometry.se3 import from_rt
 from kiteline_core.ground.config import GroundConfig
-from kiteline_core.ground.segmentation import GroundSegmenter
+from kiteline_core.ground.segmentation import ExpectedGround, GroundSegmenter
 from kiteline_core.ids import AgentId
 from kiteline_core.imaging.matching import MatchConfig, match, match_near
 from kiteline_core.places.place_index import PlaceIndex, Vocabulary, nodes
@@ -35,6 +37,9 @@ WARMING = ("kiteline_codec.warm", "kiteline_agent.runtime.warm")  # modules whos
 
 def warm(config: AgentConfig | None = None) -> None:
     """Run every kernel once, on the types that flights use. A filled cache makes this take a fraction of a second."""
+    if config is not None and config.tracker == "ekf":
+        warm_filter()
+        return
     state, pixels = 1, np.empty(240 * 320, np.uint8)
     for i in range(pixels.size):  # deterministic noise: corners everywhere
         state = state * 1103515245 + 12345 & 0x7FFFFFFF
@@ -75,7 +80,9 @@ def _warm_scans(rig: CameraRig) -> None:
     disparity = np.broadcast_to(np.maximum(rows * view.bf, 2.6)[:, None], (view.height, view.width))
     image = np.zeros((view.height, view.width), np.uint8)
     up_c = np.array([0.0, -1.0, 0.0])
-    scan = segmenter.segment(np.ascontiguousarray(disparity, np.float32), (image, image), up_c).scan
+    measured = np.ascontiguousarray(disparity, np.float32), (image, image), up_c
+    segmenter.segment(*measured, expected=ExpectedGround(1.0, 0.1))
+    scan = segmenter.segment(*measured).scan
     grid.add(Scanned(scan, np.eye(4), 1.0, np.zeros(5)), RangeError.of_noise(view.bf, segmenter.surface_sigma_px))
     grid.around(np.eye(4), None, {}, GroundConfig().bands_m)
 
@@ -107,7 +114,7 @@ def _resting(k: int) -> ImuBatch:
 
 
 def _warm_monocular(image: NDArray[np.uint8], draw: NDArray[np.float64]) -> None:
-    """Both starts, on a cloud of points (3,n) drawn from 0 to 1 and on one point, and the search along a segment."""
+    """Both starts, on a cloud of points (3,n) drawn from 0 to 1 and on one point, and the search of a seed."""
     x, y, z = draw[0] - 0.5, draw[1] - 0.5, 1.0 + draw[2]
     a, b = (np.column_stack([200.0 * (x - shift) / z + 159.5, 200.0 * y / z + 119.5]) for shift in (0.0, 0.2))
     two_view(a, b, np.array([200.0, 200.0, 159.5, 119.5]), TwoViewConfig(), 0)
@@ -122,3 +129,9 @@ def _warm_monocular(image: NDArray[np.uint8], draw: NDArray[np.float64]) -> None
         build_pyramid(image, 4), NO_GRID, templates, np.zeros(1, np.int64), np.zeros(1, np.uint8), np.eye(2)[None],
         place, place + 5.0, 0.7, 40, 0.7, 0.9, place.copy(), np.zeros(1, np.int8),
     )  # fmt: skip
+    ray, mean = np.ones((1, 3)), np.ones(1)
+    seed_segments(
+        np.eye(4), np.ones(5), np.zeros(1, np.int64), np.eye(4)[None], np.zeros((1, 1, 2)), mean, mean, 1.0, 2.0, ray,
+        ray.copy(), place.copy(), place.copy(),
+    )  # fmt: skip
+    intersect(ray, ray, place, np.zeros(1, np.uint8), np.ones(5), 1.0, mean, mean.copy(), mean.copy())

@@ -2,6 +2,7 @@
 
 Keyframes are scanned, and frames between them in which something new is seen; a view that stays is scanned again now
 and then. The height of the ground is followed from scan to scan; those that saw another are held back or withdrawn.
+If the base makes the scans, their images are sent in place of all that, except while the link does not carry them.
 """
 
 from __future__ import annotations
@@ -19,15 +20,17 @@ from kiteline_agent.mapping.camera_state import CameraState
 from kiteline_agent.scan_config import ScanConfig
 from kiteline_agent.scans.range_error import RangeError
 from kiteline_agent.scans.scan_queue import ScanQueue
+from kiteline_agent.scans.sent_images import SentImages
 from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_codec.channel import RecordChannel
-from kiteline_codec.schema import KeyframeScan
+from kiteline_codec.schema import KeyframeScan, ScanImages
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import Rectifier
 from kiteline_core.ground.column_scan import ColumnScan
 from kiteline_core.ground.config import GroundConfig
 from kiteline_core.ground.disparity import DisparityStripes
 from kiteline_core.ground.ground_height import GroundHeight, Seen, Verdict, without_ground
+from kiteline_core.ground.image_codes import encode_pair
 from kiteline_core.ground.segmentation import GroundSegmenter
 from kiteline_core.ground.wide_view import WideView
 from kiteline_core.ids import NO_KEYFRAME, KeyframeId
@@ -60,6 +63,7 @@ class _Begun:
     """A scan that is being made. uv: (n,2) keypoints to label. stripe: the next one; disparity: of a depth camera.
 
     part: 0 of the keyframe itself; else T_k_s (4,4) is the pose of a later camera in it. repeats: see `Scanned`.
+    as_images: the base makes it.
     """
 
     keyframe: KeyframeId
@@ -71,6 +75,12 @@ class _Begun:
     disparity: F32 | None
     stripe: int = 0
     repeats: bool = False
+    as_images: bool = False
+
+    @property
+    def is_replaceable(self) -> bool:
+        """True if a keyframe may take the place of its frame: nothing is matched, and it shows something new."""
+        return not (self.stripe or self.repeats) and self.disparity is None
 
 
 class ScanStage:
@@ -87,7 +97,8 @@ class ScanStage:
         self._channel = channel
         self._config = config
         self._work = work
-        self._view = WideView(rectifier, ground)
+        # The base knows the rectified camera alone.
+        self._view = WideView(rectifier, replace(ground, wider=0.0, lower=0.0) if config.by_base else ground)
         self._segmenter = GroundSegmenter(self._view.camera, ground)
         self._stripes = DisparityStripes(self._segmenter.camera, ground) if local_map.camera.stereo else None
         self._raw: tuple[U8, U8] | None = None  # images of the scan that was begun, until they are matched
@@ -98,6 +109,8 @@ class ScanStage:
         self._keyframe = NO_KEYFRAME  # the newest one, whose scans are numbered
         self._part = 0  # of its newest scan
         self._queue = ScanQueue(channel)
+        self._images = SentImages(channel)
+        self._stretch = 0  # of the flight: counts losses after which the odometry frame lies elsewhere
         bf, at_scan = local_map.camera.bf, self._segmenter.camera.bf
         self._error = RangeError.of_noise(bf, self._segmenter.surface_sigma_px * bf / at_scan)
 
@@ -114,32 +127,45 @@ class ScanStage:
     def step(self, ctx: FrameContext) -> Scanned | None:
         """Go on with the scan in work, or begin one if this frame became a keyframe that shows something new."""
         self._queue.share()
+        self._images.remove_arrived()
         if not ctx.config.scan.on:
             return None
         reference = self._camera.reference
         of_keyframe = reference.is_of(ctx.number)
         if reference.is_newest and reference.keyframe != self._keyframe:
             self._keyframe, self._part = reference.keyframe, 0
-        if self._begun is None:
-            shows_more = self._shows_more()
-            if shows_more or ctx.t_ns - self._last_ns > self._config.again_s * 1e9:
-                self._begin(ctx, of_keyframe, repeats=not shows_more)
+        if self._begun is None or (of_keyframe and self._begun.is_replaceable):
+            self._begin_if_due(ctx, of_keyframe)
             return None
         if of_keyframe or not self._governor.may_scan():
             return None  # a keyframe is work enough for a frame
         begun = self._begun
+        if begun.as_images:
+            self._begun = None
+            self._send_images(begun)
+            return None
         parts = min(_MOST_PARTS, max(1, round(ctx.dt_s / self._config.part_s)))
         for _ in range(parts):
             if begun.disparity is None and not self._match_stripe(begun):
                 continue
             assert begun.disparity is not None
             self._begun = None
-            return self._finish(begun, begun.disparity)
+            scanned = self._finish(begun, begun.disparity)
+            if parts < _MOST_PARTS:  # a slow camera's next keyframe would come in the midst of it
+                self._begin_if_due(ctx, of_keyframe)
+            return scanned
         return None
+
+    def _begin_if_due(self, ctx: FrameContext, of_keyframe: bool) -> None:
+        """Begin a scan of a frame that shows something new, or of any one after a while."""
+        shows_more = self._shows_more() or (of_keyframe and self._begun is not None)
+        if shows_more or ctx.t_ns - self._last_ns > self._config.again_s * 1e9:
+            self._begin(ctx, of_keyframe, repeats=not shows_more)
 
     def forget(self) -> None:
         """The camera has moved by an unknown way: the ground lies elsewhere than where it was seen, in o."""
         self._begun = self._last_T_o_c = None
+        self._stretch += 1
         self._ground = GroundHeight(self._segmenter.config)
 
     def _match_stripe(self, begun: _Begun) -> bool:
@@ -149,15 +175,28 @@ class ScanStage:
             begun.disparity = self._view.mask(self._stripes.finish())
             return True
         if begun.stripe == 0:  # not in the frame of the keyframe
-            assert self._raw is not None
-            left, right = self._view.pair(*self._raw)
-            self._work.rectified_px += 2 * left.size
-            self._stripes.begin(left, right)
-            self._raw = None
+            self._stripes.begin(*self._take_pair())
         self._stripes.match(begun.stripe)
         self._work.matched_px += self._stripes.stripe_px
         begun.stripe += 1
         return False
+
+    def _take_pair(self) -> tuple[U8, U8]:
+        """The rectified half-size images (h,w) of the scan that was begun."""
+        assert self._raw is not None
+        left, right = self._view.pair(*self._raw)
+        self._work.rectified_px += 2 * left.size
+        self._raw = None
+        return left, right
+
+    def _send_images(self, begun: _Begun) -> None:
+        """Let the base make a scan."""
+        left, right = (self._segmenter.camera.reduced(half) for half in self._take_pair())
+        self._work.coded_px += 2 * left.size
+        code = encode_pair((left, right), self._config.jpeg_quality)
+        self._images.put(
+            ScanImages(begun.keyframe, begun.T_o_c, self._stretch, begun.up_c, code, begun.part, begun.T_k_s)
+        )
 
     def _shows_more(self) -> bool:
         """True if the camera has moved or turned since the last scan by enough to see something else."""
@@ -173,6 +212,9 @@ class ScanStage:
     def _begin(self, ctx: FrameContext, of_keyframe: bool, *, repeats: bool) -> None:
         """Take what a scan of this frame needs."""
         images, disparity, reference = ctx.images, None, self._camera.reference
+        as_images = self._config.by_base and images.depth_m is None and self._images.has_room
+        if as_images and repeats:
+            return
         # An older keyframe, to which a relocalisation led, has scans under the next numbers already.
         hangs = reference.keyframe != NO_KEYFRAME and reference.keyframe == self._keyframe
         if not (of_keyframe or repeats) and (not hangs or self._part == KeyframeScan.PARTS - 1):
@@ -190,12 +232,11 @@ class ScanStage:
             self._begun = _Begun(reference.keyframe, 0, None, up_c, T_o_c, np.empty((0, 2)), disparity, repeats=True)
             return
         self._last_T_o_c = T_o_c
-        if of_keyframe:
-            self._begun = _Begun(reference.keyframe, 0, None, up_c, T_o_c, self._maker.new_uv, disparity)
-        else:
+        part, T_k_s, uv = 0, None, self._maker.new_uv
+        if not of_keyframe:
             self._part += 1
-            T_k_s, uv = reference.T_k_c.copy(), np.empty((0, 2))
-            self._begun = _Begun(reference.keyframe, self._part, T_k_s, up_c, T_o_c, uv, disparity)
+            part, T_k_s, uv = self._part, reference.T_k_c.copy(), np.empty((0, 2))
+        self._begun = _Begun(reference.keyframe, part, T_k_s, up_c, T_o_c, uv, disparity, as_images=as_images)
 
     def _finish(self, begun: _Begun, disparity: F32) -> Scanned:
         segmenter, stereo = self._segmenter, self._stripes is not None

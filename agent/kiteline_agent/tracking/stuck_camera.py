@@ -33,7 +33,9 @@ class StuckCamera:
     def update(self, left: NDArray[np.uint8], T_o_c: F64) -> bool:
         """True if image (h,w) is an old one although the camera should be at T_o_c (4,4) by now."""
         rows = left[::_ROW_STEP]
-        if not np.array_equal(rows, self._rows):
+        middle = len(rows) // 2  # tells most images apart by itself
+        same = rows.shape == self._rows.shape and np.array_equal(rows[middle], self._rows[middle])
+        if not (same and np.array_equal(rows, self._rows)):
             self._rows, self._T_o_c, self._repeats = rows.copy(), T_o_c.copy(), 0
             return False
         self._repeats += 1

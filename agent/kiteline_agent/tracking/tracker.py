@@ -44,15 +44,14 @@ class Tracker:
             T_c_m = rough.T_c_m
         return self._fine(ctx, T_c_m, align.fine_from)
 
-    def track_by_imu(self, ctx: FrameContext) -> Track:
-        """The same from the prediction of an IMU, which is mostly good to half a pixel: on the finest level alone then.
+    def track_by_imu(self, ctx: FrameContext) -> Track | None:
+        """The same from the prediction of an IMU, which is mostly good to half a pixel: on the finest level alone.
 
-        A track that is farther from the prediction is measured again by both passes.
+        None if the track is farther from the prediction, or holds too little: then both passes have to measure it.
         """
         pose = ctx.config.pose
         track = self._fine(ctx, ctx.T_c_m, 0)
-        near = track.holds(pose) and self._off_px(track, ctx.T_m_c) < pose.dragged_px
-        return track if near else self.track(ctx, ctx.T_c_m)
+        return track if track.holds(pose) and self._off_px(track, ctx.T_m_c) < pose.dragged_px else None
 
     def _fine(self, ctx: FrameContext, T_c_m: F64, first: int, near_px: float = np.inf) -> Track:
         """Measure the pose from a prediction (4,4) that is good to some pixels: many landmarks, with disparities.

@@ -7,6 +7,7 @@ others are needed more.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -15,12 +16,12 @@ from numpy.typing import NDArray
 from kiteline_basestation.config import LoopConfig, MapCacheConfig
 from kiteline_basestation.exchange.agent_velocity import AgentVelocity
 from kiteline_basestation.exchange.sharing import SharingPolicy
-from kiteline_basestation.map.map_tables import CULLED, LANDMARK
+from kiteline_basestation.map.map_tables import CULLED, LANDMARK, NO_POSE
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_codec.channel import RecordChannel
 from kiteline_codec.schema import CACHED_KINDS, CachedKeyframe, CachedLandmarks, GridTile, Key, LivePose, messages
 from kiteline_core.geometry import se3, sim3
-from kiteline_core.ids import SUBMAP_BITS, AgentId, KeyframeId, SubmapId, agent_of_submap, submap_of_keyframe
+from kiteline_core.ids import SUBMAP_BITS, AgentId, KeyframeId, SubmapId, agent_of_keyframe, submap_of_keyframe
 
 F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]
@@ -82,11 +83,11 @@ class MapCachePlanner:
         self, agent: AgentId, cache: _AgentCache, T_w_c: F64, predicted: F64, submap: SubmapId
     ) -> list[KeyframeId]:  # fmt: skip
         """Keyframes that the agent lacks, those with most landmarks in view first. predicted: T_w_c (4,4) soon."""
-        rows = self._lacking(agent, submap)
+        reach = self._config.max_distance_ratio * self._depth_m(submap)
+        rows = self._lacking(agent, submap, (T_w_c[:3, 3], predicted[:3, 3]), reach)
         if not len(rows):
             return []
         table, keypoints = self._map.keyframes, self._map.keypoints
-        reach = self._config.max_distance_ratio * self._depth_m(submap)
         positions, axes = table.T_w_k[rows, :3, 3], table.T_w_k[rows, :3, 2]
         distance = np.minimum(
             np.linalg.norm(positions - T_w_c[:3, 3], axis=1), np.linalg.norm(positions - predicted[:3, 3], axis=1)
@@ -109,21 +110,18 @@ class MapCachePlanner:
         chosen = order[enough[order]][: self._config.max_keyframes]
         return [KeyframeId(int(k)) for k in table.id[rows[chosen]]]
 
-    def _lacking(self, agent: AgentId, submap: SubmapId) -> NDArray[np.int64]:
-        """Rows of keyframes of the map that are shared with the agent and not in its local map."""
-        rows: list[int] = []
+    def _lacking(self, agent: AgentId, submap: SubmapId, centres: Sequence[F64], reach: float) -> I32:
+        """Rows of keyframes of the map, near one of the centres (3,) in w, that are shared with the agent and not in
+        its local map.
+        """
+        table, newest = self._map.keyframes, self._config.local_keyframes
         boot = submap >> SUBMAP_BITS
-        own = [s for s in self._map.submaps if s >> SUBMAP_BITS == boot]
-        newest = sorted(
-            (int(self._map.keyframes.t_ns[self._map.rows[k]]), k)
-            for s in own
-            for k in self._map.submaps[s][-self._config.local_keyframes :]
-        )
-        local = {k for _, k in newest[-self._config.local_keyframes :]}
-        for other in self._map.submaps_of_map(submap):
-            if self._sharing.allows(agent, agent_of_submap(other)):
-                rows += [self._map.rows[k] for k in self._map.submaps.get(other, []) if k not in local]
-        return np.array([r for r in rows if self._map.keyframes.pose_source[r]], np.int64)
+        own = np.concatenate([self._map.rows_of(s)[-newest:] for s in self._map.submaps if s >> SUBMAP_BITS == boot])
+        local = own[np.lexsort((table.id[own], table.t_ns[own]))][-newest:]
+        rows = np.unique(np.concatenate([self._map.rows_near(submap, centre, reach) for centre in centres]))
+        rows = rows[(table.pose_source[rows] != NO_POSE) & ~np.isin(rows, local)]
+        shared = [self._sharing.allows(agent, agent_of_keyframe(KeyframeId(k))) for k in table.id[rows].tolist()]
+        return np.asarray(rows[np.array(shared, np.bool_)])
 
     def _depth_m(self, submap: SubmapId) -> float:
         """Median depth in w of the landmarks of the agent's newest keyframes."""
@@ -155,7 +153,8 @@ class MapCachePlanner:
         gone = [
             k
             for k, entry in cache.cached.items()
-            if map_id(submap_of_keyframe(k)) != map_id(entry.record.submap)
+            if k not in self._map
+            or map_id(submap_of_keyframe(k)) != map_id(entry.record.submap)
             or abs(self._scale(k, submap) / entry.scale - 1.0) > self._config.max_scale_change
             or (k not in needed and not _arrived(entry, channel))
         ]

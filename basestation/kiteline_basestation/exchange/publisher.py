@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
+from kiteline_basestation.config import PublishConfig
 from kiteline_basestation.exchange.correction_batches import MEMBERS
 from kiteline_basestation.map.map_tables import CULLED, LANDMARK, REFINED, REFINED_POSE, REMOVED
 from kiteline_basestation.map.sparse_map import SparseMap
@@ -21,7 +22,7 @@ from kiteline_codec.schema import (
     SubmapPlacement,
     messages,
 )
-from kiteline_core.ids import AgentId, KeyframeId, SubmapId, agent_of_keyframe, agent_of_submap
+from kiteline_core.ids import AgentId, KeyframeId, SubmapId, agent_of_keyframe, agent_of_submap, submap_of_keyframe
 
 F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]
@@ -30,20 +31,24 @@ _MEMBER_KINDS = frozenset(record.KIND for record in MEMBERS)
 _POSE_BYTES = 24  # of a keyframe's pose on the wire, and of what else stands beside landmarks
 _LANDMARK_BYTES = 4  # of a refined landmark as a residual
 
+_Mark = tuple[int, KeyframeId]  # KIND of a record, and the keyframe that it is of
 Published = tuple[tuple[AgentId, tuple[Record, ...]], ...]
 
 
 class Publisher:
     """The base's changed values. A record holds a whole value, so that a later one replaces an earlier one."""
 
-    def __init__(self, sparse_map: SparseMap) -> None:
+    def __init__(self, sparse_map: SparseMap, config: PublishConfig | None = None) -> None:
         self._map = sparse_map
-        self._dirty: dict[tuple[int, KeyframeId], None] = {}  # what has waited longest comes first
+        self._most = (config or PublishConfig()).batch_values
+        self._dirty: dict[_Mark, None] = {}
+        self._moves: dict[AgentId, dict[_Mark, None]] = {}  # what moves an agent's map; what has waited longest first
         self._records: list[tuple[AgentId, Record]] = []
 
     def mark_changed(self, kind: int, keyframe: KeyframeId) -> None:
         """Mark a value of a keyframe as changed. kind: KIND of a record class."""
-        self._dirty.setdefault((int(kind), keyframe))
+        marks = self._moves.setdefault(agent_of_keyframe(keyframe), {}) if kind in _MEMBER_KINDS else self._dirty
+        marks.setdefault((int(kind), keyframe))
 
     def mark_changed_slots(self, kind: int, slots: I32) -> None:
         """Mark a value of the keyframes that own slots (n,) as changed."""
@@ -65,10 +70,16 @@ class Publisher:
         """Send any other record."""
         self._records.append((agent, record))
 
+    def forget(self, submaps: Collection[SubmapId]) -> None:
+        """Drop changes of deleted submaps that have not been sent."""
+        for marks in (self._dirty, *self._moves.values()):
+            for mark in [m for m in marks if submap_of_keyframe(m[1]) in submaps]:
+                del marks[mark]
+
     @property
     def waiting(self) -> bool:
         """True if changes wait for room."""
-        return bool(self._dirty or self._records)
+        return bool(self._dirty or self._records or any(self._moves.values()))
 
     def collect(self, room_bytes: Mapping[AgentId, int] | None = None) -> Published:
         """The changes since the last call for which there is room, by agent, in order of kind and keyframe.
@@ -90,21 +101,32 @@ class Publisher:
                 out.setdefault(agent_of_keyframe(keyframe), {})[messages.key(made)] = made
         return tuple((agent, tuple(found.values())) for agent, found in sorted(out.items()))
 
-    def _in_turn(self, room: dict[AgentId, int]) -> list[tuple[int, KeyframeId]]:
+    def _in_turn(self, room: Mapping[AgentId, int]) -> list[_Mark]:
         """Take the changes for which there is room: all poses, then landmarks of the keyframe that has waited longest
-        and of the newest ones. In a room above 0 at least one change is taken.
+        and of the newest ones. In a room above 0 at least one change is taken, and never more than a batch holds.
         """
-        limited = [mark for mark in self._dirty if agent_of_keyframe(mark[1]) in room and mark[0] in _MEMBER_KINDS]
-        waits = dict.fromkeys(limited)
-        poses = sorted((m for m in limited if m[0] == KeyframePose.KIND), key=lambda m: -m[1])
-        others = [m for m in limited if m[0] != KeyframePose.KIND]
+        taken, self._dirty = list(self._dirty), {}
+        for agent, marks in self._moves.items():
+            left = room.get(agent)
+            if left is None and len(marks) <= self._most:
+                taken += marks
+                marks.clear()
+            elif left != 0:
+                taken += self._batch(marks, left)
+        return taken
+
+    def _batch(self, marks: dict[_Mark, None], left: int | None) -> list[_Mark]:
+        """Take as many of an agent's changes as `left` bytes hold."""
+        poses = sorted((m for m in marks if m[0] == KeyframePose.KIND), key=lambda m: -m[1])
+        others = [m for m in marks if m[0] != KeyframePose.KIND]
+        taken: list[_Mark] = []
         for mark in poses + others[:1] + sorted(others[1:], key=lambda m: -m[1]):
-            agent = agent_of_keyframe(mark[1])
-            if room[agent] > 0:
-                room[agent] -= self._bytes(*mark)
-                del waits[mark]
-        taken = [mark for mark in self._dirty if mark not in waits]
-        self._dirty = waits
+            if len(taken) == self._most or (left is not None and left <= 0):
+                break
+            if left is not None:
+                left -= self._bytes(*mark)
+            taken.append(mark)
+            del marks[mark]
         return taken
 
     def _bytes(self, kind: int, keyframe: KeyframeId) -> int:

@@ -25,6 +25,9 @@ I32 = NDArray[np.int32]
 U8 = NDArray[np.uint8]
 
 
+_LOOKED = 16  # keyframes looked at for each that one step may draw: most may not have moved
+
+
 class _Hung(NamedTuple):
     """A scan, and where its camera lies in that of its keyframe; None: there."""
 
@@ -100,7 +103,7 @@ class GridUpdates:
             del self._unmade[keyframe]
             self._make(keyframe)
         drawn = 0
-        for keyframe in sorted(self._due):
+        for keyframe in sorted(self._due)[: _LOOKED * self._config.drawn_per_step]:
             if drawn >= self._config.drawn_per_step:
                 break
             del self._due[keyframe]
@@ -200,7 +203,7 @@ class GridUpdates:
             return
         submap = submap_of_keyframe(keyframe)
         siblings = self._map.submaps[submap]
-        at = siblings.index(keyframe)
+        at = self._map.number_of(keyframe)
         near = siblings[max(0, at - self._config.sparse_window) : at + self._config.sparse_window + 1]
         seen = self._map.landmarks_of(keyframe)
         around = self._map.sorted_by_id(np.concatenate([self._map.landmarks_of(k) for k in near]))

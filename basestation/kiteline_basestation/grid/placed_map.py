@@ -49,7 +49,7 @@ def placed_map(sparse_map: SparseMap, placements: Mapping[SubmapId, F64]) -> Pla
                 rows.append(sparse_map.rows[keyframe])
                 positions.append((S_w_m @ pose)[:3, 3])
                 metric.append(metres)
-    number = np.full(len(sparse_map), -1, np.int64)
+    number = np.full(sparse_map.height, -1, np.int64)
     number[rows] = np.arange(len(rows))
     points = sparse_map.live_landmarks()
     xyz, known = sparse_map.positions(points)

@@ -49,6 +49,16 @@ def _add(pool: I16, slot: int, row: int, column: int, bands: int, value: int) ->
 
 
 @helper
+def _take(pool: I16, slot: int, row: int, column: int, bands: int, value: int) -> None:
+    """Add to the plane of all bands, or to those of some."""
+    if bands == ALL:
+        total = int(pool[slot, 0, row & _MASK, column & _MASK]) + value
+        pool[slot, 0, row & _MASK, column & _MASK] = min(max(total, -_MOST), _MOST)
+    else:
+        _add(pool, slot, row, column, bands, value)
+
+
+@helper
 def _between(lower: float, middle: float, upper: float, part: float) -> float:
     """A range at a part of a column, by those at its lower edge, in its middle and at its upper edge."""
     if part < 0.5:
@@ -103,6 +113,51 @@ def draw_hits(
         _add(pool, slot, row, column, value & ALL, sign * (value >> 8))
 
 
+@helper
+def _run(x: float, dy: float, reach: float, edges: tuple[float, float, float, float]) -> tuple[int, int]:
+    """First and last column of the cells of a row within reach and between two edges; the last below the first: none.
+
+    dy: of the row from the camera at column x. edges: cosine and sine of the lower one and of the upper one. A cell
+    whose centre lies on the lower edge counts, on the upper one not: each is in exactly one sector.
+    """
+    c0, s0, c1, s1 = edges
+    width2 = reach * reach - dy * dy
+    if width2 <= 0.0:
+        return 0, -1
+    width = np.sqrt(width2)
+    first, last = int(np.ceil(x - width - 0.5)), int(np.floor(x + width - 0.5))
+    if s0 > 0.0:
+        last = min(last, int(np.floor(c0 / s0 * dy + x - 0.5)))
+    elif s0 < 0.0:
+        first = max(first, int(np.ceil(c0 / s0 * dy + x - 0.5)))
+    elif c0 * dy < 0.0:
+        return 0, -1
+    if s1 > 0.0:
+        first = max(first, int(np.floor(c1 / s1 * dy + x - 0.5)) + 1)
+    elif s1 < 0.0:
+        last = min(last, int(np.ceil(c1 / s1 * dy + x - 0.5)) - 1)
+    elif c1 * dy >= 0.0:
+        return 0, -1
+    return first, last
+
+
+@helper
+def _freed(
+    dx: float, dy: float, begin2: float, ends: tuple[float, float, float], edges: tuple[float, float, float, float]
+) -> bool:
+    """True if a cell lies where all bands of a column are free. begin2: squared; ends, edges: see `draw_free`."""
+    lower, middle, upper = ends
+    distance2 = dx * dx + dy * dy
+    least, most = max(min(lower, middle, upper), 0.0), max(lower, middle, upper, 0.0)
+    if distance2 < begin2 or distance2 > most * most:
+        return False
+    if distance2 <= least * least:
+        return True
+    left = edges[0] * dy - edges[1] * dx
+    part = left / (left + edges[3] * dx - edges[2] * dy)
+    return distance2 <= _between(lower, middle, upper, part) ** 2
+
+
 @njit
 def draw_free(
     x: float, y: float, first_rad: float, step_rad: float, begins: F64, starts: F64, ends: F64, lows: F64, under: U8,
@@ -118,76 +173,41 @@ def draw_free(
     and where rays are low; and beyond that. Marked cells keep the bands of their obstacles.
     """
     rows, columns = hits.shape
-    weight, sure_weight, far_weight = weights
     near2 = near_cells * near_cells
     for i in range(ends.shape[0]):
-        lower, middle, upper = ends[i, 0], ends[i, 1], ends[i, 2]
-        least, most = max(min(lower, middle, upper), 0.0), max(lower, middle, upper, 0.0)
+        end = ends[i, 0], ends[i, 1], ends[i, 2]
         low, clear = lows[i], clears[i] if camera_band >= 0 else 0.0
-        reach = max(most, low, clear)
+        reach = max(end[0], end[1], end[2], low, clear, 0.0)
         if reach <= 0.0:
             continue
-        begin2, start2, least2, most2 = begins[i] ** 2, starts[i] ** 2, least * least, most * most
-        low2, clear2, sure2 = low * low, clear * clear, sures[i] ** 2
+        begin2, start2, low2, clear2, sure2 = begins[i] ** 2, starts[i] ** 2, low * low, clear * clear, sures[i] ** 2
         a0, a1 = first_rad + i * step_rad, first_rad + (i + 1) * step_rad
-        c0, s0, c1, s1 = np.cos(a0), np.sin(a0), np.cos(a1), np.sin(a1)
-        bottom = max(0, int(np.floor(y + min(0.0, reach * s0, reach * s1) - 1.0)))
-        top = min(rows - 1, int(np.ceil(y + max(0.0, reach * s0, reach * s1) + 1.0)))
+        edges = np.cos(a0), np.sin(a0), np.cos(a1), np.sin(a1)
+        bottom = max(0, int(np.floor(y + min(0.0, reach * edges[1], reach * edges[3]) - 1.0)))
+        top = min(rows - 1, int(np.ceil(y + max(0.0, reach * edges[1], reach * edges[3]) + 1.0)))
         for row in range(bottom, top + 1):
             dy = row + 0.5 - y
-            width2 = reach * reach - dy * dy
-            if width2 <= 0.0:
-                continue
-            width = np.sqrt(width2)
-            first, last = int(np.ceil(x - width - 0.5)), int(np.floor(x + width - 0.5))
-            # On or left of the lower edge, and right of the upper one: each cell centre in exactly one column.
-            if s0 > 0.0:
-                last = min(last, int(np.floor(c0 / s0 * dy + x - 0.5)))
-            elif s0 < 0.0:
-                first = max(first, int(np.ceil(c0 / s0 * dy + x - 0.5)))
-            elif c0 * dy < 0.0:
-                continue
-            if s1 > 0.0:
-                first = max(first, int(np.floor(c1 / s1 * dy + x - 0.5)) + 1)
-            elif s1 < 0.0:
-                last = min(last, int(np.ceil(c1 / s1 * dy + x - 0.5)) - 1)
-            elif c1 * dy >= 0.0:
-                continue
-            first, last = max(first, 0), min(last, columns - 1)
-            while first <= last:  # a run of cells in one tile
-                slot, end_of_run = -1, min(last, first | _MASK)
-                for column in range(first, end_of_run + 1):
-                    dx = column + 0.5 - x
-                    distance2 = dx * dx + dy * dy
-                    bands = 0
-                    if begin2 <= distance2:
-                        if distance2 <= least2:
-                            bands = ALL
-                        elif distance2 <= most2:
-                            left = c0 * dy - s0 * dx
-                            part = left / (left + s1 * dx - c1 * dy)
-                            if distance2 <= _between(lower, middle, upper, part) ** 2:
-                                bands = ALL
-                        if bands == 0 and distance2 <= low2:
-                            bands = int(np.int64(under[i]))
-                    if distance2 <= clear2:
-                        bands |= 1 << camera_band
-                    bands &= ~int(np.int64(hits[row, column]))
-                    if bands == 0:
-                        continue
-                    if slot < 0:
-                        slot = _tile(row, column, slots, spare, used)
-                        touched[row >> _SHIFT, column >> _SHIFT] = 1
-                    if start2 <= distance2 <= near2:
-                        value = -sign * weight
-                    else:
-                        value = -sign * (sure_weight if distance2 <= max(sure2, start2) else far_weight)
-                    if bands == ALL:
-                        total = int(pool[slot, 0, row & _MASK, column & _MASK]) + value
-                        pool[slot, 0, row & _MASK, column & _MASK] = min(max(total, -_MOST), _MOST)
-                    else:
-                        _add(pool, slot, row, column, bands, value)
-                first = end_of_run + 1
+            first, last = _run(x, dy, reach, edges)
+            slot, tile = -1, -1
+            for column in range(max(first, 0), min(last, columns - 1) + 1):
+                dx = column + 0.5 - x
+                distance2 = dx * dx + dy * dy
+                bands = 0
+                if _freed(dx, dy, begin2, end, edges):
+                    bands = ALL
+                elif begin2 <= distance2 <= low2:
+                    bands = int(np.int64(under[i]))
+                if distance2 <= clear2:
+                    bands |= 1 << camera_band
+                bands &= ~int(np.int64(hits[row, column]))
+                if bands == 0:
+                    continue
+                if tile != column >> _SHIFT:
+                    slot, tile = _tile(row, column, slots, spare, used), column >> _SHIFT
+                    touched[row >> _SHIFT, tile] = 1
+                value = weights[2] if distance2 > max(sure2, start2) else weights[1]
+                value = weights[0] if start2 <= distance2 <= near2 else value
+                _take(pool, slot, row, column, bands, -sign * value)
 
 
 @njit

@@ -14,6 +14,7 @@ from kiteline_basestation.grid.scan_kernels import BANDS, SIDE
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 U8 = NDArray[np.uint8]
+Bool = NDArray[np.bool_]
 
 _AT_BORDER = 0.1  # of a scan's columns, at least, in which ground is seen from the image's lower border on
 _HIDDEN = 1.25  # times that distance, from which on something hides the ground before
@@ -69,18 +70,12 @@ def sectors_of(config: GridConfig, scan: KeptScan, lattice: Lattice) -> Sectors:
     bands = ranges[1].astype(np.uint8)
     middle, start, free, clear = (ranges[k] * unit for k in (0, 2, 3, 4))
     obstacle = _surfaces(middle, bands, scan.step)
-    # Cells before an obstacle are free up to some deviations of its range, and at least a cell, before it.
     near_m = np.where(np.isfinite(ranges[0]), ranges[0], 0.0)
+    # Cells before an obstacle are free up to some deviations of its range, and at least a cell, before it.
     gap = np.maximum(1.0, config.gap_sigmas * scan.sigma_per_m2 * near_m**2 * unit)
     before = obstacle - gap[:, None]
     under = np.where(bands & 1, 0, 1).astype(np.uint8)  # the floor is seen below what stands higher, a table
     behind = start > middle  # ground that was seen over a low obstacle, which hides what lies before it
-    # Just before the nearest seen ground the ray to it passes below the lowest band: nothing stands there. But
-    # where the ground begins farther than at the image's lower border, something too near to be measured hides it.
-    ahead = start * np.cos(scan.first_rad + scan.step * (np.arange(scan.columns) + 0.5))
-    border = np.quantile(ahead[free > 0.0], _AT_BORDER) if (free > 0.0).any() else 0.0
-    hidden = behind | (ahead > _HIDDEN * border)
-    begin = np.where(hidden, start, start * max(0.0, 1.0 - config.bands_m[0] / max(scan.height_m, 1e-3)))
     foot = (free >= middle - 1e-9) & ~behind
     end = np.where(foot[:, None], before, np.minimum(free[:, None], before))
     end = np.where((behind & (under == 0))[:, None], free[:, None], end)
@@ -92,11 +87,22 @@ def sectors_of(config: GridConfig, scan: KeptScan, lattice: Lattice) -> Sectors:
     camera_band = int(np.searchsorted(config.bands_m, scan.height_m, side="right")) - 1
     x, y = position_cells(lattice)
     return Sectors(
-        x, y, scan.heading_rad(config, lattice) + scan.first_rad, scan.step, obstacle, bands, weight, begin, start,
-        end, np.where(under > 0, free, 0.0), under, np.minimum(clear, before.min(1)),
-        camera_band if 0 <= camera_band < BANDS else -1,
+        x, y, scan.heading_rad(config, lattice) + scan.first_rad, scan.step, obstacle, bands, weight,
+        _begin(config, scan, start, free, behind), start, end, np.where(under > 0, free, 0.0), under,
+        np.minimum(clear, before.min(1)), camera_band if 0 <= camera_band < BANDS else -1,
         accurate_m / config.cell_m, sure,
     )  # fmt: skip
+
+
+def _begin(config: GridConfig, scan: KeptScan, start: F64, free: F64, behind: Bool) -> F64:
+    """From where (n,) cells before the nearest seen ground are free: the ray to it passes below the lowest band there.
+
+    Where the ground begins farther than at the image's lower border, something too near to be measured hides it.
+    """
+    ahead = start * np.cos(scan.first_rad + scan.step * (np.arange(scan.columns) + 0.5))
+    border = np.quantile(ahead[free > 0.0], _AT_BORDER) if (free > 0.0).any() else 0.0
+    hidden = behind | (ahead > _HIDDEN * border)
+    return np.where(hidden, start, start * max(0.0, 1.0 - config.bands_m[0] / max(scan.height_m, 1e-3)))
 
 
 def _surfaces(middle: F64, bands: U8, step: float) -> F64:

@@ -65,7 +65,7 @@ def segments_of(sparse_map: SparseMap, rows: I32, problem: BundleProblem) -> tup
     """Segments of a bundle of the keyframes in `rows` (k,), in order of time; steps over culled ones are joined."""
     table = sparse_map.keyframes
     number = {int(table.id[row]): i for i, row in enumerate(rows.tolist())}
-    depths = _depths(problem)
+    depth: F64 | None = None  # where any segment needs it
     out: list[Segment] = []
     for keyframe, i in number.items():
         agent = agent_of_keyframe(KeyframeId(keyframe))
@@ -81,9 +81,10 @@ def segments_of(sparse_map: SparseMap, rows: I32, problem: BundleProblem) -> tup
         records.reverse()
         fields: dict[str, Any] = {name: np.concatenate([getattr(r, name) for r in records]) for name in _STEPS}
         submap = submap_of_keyframe(KeyframeId(keyframe))
+        depth = _depths(problem) if depth is None else depth
         out.append(
             Segment(
-                number[at], i, se3.inverse(sparse_map.cameras[agent].T_b_c), float(depths[i]),
+                number[at], i, se3.inverse(sparse_map.cameras[agent].T_b_c), float(depth[i]),
                 sparse_map.metres_per_unit.get(submap, 1.0) / sparse_map.scale(submap),
                 replace(records[-1], since=at, **fields),
             )

@@ -6,6 +6,7 @@ first one of the new submap give the relative pose, the agent's record the scale
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -47,6 +48,12 @@ class InertialTies:
     def clear(self) -> None:
         """Drop the records that are kept."""
         self._waiting.clear()
+
+    def forget(self, submaps: Collection[SubmapId]) -> None:
+        """Drop the records that lead from or to deleted submaps."""
+        self._waiting = [
+            r for r in self._waiting if not {submap_of_keyframe(r.since), submap_of_keyframe(r.keyframe)} & set(submaps)
+        ]
 
     def take(self) -> InertialTie | None:
         """The next tie between two maps; one that joins nothing is dropped."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from itertools import compress
 from typing import Any
@@ -24,6 +24,7 @@ from kiteline_codec.schema import (
     NewLandmarks,
     Observations,
     Record,
+    ScanImages,
     StereoAlignment,
     SubmapScale,
     SubmapTie,
@@ -74,6 +75,7 @@ class Intake:
         self.last_contact_ns: dict[AgentId, int] = {}
         self.deleted: set[SubmapId] = set()  # records of these submaps are ignored
         self._scans: list[KeyframeScan] = []  # that arrived and were not taken yet
+        self._images: list[ScanImages] = []  # the same
         self.inertial_ties = InertialTies(sparse_map)
         self.refused = 0  # records that contradict the map, or are of another agent than the one that wrote them
         self._handlers: dict[type[Record], Callable[[Any, int], None]] = {
@@ -84,6 +86,7 @@ class Intake:
             NewLandmarks: self._take_section,
             Observations: self._take_section,
             KeyframeScan: lambda record, now_ns: self._scans.append(record),
+            ScanImages: lambda record, now_ns: self._images.append(record),
             InertialSteps: self._take_steps,
             GravityAlignment: self._take_gravity,
             SubmapScale: self._take_scale,
@@ -110,6 +113,11 @@ class Intake:
         early = [scan for scan, is_known in zip(self._scans, known, strict=True) if not is_known]
         self._scans = early[-self._config.max_pending :]
         return scans
+
+    def take_images(self) -> list[ScanImages]:
+        """The images of scans that arrived since the last call."""
+        images, self._images = self._images, []
+        return images
 
     def ready(self, now_ns: int) -> list[KeyframeId]:
         """Keyframes to use now, in order of id: complete ones, those past the patience, and late completions."""
@@ -153,6 +161,22 @@ class Intake:
         self.inertial_ties.clear()  # they were used, or undone
         self.fresh_ties.clear()
         self.deleted.update(state.deleted)
+
+    def forget(self, submaps: Collection[SubmapId]) -> None:
+        """Forget what concerns deleted submaps, also keyframes that came in this step and are not used yet."""
+        for waiting in (self._pending, self._waiting):
+            for keyframe in [k for k in waiting if submap_of_keyframe(k) in submaps]:
+                del waiting[keyframe]
+        self._pending_count = sum(map(len, self._pending.values()))
+        self._partial = {k for k in self._partial if submap_of_keyframe(k) not in submaps}
+        self.live = {a: pose for a, pose in self.live.items() if submap_of_keyframe(pose.keyframe) not in submaps}
+        self._scans = [scan for scan in self._scans if submap_of_keyframe(scan.keyframe) not in submaps]
+        self._images = [images for images in self._images if submap_of_keyframe(images.keyframe) not in submaps]
+        self.fresh_ties.difference_update(submaps)
+        self.inertial_ties.forget(submaps)
+        for submap in submaps:
+            for known in (self.last_pose, self.tracked_ns, self.gravity, self.loss_ties):
+                known.pop(submap, None)
 
     def _is_usable(self, keyframe: KeyframeId) -> bool:
         """True if a keyframe has a pose and a camera."""

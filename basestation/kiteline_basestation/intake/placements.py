@@ -164,13 +164,14 @@ class SubmapPlacements:
                 self._set(submap, self.unmerged[submap])
             else:
                 self.delete(submap)
-                self._publisher.withdraw_placement(submap)
                 withdrawn.append(submap)
         return withdrawn
 
     def delete(self, submap: SubmapId) -> None:
-        """Drop the placement of a submap."""
+        """Drop the placement of a submap, also one that has not been sent yet."""
+        self._publisher.withdraw_placement(submap)
         self.S_w_m.pop(submap, None)
+        self.unmerged.pop(submap, None)
         self._scale_sigma.pop(submap, None)
         self._recognised.discard(submap)
 

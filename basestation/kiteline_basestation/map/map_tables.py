@@ -69,6 +69,12 @@ def grow(table: KeyframeTable | KeypointTable, capacity: int) -> None:
         setattr(table, field.name, new)
 
 
+def clear(table: KeyframeTable | KeypointTable, rows: I32) -> None:
+    """Set rows (n,) to zero, as new ones are."""
+    for field in fields(table):
+        getattr(table, field.name)[rows] = 0
+
+
 def empty_keyframes() -> KeyframeTable:
     """A keyframe table without rows."""
     i64, u8, i32 = np.zeros(0, np.int64), np.zeros(0, np.uint8), np.zeros(0, np.int32)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from dataclasses import fields
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_basestation.map import sparse_map_kernels as kernels
+from kiteline_basestation.map.free_runs import FreeRuns
 from kiteline_basestation.map.map_tables import (
     CULLED,
     LANDMARK,
@@ -39,15 +40,39 @@ I64 = NDArray[np.int64]
 Bool = NDArray[np.bool_]
 
 
+class Rows:
+    """Rows of a submap's keyframes in order of id, in an array that grows."""
+
+    def __init__(self) -> None:
+        self._held = np.empty(16, np.int32)
+        self._count = 0
+
+    def insert(self, at: int, row: int) -> None:
+        """Insert a row at a position."""
+        if self._count == len(self._held):
+            self._held = np.concatenate([self._held, np.empty(len(self._held) // 2, np.int32)])
+        self._held[at + 1 : self._count + 1] = self._held[at : self._count]
+        self._held[at] = row
+        self._count += 1
+
+    @property
+    def rows(self) -> I32:
+        """All rows; a view."""
+        return self._held[: self._count]
+
+
 class MapView:
     """Read access to keyframes, keypoints and landmarks of all agents. Landmarks are named by their slots."""
 
     def __init__(self) -> None:
         self.keyframes = empty_keyframes()
         self.keypoints = empty_keypoints()
-        self.slots = 0
+        self.height = 0  # rows of keyframes in use, or free for the next ones
+        self.slots = 0  # the same of keypoints
+        self._free_rows, self._free_slots = FreeRuns(), FreeRuns()
         self.rows: dict[KeyframeId, int] = {}
         self.submaps: dict[SubmapId, list[KeyframeId]] = {}  # keyframes by submap, in order of id
+        self._rows_of: dict[SubmapId, Rows] = {}  # of the same keyframes
         self.keypoints_of: dict[SubmapId, int] = {}  # number of keypoints by submap that have arrived
         self.submap_poses: dict[SubmapId, F64] = {}  # S_w_m (4,4) similarity by submap, where not the identity
         self._scales: dict[SubmapId, float] = {}  # of `submap_poses`
@@ -79,6 +104,33 @@ class MapView:
 
     def __contains__(self, keyframe: KeyframeId) -> bool:
         return keyframe in self.rows
+
+    def rows_of(self, submap: SubmapId) -> I32:
+        """Rows of all keyframes of a submap, in order of id; a view that the next keyframe changes."""
+        held = self._rows_of.get(submap)
+        return np.empty(0, np.int32) if held is None else held.rows
+
+    def rows_of_map(self, submap: SubmapId) -> I32:
+        """Rows of all keyframes of the map that a submap belongs to, in order of id."""
+        return np.concatenate([self.rows_of(s) for s in self.submaps_of_map(submap)])
+
+    def rows_near(self, submap: SubmapId, position: F64, reach: float) -> I32:
+        """Rows of keyframes, of the map that a submap belongs to, which may lie within `reach` of (3,) in w."""
+        out = []
+        for other in self.submaps_of_map(submap):
+            rows = self.rows_of(other)
+            near = np.empty(len(rows), np.int32)
+            count = kernels.rows_near(rows, self.keyframes.T_w_k, np.array(position), reach, near)
+            out.append(near[:count])
+        return np.concatenate(out)
+
+    def number_of(self, keyframe: KeyframeId) -> int:
+        """How many keyframes of its submap are older than a known keyframe."""
+        return bisect_left(self.submaps[submap_of_keyframe(keyframe)], keyframe)
+
+    def children_of(self, keyframe: KeyframeId) -> list[int]:
+        """Rows of the keyframes whose parent is this one."""
+        return self._children.get(keyframe, [])
 
     def slots_of(self, keyframe: KeyframeId) -> I32:
         """Slots of all keypoints of a keyframe, in order of keypoint index."""
@@ -117,8 +169,12 @@ class MapView:
 
     def sorted_by_id(self, landmarks: I32) -> I32:
         """Unique landmarks in order of id, which does not depend on the order of arrival."""
-        landmarks = np.unique(landmarks)
-        return np.asarray(landmarks[np.argsort(self.landmark_ids(landmarks))])
+        ids = self.landmark_ids(landmarks)
+        order = np.argsort(ids, kind="stable")
+        ids = ids[order]
+        first = np.ones(len(ids), np.bool_)
+        np.not_equal(ids[1:], ids[:-1], out=first[1:])
+        return np.asarray(landmarks[order[first]])
 
     def live_landmarks(self) -> I32:
         """Slots of all root landmarks that are not culled, in order of id."""
@@ -127,6 +183,12 @@ class MapView:
         here = np.arange(n, dtype=np.int32)
         live = (table.kind[:n] == LANDMARK) & (table.root[:n] == here) & (table.flags[:n] & CULLED == 0)
         return self.sorted_by_id(here[live])
+
+    def count_live(self) -> int:
+        """Number of root landmarks that are not culled."""
+        table, n = self.keypoints, self.slots
+        is_root = table.root[:n] == np.arange(n, dtype=np.int32)
+        return int(np.count_nonzero(is_root & (table.kind[:n] == LANDMARK) & (table.flags[:n] & CULLED == 0)))
 
     def observations(self, landmarks: I32) -> tuple[I32, I32]:
         """Valid observations of landmarks (n,), in order of keyframe id, one per keyframe.
@@ -143,7 +205,7 @@ class MapView:
 
     def covisibility(self, landmarks: I32) -> I32:
         """Number of the landmarks (n,) that each keyframe observes, by row."""
-        shared = np.zeros(len(self), np.int32)
+        shared = np.zeros(self.height, np.int32)
         table = self.keypoints
         kernels.covisibility(landmarks, table.first, table.next, table.row, table.usable, shared)
         return shared
@@ -155,6 +217,25 @@ class MapView:
         ids = self.keyframes.id[rows]
         order = np.lexsort((-ids, -shared[rows]))
         return [k for k in map(KeyframeId, ids[order].tolist()) if k != keyframe]
+
+    def covisible_pairs(self, rows: I32, min_shared: int) -> I64:
+        """Pairs (p,2) of keyframes that share min_shared landmarks or more: numbers in rows (n,), the lower first."""
+        keyframes, table, n = self.keyframes, self.keypoints, self.slots
+        number, seen = np.full(self.height, -1, np.int32), np.full(n, -1, np.int32)
+        number[rows] = np.arange(len(rows), dtype=np.int32)
+        is_live = ((table.kind[:n] == LANDMARK) & (table.flags[:n] & CULLED == 0)).astype(np.uint8)
+        shared, touched = np.zeros(self.height, np.int32), np.empty(self.height, np.int32)
+        room = 16 * len(rows)
+        while True:
+            pairs = np.empty((2, room), np.int64)
+            found = kernels.strong_pairs(
+                rows, keyframes.start, keyframes.count, table.usable, table.root, is_live, table.first, table.next,
+                table.row, number, max(min_shared, 1), shared, touched, seen, pairs[0], pairs[1],
+            )  # fmt: skip
+            if found <= room:
+                return np.ascontiguousarray(pairs[:, :found].T)
+            room = found
+            seen.fill(-1)
 
     def observed_together(self, a: int, b: int) -> bool:
         """True if a keyframe observes both landmarks, so that they cannot be the same."""
@@ -172,18 +253,18 @@ class MapView:
 
     def positions(self, landmarks: I32) -> tuple[F64, Bool]:
         """Positions (n,3) of landmarks in w, m, and whether each is known."""
-        table = self.keypoints
+        table, keyframes = self.keypoints, self.keyframes
+        landmarks = np.asarray(landmarks, np.int32)
         rows = table.row[landmarks]
         inv = self.inverse_depths(landmarks)
-        valid = (inv > 0) & (self.keyframes.pose_source[rows] != NO_POSE) & (table.kind[landmarks] == LANDMARK)
-        z = self.keyframes.scale[rows] / np.where(valid, inv, 1.0)  # in units of w
-        fx, fy, cx, cy = self.keyframes.camera[rows, :4].T
-        uv = table.uv[landmarks].astype(np.float64) + table.offset[landmarks]
-        local = np.stack(
-            [(uv[:, 0] - cx) / np.where(fx > 0, fx, 1.0) * z, (uv[:, 1] - cy) / np.where(fy > 0, fy, 1.0) * z, z], 1
-        )
-        pose = self.keyframes.T_w_k[rows]
-        return np.einsum("nij,nj->ni", pose[:, :3, :3], local) + pose[:, :3, 3], valid & (fx > 0)
+        known = (inv > 0) & (keyframes.pose_source[rows] != NO_POSE) & (table.kind[landmarks] == LANDMARK)
+        known &= keyframes.camera[rows, 0] > 0
+        out = np.empty((len(landmarks), 3))
+        kernels.positions(
+            landmarks, np.where(known, inv, 1.0), table.row, table.uv, table.offset, keyframes.scale, keyframes.camera,
+            keyframes.T_w_k, out,
+        )  # fmt: skip
+        return out, known
 
     def project_into_anchor(self, landmarks: I32, positions: F64) -> tuple[F32, F32, Bool]:
         """The inverse of `positions`: inverse depths (n,), offsets (n,2) px, whether in front of the keyframe (n,)."""

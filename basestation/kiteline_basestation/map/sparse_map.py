@@ -7,7 +7,8 @@ landmark that a keypoint observes; for a fused landmark, the root landmark. Reco
 
 from __future__ import annotations
 
-from bisect import bisect_right, insort
+from bisect import bisect_right
+from collections.abc import Collection
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,18 +23,17 @@ from kiteline_basestation.map.map_tables import (
     REFINED,
     REFINED_POSE,
     REMOVED,
+    clear,
     grow,
 )
-from kiteline_basestation.map.map_view import MapView
-from kiteline_codec.schema import StereoAlignment
-from kiteline_core.geometry import disparity_offset, se3, sim3
-from kiteline_core.geometry.cameras import RectifiedCamera
+from kiteline_basestation.map.map_view import Rows
+from kiteline_basestation.map.rig_values import RigValues, parameters
+from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import (
     KEYPOINT_BITS,
     MAX_KEYPOINTS,
     NO_KEYFRAME,
     NO_LANDMARK,
-    AgentId,
     KeyframeId,
     SubmapId,
     agent_of_keyframe,
@@ -47,61 +47,13 @@ I32 = NDArray[np.int32]
 I64 = NDArray[np.int64]
 Bool = NDArray[np.bool_]
 
-_REPAIRED_PX = 0.5  # difference of a number of a disparity offset; flights of one rig differ by a tenth
-
 _MOST_WAITED_FOR = 100_000  # keyframes that observations name and that were not received: only a faulty agent has more
 
 
-class SparseMap(MapView):
-    """Keyframes, keypoints and landmarks of all agents. Row and slot numbers never change."""
+class SparseMap(RigValues):
+    """Keyframes, keypoints and landmarks of all agents. Row and slot numbers change only by being forgotten."""
 
     # -- values of the agents ------------------------------------------------------------------------------------------
-
-    def set_camera(self, agent: AgentId, camera: RectifiedCamera) -> None:
-        """Set the rectified camera of an agent, also for its keyframes so far.
-
-        Disparity offsets outlive the flight: the agent's next one begins with them. They end with the calibration told.
-        """
-        before = self.cameras.get(agent)
-        if before is not None and _parameters(before) != _parameters(camera):
-            self.rows_px.pop(agent, None)
-            self.rows_read.discard(agent)
-            self.known_offset_px.pop(agent, None)
-            self.onboard_sigma_px.pop(agent, None)
-            self.disparity_sigma_px.pop(agent, None)
-            if agent in self.disparity_offset_px:
-                self.disparity_offset_px[agent] = disparity_offset.none()
-                self.disparity_calibrated.discard(agent)
-        self.cameras[agent] = camera
-        for keyframe, row in self.rows.items():
-            if agent_of_keyframe(keyframe) == agent:
-                self.keyframes.camera[row] = _parameters(camera)
-
-    def set_stereo_alignment(self, record: StereoAlignment) -> None:
-        """Set what an agent knows of its right camera. A disparity offset of earlier flights that was estimated here
-        counts more, unless the rig was repaired since; one that the agent finds in this flight counts until the offset
-        is better known here.
-        """
-        agent = record.agent
-        self.rows_px[agent] = record.rows_px
-        self.rows_read.discard(agent)
-        if record.rows_read:
-            self.rows_read.add(agent)
-        if record.sigma_px is None and not np.any(record.disparity_px != 0.0):
-            return
-        if agent not in self.disparity_offset_px and record.sigma_px is None:
-            self.disparity_offset_px[agent] = self.known_offset_px[agent] = record.disparity_px
-        if record.sigma_px is None:
-            return
-        known = self.known_offset_px.get(agent) if agent not in self.onboard_sigma_px else None
-        if known is not None and np.abs(record.disparity_px - known).max() < _REPAIRED_PX:
-            return
-        if known is not None:
-            self.disparity_sigma_px.pop(agent, None)
-        self.known_offset_px[agent], self.onboard_sigma_px[agent] = record.disparity_px, record.sigma_px
-        if self.disparity_sigma_px.get(agent, np.inf) > record.sigma_px:
-            self.disparity_offset_px[agent], self.disparity_sigma_px[agent] = record.disparity_px, record.sigma_px
-            self.disparity_calibrated.discard(agent)
 
     def add_keyframe(self, keyframe: KeyframeId, t_ns: int, parent: KeyframeId, T_p_k: F64, keypoints: int) -> int:
         """Add a keyframe, or update its header. T_p_k: (4,4). Returns its row.
@@ -117,11 +69,13 @@ class SparseMap(MapView):
         table = self.keyframes
         row = self.rows.get(keyframe)
         if row is None:
-            row = len(self.rows)
+            free = self._free_rows.take()
+            row = self.height if free is None else free
+            self.height = max(self.height, row + 1)
             if row == len(table.id):
                 grow(table, row + max(32, row // 4))
             self.rows[keyframe] = row
-            insort(self.submaps.setdefault(submap_of_keyframe(keyframe), []), keyframe)
+            self._enter(keyframe, row)
             self._note_offset(keyframe)
             table.id[row] = keyframe
             table.start[row] = self._allocate(row, keypoints)
@@ -129,7 +83,7 @@ class SparseMap(MapView):
             table.scale[row] = 1.0
             camera = self.cameras.get(agent_of_keyframe(keyframe))
             if camera is not None:
-                table.camera[row] = _parameters(camera)
+                table.camera[row] = parameters(camera)
             self._children.setdefault(parent, []).append(row)
         elif table.parent[row] != parent:
             self._children[KeyframeId(int(table.parent[row]))].remove(row)
@@ -143,6 +97,14 @@ class SparseMap(MapView):
         if waiting is not None:
             self._link_observations(np.array(list(waiting), np.int32))
         return row
+
+    def _enter(self, keyframe: KeyframeId, row: int) -> None:
+        """Add a keyframe to its submap."""
+        submap = submap_of_keyframe(keyframe)
+        keyframes = self.submaps.setdefault(submap, [])
+        at = bisect_right(keyframes, keyframe)
+        keyframes.insert(at, keyframe)
+        self._rows_of.setdefault(submap, Rows()).insert(at, row)
 
     def _note_offset(self, keyframe: KeyframeId) -> None:
         """Note the disparity offset that both sides know as a keyframe arrives: its motion was measured with it.
@@ -275,14 +237,54 @@ class SparseMap(MapView):
         slots = np.flatnonzero(linked).astype(np.int32)
         self._link_observations(slots[np.isin(self.find_landmarks(table.landmark[slots]), landmarks)])
 
+    def forget(self, submaps: Collection[SubmapId]) -> None:
+        """Forget submaps. Their rows and slots, which nothing may name any more, are free for the next keyframes."""
+        table, keyframes = self.keypoints, [k for s in submaps for k in self.submaps.get(s, [])]
+        if keyframes:
+            here = np.concatenate([self.slots_of(k) for k in keyframes])
+            inside = np.zeros(self.slots + 1, np.bool_)  # the last one: of no landmark
+            inside[here] = True
+            roots = table.root[: self.slots]
+            outside = np.flatnonzero(inside[roots] & ~inside[:-1]).astype(np.int32)
+            kernels.link(here, np.full(len(here), -1, np.int32), table.root, table.first, table.next)
+            is_landmark = table.kind[outside] == LANDMARK
+            fused, left = outside[is_landmark], outside[~is_landmark]
+            kernels.link(left, np.full(len(left), -1, np.int32), table.root, table.first, table.next)
+            kernels.link(fused, fused, table.root, table.first, table.next)  # they are roots again
+            clear(table, here)
+            for links in (table.root, table.first, table.next, table.landmark):
+                links[here] = -1
+            rows = np.array([self.rows.pop(k) for k in keyframes], np.int32)
+            runs = np.column_stack([self.keyframes.count[rows], self.keyframes.start[rows]])
+            self._free_slots.free((length, begin) for length, begin in runs.tolist())
+            clear(self.keyframes, rows)
+            self._free_rows.free((1, row) for row in rows.tolist())
+            self.moved_rows.difference_update(rows.tolist())
+            self._children[NO_KEYFRAME] = sorted({*self._children.get(NO_KEYFRAME, [])} - {*rows.tolist()})
+            self._link_observations(left[self.find_landmarks(table.landmark[left]) >= 0])
+            for anchor, slots in list(self._waiting.items()):
+                self._waiting[anchor] = {slot: None for slot in slots if not inside[slot]}
+                if not self._waiting[anchor]:
+                    del self._waiting[anchor]
+        gone = set(submaps)
+        for of_keyframe in (self._children, self._waiting, self.inertial_steps, self.up, self.measured_with_px):
+            for keyframe in [k for k in of_keyframe if submap_of_keyframe(k) in gone]:  # also of those that never came
+                del of_keyframe[keyframe]
+        for submap in submaps:
+            for of_submap in (self.submaps, self._rows_of, self.keypoints_of, self.submap_poses, self._scales,
+                              self.root_submaps, self.metres_per_unit):  # fmt: skip
+                of_submap.pop(submap, None)
+            self.metric_submaps.discard(submap)
+
     # -- inside ------------------------------------------------------------------------------------------------------
 
     def _allocate(self, row: int, keypoints: int) -> int:
-        start, table = self.slots, self.keypoints
-        self.slots += keypoints
+        table, free = self.keypoints, self._free_slots.take(keypoints) if keypoints else None
+        start = self.slots if free is None else free
+        self.slots = max(self.slots, start + keypoints)
         if self.slots > len(table.row):
             grow(table, self.slots + max(8192, self.slots // 4))
-        new = slice(start, self.slots)
+        new = slice(start, start + keypoints)
         table.row[new] = row
         table.root[new] = -1
         table.first[new] = -1
@@ -382,7 +384,3 @@ class SparseMap(MapView):
                     table.pose_source[row] = COMPOSED
                     self._refresh_usable(row)
                 open_.append(KeyframeId(int(table.id[row])))
-
-
-def _parameters(camera: RectifiedCamera) -> tuple[float, float, float, float, float]:
-    return camera.fx, camera.fy, camera.cx, camera.cy, camera.bf

@@ -117,6 +117,61 @@ def share_keyframe(a, b, first, next_, row, usable):  # type: ignore[no-untyped-
 
 
 @njit
+def rows_near(rows, T_w_k, position, reach, near):  # type: ignore[no-untyped-def]
+    """Write those of rows (n,) whose T_w_k (m,4,4) lies within a cube of `reach` around (3,) to `near`, in order.
+
+    Returns their number.
+    """
+    n = 0
+    for i in range(rows.shape[0]):
+        r = rows[i]
+        if (
+            abs(T_w_k[r, 0, 3] - position[0]) <= reach
+            and abs(T_w_k[r, 1, 3] - position[1]) <= reach
+            and abs(T_w_k[r, 2, 3] - position[2]) <= reach
+        ):
+            near[n] = r
+            n += 1
+    return n
+
+
+@njit
+def strong_pairs(  # type: ignore[no-untyped-def]
+    rows, start, count, usable, root, is_live, first, next_, row, number, least, shared, touched, seen, a, b
+):
+    """Pairs of keyframes that share at least `least` landmarks: numbers of the older one to `a`, of the newer to `b`.
+
+    rows: (n,) of the keyframes. start, count: slots of each row's keypoints. is_live: (slots,) of landmarks that are
+    not culled. number: (m,) of each row in `rows`, -1 outside. shared: (m,) zeros in and out. touched: (m,) room. seen:
+    (slots,) -1 in. Returns how many pairs there are; those for which `a` has no room are not written.
+    """
+    pairs = 0
+    for i in range(rows.shape[0]):
+        met = 0
+        for k in range(start[rows[i]], start[rows[i]] + count[rows[i]]):
+            if usable[k] == 0 or root[k] < 0 or is_live[root[k]] == 0 or seen[root[k]] == i:
+                continue
+            seen[root[k]] = i
+            s = first[root[k]]
+            while s >= 0:
+                r = row[s]
+                if usable[s] != 0 and number[r] >= 0 and number[r] < i:
+                    if shared[r] == 0:
+                        touched[met] = r
+                        met += 1
+                    shared[r] += np.int32(1)
+                s = next_[s]
+        for t in range(met):
+            r = touched[t]
+            if shared[r] >= least:
+                if pairs < a.shape[0]:
+                    a[pairs], b[pairs] = number[r], i
+                pairs += 1
+            shared[r] = 0
+    return pairs
+
+
+@njit
 def covisibility(landmarks, first, next_, row, usable, shared):  # type: ignore[no-untyped-def]
     """Add the number of landmarks (n,) that keyframe row k observes to shared[k] (keyframes,)."""
     for i in range(landmarks.shape[0]):
@@ -125,3 +180,21 @@ def covisibility(landmarks, first, next_, row, usable, shared):  # type: ignore[
             if usable[s] != 0:
                 shared[row[s]] += np.int32(1)
             s = next_[s]
+
+
+@njit
+def positions(landmarks, inv, row, uv, offset, scale, camera, pose, out):  # type: ignore[no-untyped-def]
+    """Write the positions (n,3) in w of landmarks (n,) of inverse depths inv (n,) > 0 in their keyframes to out.
+
+    row, uv, offset: of all keypoints. scale, camera (5,), pose (4,4): of all keyframes.
+    """
+    for i in range(landmarks.shape[0]):
+        s = landmarks[i]
+        k = row[s]
+        z = scale[k] / inv[i]
+        fx = camera[k, 0] if camera[k, 0] > 0.0 else 1.0
+        fy = camera[k, 1] if camera[k, 1] > 0.0 else 1.0
+        x = (np.float64(uv[s, 0]) + np.float64(offset[s, 0]) - camera[k, 2]) / fx * z
+        y = (np.float64(uv[s, 1]) + np.float64(offset[s, 1]) - camera[k, 3]) / fy * z
+        for j in range(3):
+            out[i, j] = pose[k, j, 0] * x + pose[k, j, 1] * y + pose[k, j, 2] * z + pose[k, j, 3]

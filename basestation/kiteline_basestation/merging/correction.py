@@ -11,44 +11,45 @@ from numpy.typing import NDArray
 from kiteline_basestation.config import BaseConfig, GraphConfig, PublishConfig
 from kiteline_basestation.exchange.publisher import Publisher
 from kiteline_basestation.inertial.level import level_of
-from kiteline_basestation.map.map_tables import LANDMARK
+from kiteline_basestation.map.map_tables import LANDMARK, NO_POSE, REFINED_POSE
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.merging.essential_graph import GraphInputs, Scaled
 from kiteline_basestation.merging.loop_edges import LoopEdge, depth_of, graph_edge_of
 from kiteline_basestation.refinement.bundle_window import BundleWindow, bundle_window
+from kiteline_basestation.refinement.full_bundle_schedule import Part
 from kiteline_codec.schema import KeyframePose, RefinedLandmarks
 from kiteline_core.geometry import se3, sim3
-from kiteline_core.ids import NO_KEYFRAME, KeyframeId, SubmapId, submap_of_keyframe
+from kiteline_core.ids import KeyframeId, SubmapId, submap_of_keyframe
 
 F64 = NDArray[np.float64]
+I32 = NDArray[np.int32]
 
 _SAME = 1e-4  # relative change of depths that is not sent: a fifth of the code of an inverse depth
 
 
 def keyframes_of(sparse_map: SparseMap, map_id: SubmapId) -> list[KeyframeId]:
     """All keyframes of a map that have a pose, in order of id."""
-    keyframes = [k for s in sparse_map.submaps_of_map(map_id) for k in sparse_map.submaps.get(s, [])]
-    return [k for k in keyframes if sparse_map.pose(k) is not None]
+    return [KeyframeId(k) for k in sparse_map.keyframes.id[_posed_rows(sparse_map, map_id)].tolist()]
+
+
+def _posed_rows(sparse_map: SparseMap, map_id: SubmapId) -> I32:
+    rows = sparse_map.rows_of_map(map_id)
+    return np.asarray(rows[sparse_map.keyframes.pose_source[rows] != NO_POSE])
 
 
 def essential_graph_of(
     sparse_map: SparseMap, map_id: SubmapId, loops: Sequence[LoopEdge], config: GraphConfig
 ) -> GraphInputs | None:  # fmt: skip
     """The essential graph of a map, fixed at the first keyframe of its root submap; None with fewer than two."""
-    keyframes = keyframes_of(sparse_map, map_id)
-    if len(keyframes) < 2:
+    rows = _posed_rows(sparse_map, map_id)
+    if len(rows) < 2:
         return None
+    keyframes = [KeyframeId(k) for k in sparse_map.keyframes.id[rows].tolist()]
     number = {k: i for i, k in enumerate(keyframes)}
-    poses = np.stack([sparse_map.keyframes.T_w_k[sparse_map.rows[k]] for k in keyframes])
-    pairs: set[tuple[int, int]] = set()
-    for keyframe in keyframes:
-        parent = KeyframeId(int(sparse_map.keyframes.parent[sparse_map.rows[keyframe]]))
-        if parent in number:
-            pairs.add((number[parent], number[keyframe]))
-        for other in sparse_map.covisible_keyframes(keyframe, config.min_shared):
-            if other < keyframe and other in number:
-                pairs.add((number[other], number[keyframe]))
-    edges = np.array(sorted(pairs), np.int64).reshape(-1, 2)
+    poses = sparse_map.keyframes.T_w_k[rows]
+    above = [number.get(KeyframeId(k), -1) for k in sparse_map.keyframes.parent[rows].tolist()]
+    tree = np.array([(p, i) for i, p in enumerate(above) if p >= 0], np.int64).reshape(-1, 2)
+    edges = np.unique(np.concatenate([tree, sparse_map.covisible_pairs(rows, config.min_shared)]), axis=0)
     between = np.linalg.inv(poses[edges[:, 0]]) @ poses[edges[:, 1]]
     length = np.linalg.norm(between[:, :3, 3], axis=1)
     sigma = np.column_stack([config.sigma_m + config.sigma_path * length, np.full(len(edges), config.sigma_rad)])
@@ -80,44 +81,64 @@ def essential_graph_of(
 def move_keyframes(
     sparse_map: SparseMap, map_id: SubmapId, targets: Mapping[KeyframeId, F64], publisher: Publisher,
     publish: PublishConfig,
-) -> None:  # fmt: skip
+) -> bool:  # fmt: skip
     """Move keyframes to T_w_k (4,4); keyframes without a target move with their parent.
 
-    The first keyframe of a submap keeps its pose in m: the submap is moved instead.
+    The first keyframe of a submap keeps its pose in m: the submap is moved instead. Returns True if one was.
     """
-    keyframes = keyframes_of(sparse_map, map_id)
-    goal: dict[KeyframeId, F64] = {}
-    for keyframe in keyframes:  # in order of id: parents first
-        old = sparse_map.world_pose(keyframe)
-        assert old is not None
-        if keyframe in targets:
-            goal[keyframe] = targets[keyframe]
-        else:
-            parent = KeyframeId(int(sparse_map.keyframes.parent[sparse_map.rows[keyframe]]))
-            above = sparse_map.world_pose(parent) if parent != NO_KEYFRAME else None
-            if above is None or parent not in goal:
-                goal[keyframe] = old
-            else:
-                goal[keyframe] = se3.orthonormalise(goal[parent] @ se3.inverse(above) @ old)
+    table, rows_by_id = sparse_map.keyframes, sparse_map.rows
+    goal = dict(targets)
+    changed = [k for k, T in targets.items() if not np.array_equal(T, table.T_w_k[rows_by_id[k]])]
+    for keyframe in _carried(sparse_map, changed, targets):
+        parent = KeyframeId(int(table.parent[rows_by_id[keyframe]]))
+        above, old = table.T_w_k[rows_by_id[parent]], table.T_w_k[rows_by_id[keyframe]]
+        goal[keyframe] = se3.orthonormalise(goal[parent] @ se3.inverse(above) @ old)
+    firsts, has_moved = set(), False
     for submap in sparse_map.submaps_of_map(map_id):
         first = sparse_map.submaps[submap][0]
+        firsts.add(first)
         T_m_k = sparse_map.pose(first)
         fixed = submap == sparse_map.map_id(map_id) and not sparse_map.is_up_to_scale(submap)
-        if T_m_k is not None and not fixed:
+        held = first not in goal or np.array_equal(goal[first], table.T_w_k[rows_by_id[first]])
+        if T_m_k is not None and not (fixed or held):
             unit = sparse_map.scale(submap)
+            left = [k for k in sparse_map.submaps[submap] if k not in goal]  # these stay in w
+            goal |= {k: T for k in left if (T := sparse_map.world_pose(k)) is not None}
             sparse_map.move_submap(submap, sim3.normalise(sim3.of(unit, goal[first]) @ se3.inverse(T_m_k)))
-    firsts = {sparse_map.submaps[s][0] for s in sparse_map.submaps_of_map(map_id)}
-    for keyframe in keyframes:
-        if keyframe in firsts:
+            has_moved = True
+    moving = [k for k in sorted(goal) if k not in firsts]
+    if not moving:
+        return has_moved
+    rows, new = np.array([rows_by_id[k] for k in moving]), np.stack([goal[k] for k in moving])
+    composed = table.pose_source[rows] != REFINED_POSE  # these are carried along as their parents are set
+    for i in np.flatnonzero(_differ(table.T_w_k[rows], new, publish) | composed).tolist():
+        if composed[i] and not _differ(table.T_w_k[rows[i : i + 1]], new[i : i + 1], publish)[0]:
             continue
-        now = sparse_map.world_pose(keyframe)
-        assert now is not None
-        change = se3.inverse(now) @ goal[keyframe]
-        moved = float(np.linalg.norm(change[:3, 3]))
-        rotated = float(np.linalg.norm(change[:3, :3] - np.eye(3))) / np.sqrt(2.0)
-        if moved > publish.pose_m or rotated > publish.pose_rad:
-            sparse_map.set_world_pose(keyframe, goal[keyframe])
-            publisher.mark_changed(KeyframePose.KIND, keyframe)
+        sparse_map.set_world_pose(moving[i], new[i])
+        publisher.mark_changed(KeyframePose.KIND, moving[i])
+    return has_moved
+
+
+def _differ(a: F64, b: F64, publish: PublishConfig) -> NDArray[np.bool_]:
+    """Whether poses (n,4,4) differ by as much as is sent."""
+    change = np.linalg.inv(a) @ b
+    moved = np.linalg.norm(change[:, :3, 3], axis=1)
+    rotated = np.linalg.norm(change[:, :3, :3] - np.eye(3), axis=(1, 2)) / np.sqrt(2.0)
+    return np.asarray((moved > publish.pose_m) | (rotated > publish.pose_rad))
+
+
+def _carried(
+    sparse_map: SparseMap, changed: Sequence[KeyframeId], targets: Mapping[KeyframeId, F64]
+) -> list[KeyframeId]:  # fmt: skip
+    """Descendants of changed keyframes, in order of id, that move along: neither they nor one between has a target."""
+    table, open_, out = sparse_map.keyframes, list(changed), list[KeyframeId]()
+    while open_:
+        for row in sparse_map.children_of(open_.pop()):
+            child = KeyframeId(int(table.id[row]))
+            if child not in targets and table.pose_source[row] != NO_POSE:
+                out.append(child)
+                open_.append(child)
+    return sorted(out)
 
 
 def apply_scales(
@@ -172,22 +193,35 @@ def _scale_depths(sparse_map: SparseMap, keyframe: KeyframeId, factor: float, pu
         publisher.mark_changed(RefinedLandmarks.KIND, keyframe)
 
 
+def part_spans(count: int, most: int) -> list[tuple[int, int]]:
+    """Begin and end of the parts, which overlap by half, of so many keyframes in a row."""
+    half = max(most // 2, 1)
+    return [(begin, min(begin + most, count)) for begin in range(0, max(count - half, 1), half)]
+
+
 def full_bundle_window(
-    sparse_map: SparseMap, map_id: SubmapId, loops: Sequence[LoopEdge], base: BaseConfig
+    sparse_map: SparseMap, map_id: SubmapId, loops: Sequence[LoopEdge], base: BaseConfig, part: Part | None = None
 ) -> BundleWindow | None:  # fmt: skip
-    """Bundle window of a whole map, or of the part around its newest loop if the map is too large."""
-    config = base.graph
-    keyframes = [k for k in keyframes_of(sparse_map, map_id) if not sparse_map.keyframes.culled[sparse_map.rows[k]]]
+    """Bundle window of a whole map; of one that is too large, `part`, or without one what is around its newest loop."""
+    config, table = base.graph, sparse_map.keyframes
+    rows = _posed_rows(sparse_map, map_id)
+    rows = rows[table.culled[rows] == 0]
     first = sparse_map.submaps[sparse_map.map_id(map_id)][0]
-    if len(keyframes) > config.max_full:
-        newest = next((e for e in reversed(loops) if e.new in keyframes), None)
-        around = [newest.new, newest.old] if newest is not None else keyframes[-1:]
-        near = sparse_map.keyframes.T_w_k[[sparse_map.rows[k] for k in keyframes], :3, 3]
-        centres = np.stack([sparse_map.keyframes.T_w_k[sparse_map.rows[k], :3, 3] for k in around])
-        distance = np.linalg.norm(near[:, None] - centres, axis=2).min(axis=1)
-        keep = np.sort(np.argsort(distance, kind="stable")[: config.max_full])
-        keyframes = [keyframes[i] for i in keep.tolist()]
-    if len(keyframes) < 2:
+    is_large = len(rows) > config.max_full
+    if is_large and part is not None:
+        submap, number = part
+        begin, end = part_spans(len(sparse_map.rows_of(submap)), config.max_full)[number]
+        rows = rows[np.isin(rows, sparse_map.rows_of(submap)[begin:end])]
+    elif is_large:
+        inside = set(table.id[rows].tolist())
+        newest = next((e for e in reversed(loops) if e.new in inside), None)
+        ends = [int(table.id[rows[-1]])] if newest is None else [newest.new, newest.old]
+        around = [sparse_map.rows[KeyframeId(k)] for k in ends]
+        apart = table.T_w_k[rows, None, :3, 3] - table.T_w_k[around, :3, 3]
+        distance = np.linalg.norm(apart, axis=2).min(axis=1)
+        rows = rows[np.sort(np.argsort(distance, kind="stable")[: config.max_full])]
+    if len(rows) < 2:
         return None
+    keyframes = [KeyframeId(k) for k in table.id[rows].tolist()]
     wide = replace(base.bundle_window, max_fixed=config.max_full // 2)
-    return bundle_window(sparse_map, keyframes, wide, base.measurement, {first})
+    return bundle_window(sparse_map, keyframes, wide, base.measurement, {first}, with_children=is_large)

@@ -10,4 +10,4 @@ def _cost_ops(inputs: GraphInputs, result: GraphResult) -> int:
     return result.cost_ops
 
 
-POSE_GRAPH = JobKind("graph", optimise, _cost_ops)
+POSE_GRAPH = JobKind("graph", optimise, _cost_ops, rank=1)

@@ -49,8 +49,11 @@ def agreeing(sparse_map: SparseMap, matches: Sequence[LoopMatch], config: LoopCo
     return [match for match, fit in zip(matches, fits.tolist()) if fit]
 
 
-def within_drift(sparse_map: SparseMap, edge: LoopEdge, config: LoopConfig) -> bool:
-    """True if the correction of a loop is no larger than the drift expected over the path between its keyframes."""
+def within_drift(sparse_map: SparseMap, edge: LoopEdge, config: LoopConfig, times: float = 1.0) -> bool:
+    """True if the correction of a loop is no larger than the drift expected over the path between its keyframes.
+
+    times: that drift.
+    """
     X = correction_of(sparse_map, edge)
     pose = sparse_map.world_pose(edge.new)
     assert pose is not None
@@ -62,9 +65,25 @@ def within_drift(sparse_map: SparseMap, edge: LoopEdge, config: LoopConfig) -> b
         )  # scale drift displaces the end of the path
     moved = float(np.linalg.norm(se3.transform(X, pose[None, :3, 3])[0] - pose[:3, 3]))
     return (
-        moved <= config.drift_m + share * path
-        and _rotation_between(np.eye(4), X) <= config.drift_rad + config.drift_rad_m * path
+        moved <= times * (config.drift_m + share * path)
+        and _rotation_between(np.eye(4), X) <= times * (config.drift_rad + config.drift_rad_m * path)
         and abs(float(np.log(sim3.scale_of(X)))) <= config.max_scale_drift
+    )
+
+
+def outvotes_drift(sparse_map: SparseMap, matches: Sequence[LoopMatch], config: LoopConfig) -> bool:
+    """True if matches in one submap that agree are so many, and so independent, that drift was larger than expected."""
+    strong = [m for m in matches if m.inliers >= config.min_inliers_loop]
+    voters = sorted({m.new for m in strong})
+    if len(voters) < config.drift_votes or len({m.old for m in strong}) < config.drift_votes // 2:
+        return False
+    positions = sparse_map.keyframes.T_w_k[[sparse_map.rows[k] for k in voters], :3, 3]
+    apart = float(np.linalg.norm(positions - positions[0], axis=1).max())  # a path to and fro shows one thing often
+    return (
+        apart >= config.drift_votes_apart * depth_of(sparse_map, strong[-1])
+        and within_drift(sparse_map, strong[-1], config, config.most_drift)
+        and keeps_level(sparse_map, strong[-1], config)
+        and has_depth_relief(sparse_map, strong, config)
     )
 
 
@@ -90,10 +109,10 @@ def path_length(sparse_map: SparseMap, a: KeyframeId, b: KeyframeId) -> float:
     total = 0.0
     same = submap_of_keyframe(a) == submap_of_keyframe(b)
     for submap in sorted({submap_of_keyframe(a), submap_of_keyframe(b)}):
-        keyframes = sparse_map.submaps[submap]
+        rows = sparse_map.rows_of(submap)
         if same:
-            keyframes = [k for k in keyframes if min(a, b) <= k <= max(a, b)]
-        positions = sparse_map.keyframes.T_w_k[[sparse_map.rows[k] for k in keyframes], :3, 3]
+            rows = rows[sparse_map.number_of(min(a, b)) : sparse_map.number_of(max(a, b)) + 1]
+        positions = sparse_map.keyframes.T_w_k[rows, :3, 3]
         total += float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
     return total
 

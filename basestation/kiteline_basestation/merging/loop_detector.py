@@ -6,6 +6,7 @@ accepted when enough keyframes agree on one correction and few or none contradic
 
 from __future__ import annotations
 
+from bisect import insort
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -19,11 +20,12 @@ from kiteline_basestation.merging import loop_consistency as consistency
 from kiteline_basestation.merging.loop_edges import LoopMatch, correction_of, rescaled, slot_pairs
 from kiteline_basestation.merging.loop_verification import KeyframeObservations, observations_of, verify_loop
 from kiteline_core.geometry import se3, sim3
-from kiteline_core.ids import KeyframeId, SubmapId, agent_of_keyframe, agent_of_submap, submap_of_keyframe
+from kiteline_core.ids import AgentId, KeyframeId, SubmapId, agent_of_keyframe, submap_of_keyframe
 from kiteline_core.places.place_index import PlaceIndex, Vocabulary
 
 F64 = NDArray[np.float64]
 SubmapPair = tuple[SubmapId, SubmapId]  # the smaller id first
+_Frame = tuple[AgentId, int]  # an agent, and a time stamp
 
 _QUERIED = 12  # places queried for each candidate that is verified: most are of neighbouring keyframes
 _SAME_VIEW_COSINE = 0.5  # of the angle between optical axes: views of one place from nearby
@@ -70,6 +72,8 @@ class LoopDetector:
         self._sharing = SharingPolicy(config.share)
         self._matches: dict[SubmapPair, list[LoopMatch]] = {}
         self._contradicted: dict[SubmapPair, int] = {}  # how often matches contradicted a merge of two submaps
+        self._frames: dict[KeyframeId, _Frame] = {}  # agent and time of each keyframe of the index
+        self._of_frame: dict[_Frame, list[KeyframeId]] = {}
         self._first_seen: dict[SubmapId, int] = {}  # order in which submaps were first seen
         self.kept_apart: list[tuple[frozenset[SubmapId], frozenset[SubmapId]]] = []  # maps that a user has split
         self.requested: set[SubmapPair] = set()  # maps that a user asked to merge: one match is sufficient
@@ -80,10 +84,34 @@ class LoopDetector:
         """Add a keyframe to the place index."""
         self._first_seen.setdefault(submap_of_keyframe(keyframe), len(self._first_seen))
         self._index.add(keyframe, observations_of(self._map, keyframe).descriptor)
+        frame = self._frame_of(keyframe)
+        if self._frames.get(keyframe) != frame:  # its header may come again, with another time
+            self._leave_frame(keyframe)
+            self._frames[keyframe] = frame
+            insort(self._of_frame.setdefault(frame, []), keyframe)
 
     def remove(self, keyframe: KeyframeId) -> None:
         """Remove a keyframe from the place index."""
         self._index.remove(keyframe)
+        self._leave_frame(keyframe)
+
+    def _leave_frame(self, keyframe: KeyframeId) -> None:
+        frame = self._frames.pop(keyframe, None)
+        if frame is not None:
+            self._of_frame[frame].remove(keyframe)
+            if not self._of_frame[frame]:
+                del self._of_frame[frame]
+
+    def _frame_of(self, keyframe: KeyframeId) -> _Frame:
+        return agent_of_keyframe(keyframe), int(self._map.keyframes.t_ns[self._map.rows[keyframe]])
+
+    def forget(self, submaps: Collection[SubmapId]) -> None:
+        """Drop the matches of deleted submaps."""
+        gone = set(submaps)
+        self._matches = {key: matches for key, matches in self._matches.items() if gone.isdisjoint(key)}
+        self._contradicted = {key: count for key, count in self._contradicted.items() if gone.isdisjoint(key)}
+        self._first_seen = {s: number for s, number in self._first_seen.items() if s not in gone}
+        self.requested = {key for key in self.requested if gone.isdisjoint(key)}
 
     def oldest(self, submaps: Sequence[SubmapId]) -> SubmapId:
         """The submap that was seen first."""
@@ -127,19 +155,17 @@ class LoopDetector:
     def _closure_by_agent(self, keyframe: KeyframeId) -> LoopClosure | None:
         """Closure by two keyframes of one frame: an agent that relocalised in an old submap made one in each."""
         sparse_map = self._map
-        new, t_ns = submap_of_keyframe(keyframe), sparse_map.keyframes.t_ns[sparse_map.rows[keyframe]]
-        for submap in sorted(sparse_map.submaps):
-            if agent_of_submap(submap) != agent_of_submap(new) or sparse_map.map_id(submap) == sparse_map.map_id(new):
+        new = submap_of_keyframe(keyframe)
+        for other in self._of_frame.get(self._frame_of(keyframe), []):
+            submap = submap_of_keyframe(other)
+            if sparse_map.map_id(submap) == sparse_map.map_id(new):
                 continue
-            for other in sparse_map.submaps[submap]:
-                if sparse_map.keyframes.t_ns[sparse_map.rows[other]] != t_ns or other not in self._index:
-                    continue
-                if sparse_map.is_up_to_scale(new) or sparse_map.is_up_to_scale(submap):
-                    continue  # the scale between the submaps is unknown
-                if self._contradicted.get(_pair(new, submap), 0) or self.is_kept_apart(new, submap):
-                    continue
-                match = LoopMatch(keyframe, other, np.eye(4), self._config.min_inliers_loop, 1.0)
-                return self._closure(match, [match])
+            if sparse_map.is_up_to_scale(new) or sparse_map.is_up_to_scale(submap):
+                continue  # the scale between the submaps is unknown
+            if self._contradicted.get(_pair(new, submap), 0) or self.is_kept_apart(new, submap):
+                continue
+            match = LoopMatch(keyframe, other, np.eye(4), self._config.min_inliers_loop, 1.0)
+            return self._closure(match, [match])
         return None
 
     def _candidates(self, keyframe: KeyframeId, observations: KeyframeObservations) -> list[KeyframeId]:
@@ -150,7 +176,7 @@ class LoopDetector:
         shared = sparse_map.covisibility(sparse_map.landmarks_of(keyframe))
         known = set(sparse_map.keyframes.id[np.flatnonzero(shared > config.max_shared)].tolist())
         same = sparse_map.submaps[submap_of_keyframe(keyframe)]
-        at = same.index(keyframe)
+        at = sparse_map.number_of(keyframe)
         near = same[max(0, at - config.min_gap) : at + config.min_gap + 1]
         before = [k for k in near if k < keyframe][-1:]
         enough = config.min_likeness
@@ -203,6 +229,10 @@ class LoopDetector:
         supporters = {m.new for m in chosen}
         best = max(chosen, key=lambda m: (m.inliers, m.new))
         if same_map and not consistency.within_drift(self._map, match, config):
+            alone = len(chosen) == len(matches)  # one that sees two places speaks for neither
+            if new == old and alone and consistency.outvotes_drift(self._map, chosen, config):
+                self._matches[key] = []
+                return self._closure(best, chosen)
             self.rejected += 1
             if new == old or len(supporters) < config.min_keyframes:
                 return None
@@ -229,7 +259,7 @@ class LoopDetector:
         if self._map.map_id(new) == self._map.map_id(old):
             return None
         same = self._map.submaps[new]
-        at = same.index(match.new)
+        at = self._map.number_of(match.new)
         for keyframe in reversed(same[max(0, at - self._config.predecessors) : at]):
             if any(m.new == keyframe for m in self._matches[_pair(new, old)]):
                 continue
@@ -255,8 +285,8 @@ class LoopDetector:
             return False
         if submap_of_keyframe(match.new) != submap_of_keyframe(newest.new):
             return True
-        same = self._map.submaps[submap_of_keyframe(match.new)]
-        return abs(same.index(match.new) - same.index(newest.new)) <= self._config.recent_keyframes
+        between = self._map.number_of(match.new) - self._map.number_of(newest.new)
+        return abs(between) <= self._config.recent_keyframes
 
     def _is_ambiguous(self, keyframe: KeyframeId) -> bool:
         """True if the map of a keyframe shows the same place elsewhere too."""

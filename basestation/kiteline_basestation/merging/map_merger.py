@@ -147,6 +147,7 @@ class MapMerger:
         move_keyframes(self._map, map_id, targets, self._publisher, self._config.publish)
         self._fuse_matches(map_id)
         self._corrections.request_bundle(map_id)
+        self._corrections.request_parts(map_id)
         return MergeResult(moved=frozenset({map_id}), rescaled=units)
 
     def finish_bundle(self, done: JobDone, now_ns: int) -> MergeResult:
@@ -180,7 +181,7 @@ class MapMerger:
     def search_overlap(self, newer: SubmapId, older: SubmapId) -> None:
         """Search the older map for every keyframe of the newer one; one match then suffices (a user's command)."""
         self.detector.requested.add((min(newer, older), max(newer, older)))
-        self._requery.extend(k for k in keyframes_of(self._map, newer) if k not in self._requery)
+        self._requery = list(dict.fromkeys([*self._requery, *keyframes_of(self._map, newer)]))
 
     def merge(self, newer: SubmapId, older: SubmapId, S_older_newer: F64) -> MergeResult:
         """Merge two maps as a user says: S_older_newer (4,4) moves the newer map in w."""
@@ -212,6 +213,12 @@ class MapMerger:
             for keyframe in self._map.submaps.get(submap, []):
                 self.detector.remove(keyframe)
             self._corrections.cancel(submap)
+            self._unfused.pop(submap, None)
+            self._last_return.pop(submap, None)
+        self.detector.forget(submaps)
+        self._corrections.forget(submaps)
+        gone = set(submaps)
+        self._edges = [e for e in self._edges if gone.isdisjoint(map(submap_of_keyframe, (e.new, e.old)))]
         self._requery = [k for k in self._requery if submap_of_keyframe(k) not in submaps]
         self.merges = [m for m in self.merges if m.map_id not in submaps and m.into not in submaps]
 
@@ -261,8 +268,7 @@ class MapMerger:
         self.loops, self.undone = state.loops, state.undone
         self._last_return = dict(state.last_return)
         self._corrections.uncertain_at.update(state.uncertain_at)
-        self._corrections.bundled_sizes.update(state.bundled_sizes)
-        self._corrections.restore(state.graphs_due, state.bundles_due)
+        self._corrections.restore(state.graphs_due, state.bundles_due, state.bundled_sizes)
         self._requery = [k for k in state.requery if k in sparse_map]
         known = (e for e in state.edges if sparse_map.pose(e.new) is not None and sparse_map.pose(e.old) is not None)
         self._edges = list(known)
@@ -304,14 +310,17 @@ class MapMerger:
         """True if a keyframe shares landmarks with one that lies far back in its submap."""
         shared = self._map.covisibility(self._map.landmarks_of(keyframe))
         rows = np.flatnonzero(shared >= self._config.loops.min_inliers)
-        same = self._map.submaps[submap_of_keyframe(keyframe)]
-        old = set(same[: max(0, same.index(keyframe) - self._config.loops.loop_gap)])
-        return any(k in old for k in self._map.keyframes.id[rows].tolist())
+        submap = submap_of_keyframe(keyframe)
+        number = self._map.number_of(keyframe) - self._config.loops.loop_gap
+        if number <= 0:
+            return False
+        ids = self._map.keyframes.id[rows]
+        return bool(np.any((ids >> SEQUENCE_BITS == submap) & (ids < self._map.submaps[submap][number])))
 
     def _is_return(self, keyframe: KeyframeId) -> bool:
         """True if the path returns to an old place with this keyframe, and did not a few keyframes ago."""
         submap = submap_of_keyframe(keyframe)
-        at = self._map.submaps[submap].index(keyframe)
+        at = self._map.number_of(keyframe)
         before = self._last_return.get(submap, -self._config.loops.loop_gap - 1)
         self._last_return[submap] = at
         return at - before > self._config.loops.loop_gap
@@ -327,7 +336,7 @@ class MapMerger:
             sparse_map.move_submap(submap, sim3.normalise(closure.S_older_newer @ merge.moved[submap]))
             sparse_map.root_submaps[submap] = older
         self.merges.append(merge)
-        self._requery.extend(k for s in submaps for k in sparse_map.submaps[s] if k not in self._requery)
+        self._requery = list(dict.fromkeys([*self._requery, *(k for s in submaps for k in sparse_map.submaps[s])]))
         return MergeResult(moved=frozenset({older, newer}))
 
     def _fuse_matches(self, map_id: SubmapId) -> None:
@@ -370,7 +379,11 @@ class MapMerger:
             pose = self._map.world_pose(keyframe)
             assert pose is not None
             targets[keyframe] = pose
-        move_keyframes(self._map, map_id, targets, self._publisher, self._config.publish)
+        before = self._map.keyframes.T_w_k.copy()
+        moved = move_keyframes(self._map, map_id, targets, self._publisher, self._config.publish)
         apply_bundle(self._map, window, result, self._publisher, self._config.cull, self._config.publish)
+        if bundle.part is not None and not moved:  # also those that came since and were carried along
+            bent = np.flatnonzero((before != self._map.keyframes.T_w_k).any(axis=(1, 2)))
+            return MergeResult(bent=frozenset(bent.tolist()))
         told = {map_id: result.scale_sigma} if result.scale_sigma > 0.0 else {}
         return MergeResult(moved=frozenset({map_id}), rescaled=units, scale_sigma=told)

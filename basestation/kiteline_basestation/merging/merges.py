@@ -58,7 +58,7 @@ class MergeResult:
     moved: ids of maps in which all keyframes may have moved. rescaled: factors by which units of submaps grew in their
     map. scale_sigma: relative deviations of lengths, by map id, where accelerations told them. split: submaps that no
     longer belong to the map that they were merged into. requeried: keyframes for which loop closures were searched
-    again; local bundles are due around them.
+    again; local bundles are due around them. bent: rows of keyframes that a bundle of a part of a large map moved.
     """
 
     moved: frozenset[SubmapId] = frozenset()
@@ -66,12 +66,13 @@ class MergeResult:
     scale_sigma: Mapping[SubmapId, float] = field(default_factory=dict)
     split: frozenset[SubmapId] = frozenset()
     requeried: tuple[KeyframeId, ...] = ()
+    bent: frozenset[int] = frozenset()
 
     def __add__(self, later: MergeResult) -> MergeResult:
         factors = {submap: self.rescaled.get(submap, 1.0) * factor for submap, factor in later.rescaled.items()}
         return MergeResult(
             self.moved | later.moved, {**self.rescaled, **factors}, {**self.scale_sigma, **later.scale_sigma},
-            self.split | later.split, self.requeried + later.requeried,
+            self.split | later.split, self.requeried + later.requeried, self.bent | later.bent,
         )  # fmt: skip
 
 

@@ -57,18 +57,21 @@ def _poses(
 def _move_culled(sparse_map: SparseMap, window: BundleWindow, before: F64, publisher: Publisher) -> None:
     """Move culled keyframes, which have no observations, along with their nearest ancestor in the window."""
     table = sparse_map.keyframes
-    number = {int(table.id[row]): i for i, row in enumerate(window.rows.tolist())}
-    for row in np.flatnonzero(table.culled[: len(sparse_map)]).tolist():
-        parent = KeyframeId(int(table.parent[row]))
-        while parent in sparse_map and parent not in number and table.culled[sparse_map.rows[parent]]:
-            parent = KeyframeId(int(table.parent[sparse_map.rows[parent]]))
-        i = number.get(parent)
-        if i is None or np.array_equal(before[i], table.T_w_k[window.rows[i]]) or int(table.id[row]) in number:
+    inside = set(window.rows.tolist())
+    for i, moved in enumerate(window.rows.tolist()):
+        if np.array_equal(before[i], table.T_w_k[moved]):
             continue
-        keyframe = KeyframeId(int(table.id[row]))
-        moved = table.T_w_k[window.rows[i]] @ np.linalg.inv(before[i]) @ table.T_w_k[row]
-        sparse_map.set_world_pose(keyframe, se3.orthonormalise(moved))
-        publisher.mark_changed(KeyframePose.KIND, keyframe)
+        motion = table.T_w_k[moved] @ np.linalg.inv(before[i])
+        open_, along = [moved], list[int]()
+        while open_:
+            children = sparse_map.children_of(KeyframeId(int(table.id[open_.pop()])))
+            below = [row for row in children if table.culled[row] and row not in inside]
+            open_ += below
+            along += below
+        for row in sorted(along):
+            keyframe = KeyframeId(int(table.id[row]))
+            sparse_map.set_world_pose(keyframe, se3.orthonormalise(motion @ table.T_w_k[row]))
+            publisher.mark_changed(KeyframePose.KIND, keyframe)
 
 
 def _observations(
@@ -143,7 +146,7 @@ def _scale_change(
     table = sparse_map.keyframes
     rows = [sparse_map.rows[k] for k in keyframes]
     anchors = sparse_map.keypoints.row[window.points]
-    number = np.full(len(sparse_map), -1, np.int64)
+    number = np.full(sparse_map.height, -1, np.int64)
     number[window.rows] = np.arange(len(window.rows))
     here = np.isin(anchors, rows) & (number[anchors] >= 0)
     if np.count_nonzero(here) < _MIN_LANDMARKS:

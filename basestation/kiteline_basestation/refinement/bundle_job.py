@@ -38,4 +38,4 @@ def _cost_ops(inputs: BundleInputs, result: BundleResult) -> int:
 
 
 LOCAL_BUNDLE = JobKind("bundle", _run, _cost_ops)
-FULL_BUNDLE = JobKind("full", _run, _cost_ops)
+FULL_BUNDLE = JobKind("full", _run, _cost_ops, rank=2)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,10 +30,8 @@ class BundleWindow:
     problem: BundleProblem
 
 
-def local_bundle_window(
-    sparse_map: SparseMap, keyframe: KeyframeId, config: BundleWindowConfig, measurement: MeasurementConfig
-) -> BundleWindow | None:
-    """A keyframe and its most covisible ones, their landmarks, and fixed keyframes that observe these."""
+def local_keyframes(sparse_map: SparseMap, keyframe: KeyframeId, config: BundleWindowConfig) -> list[KeyframeId]:
+    """A keyframe and its most covisible ones, which a local bundle around it adjusts."""
     free = [keyframe, *sparse_map.covisible_keyframes(keyframe, config.min_shared)[: config.max_free - 1]]
     parent = keyframe
     while len(free) < config.max_free // 2:  # few shared landmarks: add ancestors
@@ -41,16 +40,18 @@ def local_bundle_window(
             break
         if parent not in free:
             free.append(parent)
-    return bundle_window(sparse_map, free, config, measurement)
+    return free
 
 
 def bundle_window(
     sparse_map: SparseMap, free: list[KeyframeId], config: BundleWindowConfig, measurement: MeasurementConfig,
-    held: set[KeyframeId] | None = None,
+    held: set[KeyframeId] | None = None, *, with_children: bool = False,
 ) -> BundleWindow | None:  # fmt: skip
-    """Bundle problem with `free` keyframes of one map; None if it is too small.
+    """Bundle problem with `free` keyframes of one map, their landmarks, and fixed keyframes that observe these; None if
+    it is too small.
 
-    held: keyframes that stay fixed; by default the first one of each submap.
+    held: keyframes that stay fixed; by default the first one of each submap. with_children: hold those whose parent,
+    but for culled ones between, is free as well.
     """
     table, keyframes = sparse_map.keypoints, sparse_map.keyframes
     submaps = sparse_map.submaps_of_map(submap_of_keyframe(free[0]))
@@ -63,11 +64,10 @@ def bundle_window(
 
     # Keep the free keyframes, and of the others those that observe most.
     free_rows = np.array([sparse_map.rows[k] for k in free], np.int32)
-    counts = np.bincount(table.row[slots], minlength=len(sparse_map))
-    rows_inside = np.array([sparse_map.rows[k] for s in submaps for k in sparse_map.submaps[s]], np.int32)
-    mask = np.zeros(len(sparse_map), bool)
-    mask[rows_inside] = True
-    mask &= keyframes.pose_source[: len(sparse_map)] != NO_POSE
+    counts = np.bincount(table.row[slots], minlength=sparse_map.height)
+    mask = np.zeros(sparse_map.height, bool)
+    mask[sparse_map.rows_of_map(submaps[0])] = True
+    mask &= keyframes.pose_source[: sparse_map.height] != NO_POSE
     counts[~mask] = 0
     counts[free_rows] = 0
     others = np.flatnonzero(counts > 0)
@@ -75,11 +75,13 @@ def bundle_window(
     others = others[order[: config.max_fixed]].astype(np.int32)
     # Odometry ties keyframes to their parents: without these, few observations elsewhere would carry all of them away.
     parents = np.array([sparse_map.rows.get(KeyframeId(int(p)), -1) for p in keyframes.parent[free_rows]], np.int32)
+    if with_children:
+        parents = np.concatenate([parents, _below(sparse_map, free)])
     # Culled ones do not: what has no observations moves with the map, and must not hold it.
     parents = parents[(parents >= 0) & mask[parents] & (keyframes.culled[parents] == 0)]
     rows = np.unique(np.concatenate([free_rows, others, parents]))
     rows = rows[np.argsort(keyframes.id[rows])]
-    number = np.full(len(sparse_map), -1, np.int32)
+    number = np.full(sparse_map.height, -1, np.int32)
     number[rows] = np.arange(len(rows))
     keep = number[table.row[slots]] >= 0
 
@@ -106,12 +108,22 @@ def bundle_window(
     return BundleWindow(rows, points, slots, problem)
 
 
+def _below(sparse_map: SparseMap, keyframes: Sequence[KeyframeId]) -> I32:
+    """Rows of the nearest descendants of keyframes that are not culled: without them, all behind would move along."""
+    table, open_, out = sparse_map.keyframes, list(keyframes), list[int]()
+    while open_:
+        rows = sparse_map.children_of(open_.pop())
+        open_ += [KeyframeId(int(table.id[row])) for row in rows if table.culled[row]]
+        out += [row for row in rows if not table.culled[row]]
+    return np.array(out, np.int32)
+
+
 def measurements(sparse_map: SparseMap, slots: I32, config: MeasurementConfig) -> tuple[F64, F64]:
     """Measurements (m,3) u, v, disparity in px (-1 none); standard deviations (m,2) of pixel and disparity in px."""
     table = sparse_map.keypoints
     rows = table.row[slots]
-    has_depth = np.zeros(len(sparse_map), bool)
-    sigma = np.full(len(sparse_map), config.sigma_disparity_px)
+    has_depth = np.zeros(sparse_map.height, bool)
+    sigma = np.full(sparse_map.height, config.sigma_disparity_px)
     for row in np.unique(rows).tolist():
         agent = agent_of_keyframe(KeyframeId(int(sparse_map.keyframes.id[row])))
         camera = sparse_map.cameras.get(agent)

@@ -19,7 +19,7 @@ _MIN_SHARED = 15  # landmarks that a keyframe shares with the new one, to be tes
 def cull_weak_landmarks(sparse_map: SparseMap, keyframe: KeyframeId, config: CullConfig, publisher: Publisher) -> int:
     """Test the landmarks first observed `landmark_age` keyframes before this one. Returns how many were culled."""
     same = sparse_map.submaps[submap_of_keyframe(keyframe)]
-    number = same.index(keyframe)
+    number = sparse_map.number_of(keyframe)
     if number < config.landmark_age:
         return 0
     anchor = same[number - config.landmark_age]
@@ -44,7 +44,7 @@ def cull_redundant_keyframes(
     out: list[KeyframeId] = []
     for other in sparse_map.covisible_keyframes(keyframe, _MIN_SHARED):
         same = sparse_map.submaps[submap_of_keyframe(other)]
-        at = same.index(other)
+        at = sparse_map.number_of(other)
         if at == 0 or len(same) - at <= config.keyframe_age or not sparse_map.is_complete(other):
             continue
         if sparse_map.keyframes.pose_source[sparse_map.rows[other]] == REFINED_POSE and _redundant(

@@ -51,16 +51,16 @@ def nearby_keyframes(sparse_map: SparseMap, keyframe: KeyframeId, config: Landma
     if len(inverse) == 0:
         return covisible
     reach = config.near_ratio / float(np.median(inverse))
-    same = [k for s in sparse_map.submaps_of_map(submap_of_keyframe(keyframe)) for k in sparse_map.submaps[s]]
-    rows = np.array([sparse_map.rows[k] for k in same], np.int32)
+    rows = sparse_map.rows_near(submap_of_keyframe(keyframe), table.T_w_k[row, :3, 3], reach)
     poses = table.T_w_k[rows]
     distance = np.linalg.norm(poses[:, :3, 3] - table.T_w_k[row, :3, 3], axis=1)
     cosine = poses[:, :3, 2] @ table.T_w_k[row, :3, 2]
     near = (distance < reach) & (cosine > config.near_cosine) & (table.pose_source[rows] != NO_POSE)
     near &= (rows != row) & (table.culled[rows] == 0)
-    order = np.argsort(distance[near], kind="stable")
+    ids = table.id[rows[near]]
+    order = np.lexsort((ids, distance[near]))
     taken = set(covisible)
-    extra = [same[i] for i in np.flatnonzero(near)[order].tolist() if same[i] not in taken]
+    extra = [k for k in map(KeyframeId, ids[order].tolist()) if k not in taken]
     return covisible + extra[: config.max_nearby]
 
 

@@ -10,13 +10,13 @@ from kiteline_basestation.jobs import Job, JobDone
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.refinement.apply_bundle import apply_bundle
 from kiteline_basestation.refinement.bundle_job import LOCAL_BUNDLE, BundleInputs
-from kiteline_basestation.refinement.bundle_window import BundleWindow, local_bundle_window
+from kiteline_basestation.refinement.bundle_window import BundleWindow, bundle_window, local_keyframes
 from kiteline_basestation.refinement.odometry_factors import with_odometry_factors, without_odometry_factors
 from kiteline_core.ids import KeyframeId, SubmapId, submap_of_keyframe
 
 
 class LocalBundles:
-    """At most one local bundle at a time for each map; submaps take turns."""
+    """At most one local bundle at a time for each region of a map; submaps take turns."""
 
     def __init__(
         self, config: BaseConfig, sparse_map: SparseMap, publisher: Publisher, job_ids: Iterator[int]
@@ -28,6 +28,7 @@ class LocalBundles:
         self._waiting: dict[SubmapId, list[KeyframeId]] = {}  # keyframes that no bundle has moved yet
         self._pending: dict[int, tuple[SubmapId, BundleWindow]] = {}
         self._last_job: dict[SubmapId, int] = {}  # newest job of each submap
+        self._blocked: set[SubmapId] = set()  # submaps whose next bundle has to wait for one that is pending
 
     @property
     def idle(self) -> bool:
@@ -55,31 +56,49 @@ class LocalBundles:
 
     def add(self, keyframe: KeyframeId) -> None:
         """Queue a keyframe for a bundle around it."""
-        self._waiting.setdefault(submap_of_keyframe(keyframe), []).append(keyframe)
+        submap = submap_of_keyframe(keyframe)
+        self._waiting.setdefault(submap, []).append(keyframe)
+        self._blocked.discard(submap)
 
     def cancel(self, map_id: SubmapId) -> None:
         """Ignore the results of pending bundles of a map that has moved; they are due again."""
-        for job, (submap, _) in list(self._pending.items()):
-            if self._map.map_id(submap) == map_id:
-                del self._pending[job]
-                self.add(self._map.submaps[submap][-1])
+        self._cancel([job for job, (submap, _) in self._pending.items() if self._map.map_id(submap) == map_id])
+
+    def cancel_around(self, rows: Collection[int]) -> None:
+        """Ignore the results of pending bundles with keyframes in `rows`, which have moved; they are due again."""
+        gone = set(rows)
+        self._cancel([job for job, (_, w) in self._pending.items() if not gone.isdisjoint(w.rows.tolist())])
+
+    def _cancel(self, jobs: Collection[int]) -> None:
+        for job in jobs:
+            submap, _ = self._pending.pop(job)
+            self.add(self._map.submaps[submap][-1])
+        self._blocked.clear()
 
     def delete(self, submaps: Collection[SubmapId]) -> None:
         """Drop all that concerns deleted submaps."""
         for submap in submaps:
             self._waiting.pop(submap, None)
+            self._last_job.pop(submap, None)
         self._pending = {job: bundle for job, bundle in self._pending.items() if bundle[0] not in submaps}
+        self._blocked.clear()
 
     def jobs(self) -> list[Job]:
         """Bundles to start now: around the newest keyframe of a submap, or of a backlog from its oldest on."""
-        busy = {self._map.map_id(submap) for submap, _ in self._pending.values()}
-        jobs = []
-        for submap in sorted(self._waiting, key=lambda s: (self._last_job.get(s, 0), s)):
-            if self._map.map_id(submap) in busy:
+        jobs: list[Job] = []
+        for submap in sorted(self._waiting.keys() - self._blocked, key=lambda s: (self._last_job.get(s, 0), s)):
+            config, waiting = self._config.bundle_window, self._waiting[submap]
+            # Of a backlog half a window at a time.
+            keyframe = waiting[-1] if len(waiting) <= config.max_free else waiting[config.max_free // 2]
+            free = local_keyframes(self._map, keyframe, config)
+            if self._meets({self._map.rows[k] for k in free}, free_only=False):
+                self._blocked.add(submap)
                 continue
-            waiting, size = self._waiting.pop(submap), self._config.bundle_window.max_free
-            keyframe = waiting[-1] if len(waiting) <= size else waiting[size // 2]  # half a window at a time
-            window = local_bundle_window(self._map, keyframe, self._config.bundle_window, self._config.measurement)
+            window = bundle_window(self._map, free, config, self._config.measurement)
+            if window is not None and self._meets(set(window.rows.tolist()), free_only=True):
+                self._blocked.add(submap)
+                continue
+            del self._waiting[submap]
             moved = set() if window is None else set(self._map.keyframes.id[window.rows[window.problem.free]].tolist())
             left = [k for k in waiting if k != keyframe and k not in moved]
             if left:
@@ -90,16 +109,24 @@ class LocalBundles:
                 jobs.append(job)
                 self._pending[job.id] = (submap, window)
                 self._last_job[submap] = job.id
-                busy.add(self._map.map_id(submap))
         return jobs
+
+    def _meets(self, rows: Collection[int], *, free_only: bool) -> bool:
+        """True if keyframes are in a pending bundle; free_only: only where they are free in it."""
+        pending = (window for _, window in self._pending.values())
+        return any(
+            not set(rows).isdisjoint((w.rows[w.problem.free] if free_only else w.rows).tolist()) for w in pending
+        )  # fmt: skip
 
     def forget(self, job: int) -> None:
         """Forget a job without a result, if it is one of these."""
         self._pending.pop(job, None)
+        self._blocked.clear()
 
     def finish(self, done: JobDone) -> bool:
         """Apply a finished bundle. Returns False if it was cancelled."""
         pending = self._pending.pop(done.id, None)
+        self._blocked.clear()
         if pending is None:
             return False
         window = pending[1]

@@ -32,8 +32,11 @@ F64 = NDArray[np.float64]
 _GRID = np.stack(np.meshgrid((-0.6, 0.0, 0.6), (-0.4, 0.4)), -1).reshape(-1, 2)  # x/z, y/z: as wide as a usual lens
 _PX_OF_ROTATION = 1.7  # factor from a rotation's error to the standard deviation of 6 far points, each observed twice
 _MIN_RUN = 5  # rotations for an estimate of their common error
-_DEPTHS = (0.7, 1.8)  # times the median depth: near points constrain translation, far ones rotation
-_ROTATION_DEPTHS = (8.0,)  # the same for rotation alone
+_ON_PLANE = np.column_stack([_GRID, np.ones(len(_GRID))])
+_DEPTHS = np.concatenate([0.7 * _ON_PLANE, 1.8 * _ON_PLANE])  # of the median depth: near points tell the translation
+_ROTATION_DEPTHS = 8.0 * _ON_PLANE  # the same for rotation alone
+_MOST_PX = 1e5  # above any disparity, so that one sort orders by camera and disparity
+_UNKNOWN_DEPTH = 3.0  # where a keyframe has no disparities
 _LEAST_POINTS = 4  # synthetic points of a step
 _NO_DISPARITY, _NO_GROUP = -1.0, -1
 
@@ -98,6 +101,7 @@ def _steps(
     counts = np.bincount(problem.camera, minlength=len(window.rows))
     number = {int(table.id[row]): i for i, row in enumerate(window.rows.tolist())}
     difference_px = _PX_OF_ROTATION * _rotation_difference_px(sparse_map, window, number, config.run)
+    depth = median_depths(problem)
     for k, row in enumerate(window.rows.tolist()):
         p = number.get(int(table.parent[row]))
         keyframe = KeyframeId(int(table.id[row]))
@@ -115,7 +119,7 @@ def _steps(
             sets.append((_DEPTHS, config.scale_sigma_px))
         T_p_k = sim3.with_scaled_translation(table.T_p_k[row], sparse_map.scale(submap))
         for depths, sigma_px in sets:
-            synthetic = _synthetic_points(sparse_map, problem, k, p, T_p_k, depths)
+            synthetic = _synthetic_points(problem, k, p, T_p_k, depths, float(depth[k]))
             if synthetic is None:
                 continue
             in_k, in_p, world = synthetic
@@ -180,15 +184,28 @@ def _rotation_difference_px(sparse_map: SparseMap, window: BundleWindow, number:
     return max(each, together) * float(np.median(window.problem.lens[k, 0]))
 
 
+def median_depths(problem: BundleProblem) -> F64:
+    """The median depth (k,) that each camera observes, by its disparities."""
+    seen = problem.measured[:, 2] > 0.0
+    camera, disparity = problem.camera[seen], problem.measured[seen, 2]
+    disparity = np.sort(camera * _MOST_PX + disparity) - np.sort(camera) * _MOST_PX  # by camera, then by disparity
+    count = np.bincount(camera, minlength=len(problem.T_c_m))
+    known = count > 0
+    start = np.cumsum(count)[known] - count[known]
+    middle = 0.5 * (disparity[start + (count[known] - 1) // 2] + disparity[start + count[known] // 2])
+    depth = np.full(len(count), _UNKNOWN_DEPTH)
+    depth[known] = problem.lens[known, 4] / middle
+    return depth
+
+
 def _synthetic_points(
-    sparse_map: SparseMap, problem: BundleProblem, k: int, p: int, T_p_k: F64, depths: tuple[float, ...]
-) -> tuple[F64, F64, F64] | None:  # fmt: skip
-    """Observations (n,3) of synthetic points in keyframes k and p, and their positions (n,3); None if too few fit."""
-    own = problem.camera == k
-    depth = problem.measured[own, 2]
-    depth = depth[depth > 0]  # px
-    typical = problem.lens[k, 4] / float(np.median(depth)) if len(depth) else 3.0
-    local = np.concatenate([np.column_stack([_GRID, np.ones(len(_GRID))]) * typical * d for d in depths])
+    problem: BundleProblem, k: int, p: int, T_p_k: F64, depths: F64, typical: float
+) -> tuple[F64, F64, F64] | None:
+    """Observations (n,3) of synthetic points in keyframes k and p, and their positions (n,3); None if too few fit.
+
+    depths: (n,3) points in k at a `typical` depth of one.
+    """
+    local = typical * depths
     in_parent = se3.transform(T_p_k, local)
     ahead = in_parent[:, 2] > 0.1 * typical
     if np.count_nonzero(ahead) < _LEAST_POINTS:
@@ -201,7 +218,11 @@ def _synthetic_points(
 def _projected(lens: F64, xyz: F64) -> F64:
     """u, v, disparity (n,3) px of points (n,3) in the camera frame."""
     inv = 1.0 / xyz[:, 2]
-    return np.column_stack([lens[0] * xyz[:, 0] * inv + lens[2], lens[1] * xyz[:, 1] * inv + lens[3], lens[4] * inv])
+    out = np.empty_like(xyz)
+    out[:, 0] = lens[0] * xyz[:, 0] * inv + lens[2]
+    out[:, 1] = lens[1] * xyz[:, 1] * inv + lens[3]
+    out[:, 2] = lens[4] * inv
+    return out
 
 
 def without_odometry_factors(window: BundleWindow, result: BundleResult) -> BundleResult:

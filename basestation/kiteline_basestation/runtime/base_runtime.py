@@ -19,7 +19,7 @@ from kiteline_basestation.runtime.imports import read_imports
 from kiteline_basestation.runtime.map_files import map_files
 from kiteline_basestation.runtime.options import LOG_STEM, BaseOptions, base_config
 from kiteline_basestation.runtime.warm import warm, warm_graphs
-from kiteline_basestation.runtime.worker import SAMPLES, LockstepJobs, Worker
+from kiteline_basestation.runtime.worker import SAMPLES, LockstepJobs, Workers
 from kiteline_basestation.station import Import, Station, StationOutput
 from kiteline_basestation.store.keeper import Keeper
 from kiteline_basestation.store.restore import Restored, restore
@@ -44,12 +44,16 @@ _DRAIN_NS = 30_000_000_000  # ns of flight time after which a link that is not q
 _RSS_STEPS = 10  # steps between two readings of the resident memory
 
 
+def missing_extras() -> list[str]:
+    """What a base goes without, as the plain install leaves it out; a line each with the mend."""
+    if importlib.util.find_spec("gtsam") is None:
+        return ["gtsam is not installed: no loop closing, no map merging; pip install 'kiteline[base]'"]
+    return []
+
+
 def load_vocabulary() -> Vocabulary | None:
     """The shipped visual vocabulary; None if gtsam, which loop closing needs, is not installed."""
-    if importlib.util.find_spec("gtsam") is None:
-        process.print_lines(["gtsam is not installed: no loop closing, no map merging; pip install 'kiteline[base]'"])
-        return None
-    return shipped_vocabulary()
+    return None if missing_extras() else shipped_vocabulary()
 
 
 class BaseRuntime:
@@ -59,7 +63,7 @@ class BaseRuntime:
         self,
         options: BaseOptions,
         open_channel: Callable[[AgentId], RecordChannel],
-        jobs: Worker | None = None,
+        jobs: Workers | None = None,
         plain: bool = False,
     ) -> None:
         """open_channel: makes the base's end of a channel. plain: no codec, so no packets are logged."""
@@ -73,7 +77,7 @@ class BaseRuntime:
             warm_graphs()
         self.station = Station(self.config, open_channel, vocabulary)
         self.station.mapper.cpu_ns = time.process_time_ns
-        self.jobs: LockstepJobs | Worker = LockstepJobs() if jobs is None else jobs
+        self.jobs: LockstepJobs | Workers = LockstepJobs() if jobs is None else jobs
         self.phase = Phase.FLY
         self.now_ns: int | None = None  # flight time of the next tick in lock-step
         self.rss_mib = 0.0
@@ -257,9 +261,10 @@ def report_restored(restored: Restored | None, parent: process.Parent | None) ->
     """Print what was restored and repaired, and send it to the parent process."""
     if restored is None:
         return
+    keyframes = f"{restored.keyframes} keyframe{'s' * (restored.keyframes != 1)}"
     process.print_lines(
         [
-            f"store: {restored.keyframes} keyframes, {restored.awaited} values awaited",
+            f"store: {keyframes}, {restored.awaited} value{'s' * (restored.awaited != 1)} awaited",
             *(f"store: repaired: {fault}" for fault in restored.faults),
         ]
     )

@@ -32,7 +32,19 @@ STEP, JOB, RESTORED, IMPORT, COMMAND, ANSWER = "/step", "/job", "/restored", "/i
 
 def metadata_of(spec: BaseOptions, config: BaseConfig, *, plain_channels: bool) -> dict[str, str]:
     """Metadata of a log that a replay needs."""
-    unlogged = ("folder", "config", "store", "imports", "web", "maps", "quiet", "log_mib", "log_optional")
+    unlogged = (
+        "folder",
+        "config",
+        "store",
+        "imports",
+        "web",
+        "maps",
+        "quiet",
+        "log_mib",
+        "log_optional",
+        "paired_only",
+        "workers",
+    )
     plain = {key: value for key, value in asdict(spec).items() if key not in unlogged}
     plain["link"] = spec.link.partition(":")[0]  # the kind decides how packets are made, the address does not
     channel = "PlainChannel" if plain_channels else "CodedChannel"

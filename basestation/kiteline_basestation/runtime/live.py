@@ -1,18 +1,20 @@
-"""A live base: real clocks, any number of agents; jobs are done by a worker process."""
+"""A live base: real clocks, any number of agents; jobs are done by worker processes."""
 
 from __future__ import annotations
 
 import contextlib
+import importlib
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
-from kiteline_basestation.runtime.base_runtime import BaseRuntime, report_restored
+from kiteline_basestation.runtime.base_runtime import BaseRuntime, missing_extras, report_restored
 from kiteline_basestation.runtime.options import BaseOptions, coded_channels
 from kiteline_basestation.runtime.questions import Questions
-from kiteline_basestation.runtime.seals import BaseSeals
+from kiteline_basestation.runtime.seals import BaseSeals, logins_of
 from kiteline_basestation.runtime.terminal import TerminalReporter
 from kiteline_basestation.runtime.warm import WARMING
-from kiteline_basestation.runtime.worker import Worker
+from kiteline_basestation.runtime.worker import Workers
 from kiteline_basestation.station import Station
 from kiteline_codec.channel import CodedChannel
 from kiteline_codec.transport.framing import StreamFramer
@@ -39,6 +41,10 @@ def fly_live(options: BaseOptions, parent: process.Parent | None, stop: process.
     False if the store does not hold all of the map.
     """
     return_large_arrays()
+    if parent is None:
+        process.print_lines(missing_extras())
+    if options.web:
+        importlib.import_module("kiteline_basestation.web.status_page")  # what it needs and lacks is told at once
     if not kernel_cache.filled():
         with starting():
             kernel_cache.fill(WARMING, stop)
@@ -46,16 +52,17 @@ def fly_live(options: BaseOptions, parent: process.Parent | None, stop: process.
         return True
     clock, closed = MonotonicClock(), list[bool]()
     with contextlib.ExitStack() as stack:
-        link = open_link(options.link, "base", framer=StreamFramer, required=False)
+        logins = logins_of(Path(options.key)) if options.paired_only else None
+        link = open_link(options.link, "base", framer=StreamFramer, required=False, logins=logins)
         stack.callback(link.close)
         seals = BaseSeals(options, link)
         hub = seals.hub
         page = _open_page(options, clock.now_ns(), stack)
-        worker = Worker()
-        stack.callback(worker.close)
+        workers = Workers(options.workers)
+        stack.callback(workers.close)
         try:
             with starting(), long_work(stop, "compiling kernels"):
-                base = BaseRuntime(options, coded_channels(options, link_traits(options.link)), worker)
+                base = BaseRuntime(options, coded_channels(options, link_traits(options.link)), workers)
             stack.callback(lambda: closed.append(base.close()))
             process.notify("READY=1")  # a store or an import that takes minutes is no failed start
             with long_work(stop, "reading the map"):
@@ -74,8 +81,8 @@ def fly_live(options: BaseOptions, parent: process.Parent | None, stop: process.
         while not stop:
             now_ns = clock.now_ns()
             packets = {agent: received for agent, end in hub.links().items() if (received := end.receive())}
-            done = worker.done(now_ns)
-            process.print_lines([*worker.take_notes(), *seals.lines(now_ns)])
+            done = workers.done(now_ns)
+            process.print_lines([*workers.take_notes(), *seals.lines(now_ns)])
             commands = questions.commands()
             if packets or done or commands or now_ns - stepped_ns >= _STEP_NS:
                 output = base.step(packets, done, now_ns, commands)

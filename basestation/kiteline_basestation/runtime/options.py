@@ -34,6 +34,7 @@ class BaseOptions:
     start_ns: int = 0  # time stamp of flight time 0: the log uses the time of the first source
     down_bytes_s: int = 0  # B/s to each agent; 0: no limit
     key: str = ""  # a file with the agents' keys; "": packets are not sealed
+    paired_only: bool = False  # take no connection of anyone without a key (zenoh)
     told: tuple[str, ...] = ()  # lines about that for the user
     profile: str = ""  # wifi or radio; "": by the link's throughput
     delay_s: float = 0.0  # s; modelled delay of the link
@@ -46,6 +47,7 @@ class BaseOptions:
     imports: tuple[str, ...] = ()
     web: str = ""
     quiet: bool = False  # no status messages
+    workers: int = 0  # processes for jobs; 0: as the machine has cores
     maps: str = ""  # a Zenoh endpoint for `kiteline maps`; "": the agents' link
 
 
@@ -81,7 +83,12 @@ def parser(link_forms: str = "") -> argparse.ArgumentParser:
                    "(default, beyond this machine: a file that is made at the first start)")  # fmt: skip
     p.set_defaults(told=())
     p.add_argument("--insecure", action="store_true", help="serve anyone who reaches the link, without seals")
+    p.add_argument("--paired-only", action="store_true",
+                   help="take no connection of anyone without a key in the file (IP links): strangers take up none of "
+                   "the 96; new keys count from the next start")  # fmt: skip
     p.add_argument("--profile", choices=("wifi", "radio"), default="", help="default: as the link allows")
+    p.add_argument("--workers", metavar="N", type=int, default=0,
+                   help="processes for long work, 150 MiB each (default: a core each, 2 to 4)")  # fmt: skip
     p.add_argument("--quiet", action="store_true", help="print no status messages")
     p.add_argument("--spec", metavar="JSON", default="", help=argparse.SUPPRESS)
     return p
@@ -93,8 +100,9 @@ def options_of(a: argparse.Namespace, session: int) -> BaseOptions:
         folder=a.log, log_name=f"{LOG_STEM}{session}.mcap" if a.log else "", log_mib=a.log_mib, log_optional=True,
         session=session,
         link=a.link, config=a.config, down_bytes_s=a.down_bytes, profile=a.profile, key=a.key, told=a.told,
+        paired_only=a.paired_only,
         store=a.store, web=a.web,
-        imports=tuple(a.imports), maps=a.maps, quiet=a.quiet,
+        imports=tuple(a.imports), maps=a.maps, quiet=a.quiet, workers=max(0, a.workers),
     )  # fmt: skip
 
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import json
+import secrets
 import time
 from collections.abc import Callable, Sequence
 
 from kiteline_basestation.management import READING, Answer, Command
 from kiteline_basestation.runtime.options import BaseOptions
 from kiteline_codec.schema import WireError
-from kiteline_codec.transport.signed_question import QuestionGuard, unsigned
+from kiteline_codec.transport.signed_question import OtherStartError, QuestionGuard, unsigned
 from kiteline_hw.links.sealing import is_loopback
 from kiteline_hw.links.zenoh_link import ZenohHub
 from kiteline_hw.links.zenoh_queries import QueryServer
@@ -38,7 +39,7 @@ class Questions:
             self._server = QueryServer("maps", session=hub.session)
         if self._server is not None:
             stack.callback(self._server.close)
-        self._guard = QuestionGuard(maps_key) if options.key else None
+        self._guard = QuestionGuard(maps_key, secrets.token_hex(16)) if options.key else None
         self._reading_free = bool(options.maps) and is_loopback(f"zenoh:{options.maps.removeprefix('zenoh:')}")
 
     def commands(self) -> list[Command]:
@@ -50,7 +51,8 @@ class Questions:
             try:
                 out.append(Command(asked.number, asked.verb, self._opened(asked.verb, asked.text)))
             except WireError as error:
-                self._server.answer(asked.number, False, json.dumps({"error": str(error)}))
+                start = {"start": error.start} if isinstance(error, OtherStartError) else {}
+                self._server.answer(asked.number, False, json.dumps({"error": str(error), **start}))
         return out
 
     def answer(self, answers: Sequence[Answer]) -> None:

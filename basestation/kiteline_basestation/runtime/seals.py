@@ -8,12 +8,25 @@ from kiteline_basestation.runtime.options import BaseOptions
 from kiteline_codec.transport.seal import Direction, Opener, Sealer, suite_for
 from kiteline_codec.transport.seal_watch import SealWatch
 from kiteline_hw.links.kinds import link_traits
-from kiteline_hw.links.sealed_link import SealedHub, WatchedHub
+from kiteline_hw.links.sealed_link import SealedHub, SealedLineHub, WatchedHub
 from kiteline_hw.links.zenoh_link import ZenohHub
 from kiteline_hw.ports import LinkError, LinkHub
-from kiteline_hw.system.key_store import WatchedKeys
+from kiteline_hw.system.key_store import MAPS, WatchedKeys, login_of, read_file
 
 _LOOK_NS = 1_000_000_000  # between two looks at the file of keys
+
+
+def logins_of(path: Path) -> dict[str, str]:
+    """Users and passwords of all who have a key in a file. Raises LinkError, also if nobody has one: the base would
+    take connections of anyone.
+    """
+    keys = read_file(path)
+    if not keys.agents and keys.maps is None:
+        raise LinkError(f"nobody has a key in {path}: run `kiteline keys --file {path} pair N`")
+    owners: list[tuple[int | str, bytes]] = [*keys.agents.items()]
+    if keys.maps is not None:
+        owners.append((MAPS, keys.maps))
+    return {user: password for owner, key in owners for user, password in login_of(owner, key).items()}
 
 
 class BaseSeals:
@@ -29,7 +42,11 @@ class BaseSeals:
         self._opener = None if self._file is None else Opener(self._keys, Direction.UP)
         self.sealers: dict[int, Sealer] = {}  # by agent
         self._watch = SealWatch(Direction.DOWN, self._opener)
-        self._sealed = None if self._file is None else SealedHub(link, self._sealer, self._watch)
+        self._sealed: SealedHub | SealedLineHub | None = None
+        if self._file is not None and link_traits(options.link).thin:
+            self._sealed = SealedLineHub(link, self._sealer, self._watch)
+        elif self._file is not None:
+            self._sealed = SealedHub(link, self._sealer, self._watch)
         self.hub: LinkHub = WatchedHub(link, self._watch) if self._sealed is None else self._sealed
 
     def lines(self, now_ns: int) -> list[str]:
@@ -39,6 +56,8 @@ class BaseSeals:
             self._looked_ns = now_ns
             lines += self._new_keys()
             doubles = self._link.doubles() if isinstance(self._link, ZenohHub) else frozenset()
+            if self._sealed is not None:
+                doubles &= self._sealed.alive()  # anyone can announce a number
             lines += [
                 f"two agents have number {agent}: give each its own --agent N"
                 for agent in sorted(doubles - self._doubles)

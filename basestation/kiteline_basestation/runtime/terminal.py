@@ -1,4 +1,4 @@
-"""Status messages of a base for the terminal: events, and a summary every few seconds. Pure."""
+"""Status messages of a base for the terminal: events, and a summary every few seconds while something changes. Pure."""
 
 from __future__ import annotations
 
@@ -34,6 +34,7 @@ class TerminalReporter:
         self._merges = [] if merger is None else list(merger.merges)
         self._summary_ns = _EVERY_NS
         self._bytes_down = self._bytes_up = 0
+        self._summarised: tuple[object, ...] = ()  # what the last summary said, but for rates and memory
 
     def lines(self, here: Collection[int], flight_ns: int, rss_mib: float, stored: bool | None) -> list[str]:
         """Lines to print after a step. here: reachable agents. rss_mib: peak memory of this process.
@@ -42,7 +43,11 @@ class TerminalReporter:
         """
         out = [*self._agents(frozenset(map(AgentId, here)), flight_ns), *self._maps()]
         if flight_ns >= self._summary_ns:
-            out.append(self._status(flight_ns, rss_mib, stored))
+            status = self._status(flight_ns, rss_mib, stored)
+            now = (len(self._here), self.summary(), stored)
+            if now != self._summarised:
+                out.append(status)
+                self._summarised = now
             self._summary_ns = flight_ns + _EVERY_NS
         return [f"{flight_ns / 1e9:8.1f} s  {line}" for line in out]
 
@@ -116,7 +121,7 @@ class TerminalReporter:
         mapper = self._station.mapper
         keyframes = sum(len(mapper.map.submaps.get(submap, ())) for submap in merge.moved)
         newer, older = _name(merge.map_id, mapper.names), _name(merge.into, mapper.names)
-        return f"map {newer} ({keyframes} keyframes) merged into map {older}"
+        return f"map {newer} ({_count(keyframes, 'keyframe')}) merged into map {older}"
 
     def summary(self) -> str:
         """Sizes of the map in one line."""

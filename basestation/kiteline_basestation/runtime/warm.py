@@ -53,6 +53,7 @@ def warm(config: BaseConfig | None = None, vocabulary: Vocabulary | None = None)
     easy = replace(station.mapper.config.loops, min_inliers=4, min_inliers_all=4, min_matched_share=0.0)
     last, first = keyframe_id(submap, _KEYFRAMES - 1), keyframe_id(submap, 0)
     verify_loop(sparse_map, last, first, easy)
+    sparse_map.covisible_pairs(sparse_map.rows_of(submap), 1)
     sparse_map.set_camera(AgentId(0), replace(stereo, stereo=False))
     sparse_map.measures_depth.clear()
     verify_loop(sparse_map, last, first, easy)  # monocular, with a scale

@@ -1,10 +1,12 @@
-"""Runs jobs: in a worker process, or in lock-step flights in this process with modelled time."""
+"""Runs jobs: in worker processes, or in lock-step flights in this process with modelled time."""
 
 from __future__ import annotations
 
 import contextlib
+import heapq
 import importlib.util
 import multiprocessing
+import os
 import signal
 import time
 from collections import defaultdict, deque
@@ -13,7 +15,7 @@ from multiprocessing.connection import Connection
 
 import cv2
 
-from kiteline_basestation.job_kinds import run_job
+from kiteline_basestation.job_kinds import KINDS, run_job
 from kiteline_basestation.jobs import Job, JobDone, set_aside
 from kiteline_basestation.runtime.warm import warm, warm_graphs
 from kiteline_hw.system.memory import return_large_arrays
@@ -24,13 +26,23 @@ _END_S = 0.5  # s that a worker may take to end before it is killed
 _LOOK_S = 1.0  # s between two looks whether the process was stopped
 _LONGEST_PAUSE_S = 60.0  # s between two starts of a process that dies before its first job
 _MOST_CHARS = 300  # of an error that a job raised
+_MOST_WORKERS = 4  # of 150 MiB each: more do not help one loop that feeds them
+_LONG_NICE = 5  # of workers that do long jobs: the loop and local bundles come first where cores are few
+
+CpuTimes = defaultdict[str, deque[float]]  # newest CPU times in ms, by kind of job
 
 
-def _work(pipe: Connection) -> None:
-    """Loop of the worker process: say that it is ready, then receive a job and send its result and CPU time in ms, or
+def cpu_times() -> CpuTimes:
+    """No CPU times yet."""
+    return defaultdict(lambda: deque(maxlen=SAMPLES))
+
+
+def _work(pipe: Connection, nice: int) -> None:
+    """Loop of a worker process: say that it is ready, then receive a job and send its result and CPU time in ms, or
     the error that it raised, until the pipe closes.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C stops the base, which closes the pipe
+    os.nice(nice)
     return_large_arrays()
     cv2.setNumThreads(1)
     warm()
@@ -56,9 +68,11 @@ class Worker:
     what happened, for the user.
     """
 
-    def __init__(self) -> None:
-        self.cpu_ms: defaultdict[str, deque[float]] = defaultdict(lambda: deque(maxlen=SAMPLES))
+    def __init__(self, cpu_ms: CpuTimes | None = None, nice: int = 0) -> None:
+        """cpu_ms: where CPU times go, by kind of job. nice: by how much other processes come before it."""
+        self.cpu_ms = cpu_times() if cpu_ms is None else cpu_ms
         self.deaths = 0
+        self._nice = nice
         self.notes: list[str] = []
         self._queue: deque[Job] = deque()
         self._running: Job | None = None
@@ -72,7 +86,7 @@ class Worker:
     def _start(self) -> None:
         context = multiprocessing.get_context("spawn")
         self._pipe, theirs = context.Pipe()
-        self._process = context.Process(target=_work, args=(theirs,), name="kiteline-worker", daemon=True)
+        self._process = context.Process(target=_work, args=(theirs, self._nice), name="kiteline-worker", daemon=True)
         self._process.start()
         self._ready = self._away = False
         theirs.close()  # so that each side notices when the other ends
@@ -110,6 +124,11 @@ class Worker:
     def idle(self) -> bool:
         """True if no job is running or waiting."""
         return self._running is None and not self._queue and not self._aside
+
+    @property
+    def free(self) -> bool:
+        """True if it would begin with a job at once."""
+        return self._ready and self.idle
 
     def take_notes(self) -> list[str]:
         """What happened since the last call."""
@@ -178,18 +197,80 @@ class Worker:
 
     def close(self) -> None:
         """End the worker process, also during a job."""
+        self.let_end()
+        self.end_by(time.monotonic() + _END_S)
+
+    def let_end(self) -> None:
+        """Tell the process that nothing more comes."""
         self._pipe.close()
-        self._process.join(0.0 if self._running is not None else _END_S)
+
+    def end_by(self, deadline_s: float) -> None:
+        """Wait for the process until a time of the monotonic clock, but not for a job; then kill it."""
+        self._process.join(0.0 if self._running is not None else max(0.0, deadline_s - time.monotonic()))
         if self._process.is_alive():
             self._process.kill()
             self._process.join()
+
+
+class Workers:
+    """Several worker processes: jobs wait for the next free one, those of kinds that come first before others.
+
+    The first worker does jobs of the most urgent kind alone, so that none of them waits for a long one. Results are
+    given as they come; the base logs that order.
+    """
+
+    def __init__(self, count: int = 0) -> None:
+        """count: of processes; 0: as many as the machine has cores beside the base's own, two to four."""
+        self.cpu_ms = cpu_times()
+        cores = len(os.sched_getaffinity(0))
+        self._workers = [
+            Worker(self.cpu_ms, nice=_LONG_NICE if n else 0)
+            for n in range(count or min(max(cores - 1, 2), _MOST_WORKERS))
+        ]
+        self._waiting: list[tuple[int, int, Job]] = []  # rank of its kind, order of arrival, job
+        self._count = 0
+
+    def add(self, jobs: Sequence[Job], now_ns: int) -> None:
+        """Queue jobs."""
+        for job in jobs:
+            self._count += 1
+            heapq.heappush(self._waiting, (KINDS[job.kind].rank, self._count, job))
+        self._hand_out(now_ns)
+
+    def done(self, now_ns: int) -> tuple[JobDone, ...]:
+        """Jobs finished or set aside since the last call. Never blocks."""
+        results = tuple(done for worker in self._workers for done in worker.done(now_ns))
+        self._hand_out(now_ns)
+        return results
+
+    def _hand_out(self, now_ns: int) -> None:
+        for n, worker in enumerate(self._workers):
+            if self._waiting and worker.free and (n or len(self._workers) == 1 or self._waiting[0][0] == 0):
+                worker.add([heapq.heappop(self._waiting)[2]], now_ns)
+
+    @property
+    def idle(self) -> bool:
+        """True if no job is running or waiting."""
+        return not self._waiting and all(worker.idle for worker in self._workers)
+
+    def take_notes(self) -> list[str]:
+        """What happened since the last call."""
+        return [note for worker in self._workers for note in worker.take_notes()]
+
+    def close(self) -> None:
+        """End the worker processes, also during a job."""
+        for worker in self._workers:
+            worker.let_end()
+        deadline_s = time.monotonic() + _END_S
+        for worker in self._workers:
+            worker.end_by(deadline_s)
 
 
 class LockstepJobs:
     """A worker in modelled time: a job starts when the worker is free and is done after its modelled cost."""
 
     def __init__(self) -> None:
-        self.cpu_ms: defaultdict[str, deque[float]] = defaultdict(lambda: deque(maxlen=SAMPLES))
+        self.cpu_ms = cpu_times()
         self._waiting: list[tuple[int, JobDone]] = []
         self._free_ns = 0
 

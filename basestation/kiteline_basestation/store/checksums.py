@@ -82,7 +82,9 @@ def check_tables(db: sqlite3.Connection, path: Path) -> None:
 
 
 def _schema(db: sqlite3.Connection) -> list[tuple[Any, ...]]:
-    return sorted(map(tuple, db.execute("SELECT type, name, tbl_name, ifnull(sql, '') FROM sqlite_master")))
+    """The tables, in one order; a flipped bit may have made one of the texts bytes."""
+    found = map(tuple, db.execute("SELECT type, name, tbl_name, ifnull(sql, '') FROM sqlite_master"))
+    return sorted(found, key=repr)
 
 
 class Changes:

@@ -75,7 +75,9 @@ def _combined(ours: MapperState, theirs: MapperState, new: list[KeyframeId]) -> 
         merges=m.merges + n.merges,
         detector=_combined_detector(m.detector, n.detector),
     )
-    return replace(ours, names={**theirs.names, **ours.names}, map=sparse_map, intake=intake, merger=merger)
+    scans = {**theirs.made_scans, **ours.made_scans}
+    names = {**theirs.names, **ours.names}
+    return replace(ours, names=names, map=sparse_map, intake=intake, merger=merger, made_scans=scans)
 
 
 def _combined_detector(a: DetectorState, b: DetectorState) -> DetectorState:

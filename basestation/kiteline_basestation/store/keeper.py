@@ -17,8 +17,9 @@ from kiteline_basestation.station import Station
 from kiteline_basestation.store.checksums import EmptyStoreError, StoreError
 from kiteline_basestation.store.saved_map import SavedMap, SavedValues
 from kiteline_basestation.store.state_texts import StateWriter, texts_of
-from kiteline_basestation.store.store import FILE, Batch, DiskError, Store, batch_of, read, submap_of
+from kiteline_basestation.store.store import FILE, Batch, DiskError, Store, batch_of, read
 from kiteline_codec.channel import CodedChannel
+from kiteline_codec.schema.owners import submap_of
 from kiteline_core.ids import SubmapId
 
 WRITE_NS = 250_000_000  # ns between two batches: a crash loses at most these, and the agents send them again

@@ -26,20 +26,13 @@ from typing import IO
 from kiteline_basestation.store import checksums, salvage
 from kiteline_basestation.store.checksums import Row, StoreError
 from kiteline_basestation.store.saved_map import SavedMap, SavedValues
-from kiteline_codec.schema import KEYFRAME_KINDS, SUBMAP_KINDS, Key
+from kiteline_codec.schema import KEYFRAME_KINDS, SUBMAP_KINDS
 from kiteline_core.errors import INPUT_FAULTS
 from kiteline_core.ids import SEQUENCE_BITS, SubmapId, agent_of_submap
 
 FILE = "map.sqlite"
 _BUSY_S = 5.0  # s to wait for a reader of the same file, such as `kiteline export`
 _DISK = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO}
-
-
-def submap_of(key: Key) -> SubmapId | None:
-    """The submap that a value concerns; None if it concerns no submap."""
-    if key.kind in KEYFRAME_KINDS:
-        return SubmapId(key.id >> SEQUENCE_BITS)
-    return SubmapId(key.id) if key.kind in SUBMAP_KINDS else None
 
 
 class DiskError(StoreError):

@@ -52,11 +52,13 @@ def _agent(a: AgentStatus, before: AgentStatus | None, now_ns: int, span_s: floa
     if before is not None and span_s > 0:
         up = round((a.bytes_up - before.bytes_up) / span_s)
         down = round((a.bytes_down - before.bytes_down) / span_s)
+    link = link_state(silent_s)
+    heard = link in ("live", "quiet")  # what was long ago says nothing of now
     return {
         "agent": int(a.agent),
-        "link": link_state(silent_s),
+        "link": link,
         "silent_s": None if silent_s is None else _rounded(silent_s, 1),
-        "quality": None if a.quality is None else int(a.quality),
+        "quality": int(a.quality) if a.quality is not None and heard else None,
         "position": None if pose is None else [_rounded(float(v), 3) for v in pose[:3, 3]],
         "heading_deg": None if pose is None else _heading_deg(pose),
         "counts": as_json(AGENT_COUNTS, a),

@@ -94,13 +94,13 @@ def consistency_bars(bench: Bench, flights: int, scale: float = 1.0) -> list[Bar
     return bars
 
 
-def nees_band(flights: int) -> tuple[float, float]:
-    """Range in which 95 % of the means of so many draws of a chi-square with 6 degrees of freedom lie.
+def nees_band(flights: int, degrees: int = 6) -> tuple[float, float]:
+    """Range in which 95 % of the means of so many draws of a chi-square with these degrees of freedom lie.
 
     E. Wilson, M. Hilferty, "The distribution of chi-square", 1931.
     """
-    spread = 2.0 / (9.0 * 6.0 * flights)
-    low, high = (6.0 * (1.0 - spread + sign * _NORMAL * np.sqrt(spread)) ** 3 for sign in (-1.0, 1.0))
+    spread = 2.0 / (9.0 * degrees * flights)
+    low, high = (degrees * (1.0 - spread + sign * _NORMAL * np.sqrt(spread)) ** 3 for sign in (-1.0, 1.0))
     return float(low), float(high)
 
 

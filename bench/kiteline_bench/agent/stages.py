@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from kiteline_agent.agent import Agent
+from kiteline_agent.onboard import OnboardAgent
 from kiteline_bench.harness.bars import Bar, Bench, at_most
 from kiteline_bench.harness.profiler import Profiler
 from kiteline_codec import warm as codec_warm
@@ -44,7 +44,7 @@ def profile(log_path: Path) -> dict[str, list[dict[str, int]]]:
     found: dict[str, list[dict[str, int]]] = {"frame": [], "keyframe": []}
     profiler = Profiler(STAGES)
 
-    def watch(step: Step, agent: Agent) -> None:
+    def watch(step: Step, agent: OnboardAgent) -> None:
         if step.head["frame_ns"] is not None:
             found["keyframe" if agent.work.keyframes else "frame"].append(profiler.own_ns)
         profiler.clear()

@@ -47,7 +47,9 @@ class FlightFailed(Exception):
 class Bench:
     """What a benchmark reads and writes. say: reports progress. more: Markdown that stands below the bars.
 
-    starts: most starts of a flight, or seeds, for a quick look; 0: all. inputs: of the fuzzer; 0: as it chooses.
+    starts: most starts of a flight, or seeds, for a quick look; 0: all. inputs: of the fuzzer, seconds: of a flood; 0:
+    as the benchmark chooses.
+    full: at the whole size, which takes long.
     """
 
     data: Path
@@ -56,6 +58,8 @@ class Bench:
     more: list[str] = field(default_factory=list)
     starts: int = 0
     inputs: int = 0
+    seconds: float = 0.0
+    full: bool = False
 
     def chosen(self, starts: Sequence[T]) -> list[T]:
         """All starts, or as many as wanted, spread evenly."""

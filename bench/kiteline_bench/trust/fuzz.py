@@ -10,10 +10,12 @@ import json
 import os
 import random
 import resource
+import shutil
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from zlib import crc32
 
@@ -29,13 +31,16 @@ from kiteline_codec.transport.framing import Deframer, frame
 from kiteline_codec.transport.packet import parse
 from kiteline_codec.transport.seal import Direction, Opener, Sealer, Suite
 from kiteline_hw.ports import SourceError
+from kiteline_hw.system import process
 
 TITLE = "Fuzzing"
 INPUTS = 200_000  # some minutes
+ROUND = 200_000  # inputs after which the doors begin anew, and a run that is stopped can go on
 _TESTS = Path(__file__).resolve().parents[3] / "tests" / "codec"
 
 _MAX_BYTES = 1400  # of an input
 _MAX_FILE_BYTES = 1 << 16
+_MOST_FAILURES = 20
 _FIRST = 30  # inputs of each door before memory is measured
 _KEY = bytes(32)
 _KINDS = tuple(sorted(RECORD_TYPES))
@@ -56,6 +61,15 @@ class FuzzResult:
     slowest_s: float
     grown_mib: float
     slowest: str = ""  # the door of the slowest input
+
+    def with_round(self, found: FuzzResult, grown_mib: float) -> FuzzResult:
+        """This and a further round. grown_mib: of all rounds of this process."""
+        slower = found.slowest_s > self.slowest_s
+        return FuzzResult(
+            self.inputs + found.inputs, self.accepted + found.accepted, self.refused + found.refused,
+            self.failures + found.failures, max(self.slowest_s, found.slowest_s), max(self.grown_mib, grown_mib),
+            found.slowest if slower else self.slowest,
+        )  # fmt: skip
 
 
 def read_corpus(folder: Path) -> list[bytes]:
@@ -200,7 +214,7 @@ def fuzz(
                 refused += 1
             elif outcome:
                 failures.append(f"{name}: {outcome}: {data[:400].hex()}")
-                if len(failures) == 20:
+                if len(failures) == _MOST_FAILURES:
                     break
             elif i % len(todo) >= len(todo) - len(others):
                 targets.accepted += 1
@@ -234,23 +248,46 @@ def _one(target: Target, data: bytes, draw: random.Random) -> str:
     return ""
 
 
+def read_state(path: Path) -> FuzzResult:
+    """What an earlier run has left; nothing where there is none. Raises SourceError."""
+    try:
+        return FuzzResult(**json.loads(path.read_text())) if path.exists() else FuzzResult(0, 0, 0, [], 0.0, 0.0)
+    except (ValueError, TypeError) as error:
+        raise SourceError(f"{path}: no state of a fuzzing run; delete it to begin anew") from error
+
+
+def _say(bench: Bench, done: int, inputs: int, in_round: int) -> None:
+    bench.say(f"fuzz: {done + in_round:,} of {inputs:,}")
+
+
 def run(bench: Bench) -> list[Bar]:
-    """Feed all doors in turn; the corpus of packets and codes is that of the tests."""
+    """Feed all doors in turn; the corpus of packets and codes is that of the tests. With `--keep DIR` a run that was
+    stopped goes on where it was, in rounds with seeds of their own.
+    """
     if not _TESTS.is_dir():
         raise SourceError(f"no corpus in {_TESTS}: run this benchmark in a checkout of the sources")
     entries = json.loads((_TESTS / "golden" / "records.json").read_text())
     values = [(Key(*e["key"]), bytes.fromhex(e["code"])) for e in entries]
     inputs, folder = bench.inputs or INPUTS, bench.folder / "fuzz"
+    shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()
-    found = fuzz(
-        read_corpus(_TESTS / "corpus"), values, inputs, seed=1, others=doors(folder),
-        say=lambda n: bench.say(f"fuzz: {n:,} of {inputs:,}"),
-    )  # fmt: skip
-    for failure in found.failures:
+    state, corpus, others = bench.folder / "fuzz.json", read_corpus(_TESTS / "corpus"), doors(folder)
+    total, grown_mib = read_state(state), 0.0
+    while total.inputs < inputs and len(total.failures) < _MOST_FAILURES:
+        done = total.inputs
+        found = fuzz(
+            corpus, values, min(ROUND, inputs - done), seed=1 + done // ROUND, others=others,
+            say=partial(_say, bench, done, inputs),
+        )  # fmt: skip
+        grown_mib += found.grown_mib  # in this process
+        total = total.with_round(found, grown_mib)
+        process.write_atomically(state, json.dumps(asdict(total)).encode())
+    for failure in total.failures:
         bench.say(failure)
     return [
-        at_most("inputs that were neither read nor refused", len(found.failures), 0, "", 0),
-        at_most("memory grown", found.grown_mib, 64, "MiB", 1),
-        at_most(f"slowest input ({found.slowest}), CPU", found.slowest_s * 1e3, 1000, "ms", 1),
-        Bar("read and refused", f"{inputs:,} inputs", f"{found.accepted:,} read, {found.refused:,} refused", True),
-    ]
+        at_most("inputs that were neither read nor refused", len(total.failures), 0, "", 0),
+        at_most("memory grown", total.grown_mib, 64, "MiB", 1),
+        at_most(f"slowest input ({total.slowest}), CPU", total.slowest_s * 1e3, 1000, "ms", 1),
+        Bar("read and refused", f"{inputs:,} inputs",
+            f"{total.inputs:,}: {total.accepted:,} read, {total.refused:,} refused", total.inputs >= inputs),
+    ]  # fmt: skip

@@ -1,4 +1,4 @@
-"""An agent with a sound key that means harm: its packets are well formed, what they say is drawn at random."""
+"""Senders that mean harm. With a sound key: packets are well formed, what they say is drawn at random; and without."""
 
 from __future__ import annotations
 
@@ -8,17 +8,36 @@ from collections.abc import Sequence
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.jobs import JobDone, set_aside
 from kiteline_basestation.station import Station
-from kiteline_codec.channel import CodedChannel
+from kiteline_codec.channel import CodedChannel, coded_channel
 from kiteline_codec.coding.packing import Writer
 from kiteline_codec.schema import RECORD_TYPES, IdOf, Key
-from kiteline_codec.sync.config import SyncConfig
 from kiteline_codec.transport.packet import Header, Item, add_checksum, write_header, write_item
+from kiteline_codec.transport.seal import Direction, Sealer, Suite
 from kiteline_core.ids import MAX_BOOTS, MAX_KEYFRAMES, MAX_SUBMAPS, AgentId, keyframe_id, submap_id
 
-PEER_BYTES = 24 << 20  # that this sender's values may take, map included: a small share of what a flight may
 _AGENT, _OTHER = AgentId(3), AgentId(4)
 _HUGE = (1 << 31, 1 << 32, (1 << 62) - 1, (1 << 63) - 1, 1 << 63, 1 << 64)
 _STEP_NS = 50_000_000
+
+
+def forged_packets(draw: random.Random, number: int) -> list[tuple[int, bytes]]:
+    """Packets of a sender without a key, each with the agent that it claims to be: without seals, and with wrong ones
+    that look like those of an agent that just started; short, as long as agents send them, and as long as may be.
+    """
+    out = []
+    for _ in range(number):
+        agent = draw.choice((0, 0, 3, draw.randrange(64)))
+        size = draw.choice((20, 200, 1200, 1200, 1200, 1200, 60_000 if draw.random() < 0.1 else 1200))
+        if draw.random() < 0.2:
+            data = Writer()
+            write_header(data, Header(draw.getrandbits(40) + 1, 0, values=(1, 0)))
+            data.raw(draw.randbytes(size))
+            out.append((agent, add_checksum(data)))
+        else:
+            sealer = Sealer(draw.randbytes(32), agent, draw.choice((1, 2, 1000, 1 << 47)), Direction.UP,
+                            Suite.ENCRYPTED)  # fmt: skip
+            out.append((agent, sealer.seal(draw.randbytes(size))))
+    return out
 
 
 class KeyedSender:
@@ -27,8 +46,7 @@ class KeyedSender:
     def __init__(self, codes: Sequence[tuple[Key, bytes]]) -> None:
         """codes: valid ones, that are sent under any keys, whole, mutated or in pieces."""
         self._codes = codes
-        config = SyncConfig(max_inbox_bytes=PEER_BYTES, max_assembly_bytes=4 << 20)
-        self.station = Station(BaseConfig(), lambda agent: CodedChannel(config, 7, peer=agent))
+        self.station = Station(BaseConfig(), lambda agent: coded_channel(7, peer=agent))
         self.station.track_changes()
         self._session, self._number, self._version, self._now_ns = 1, 0, 0, 0
         self._done: tuple[JobDone, ...] = ()
@@ -97,6 +115,6 @@ class KeyedSender:
             number = int(agent)
         elif id_of is IdOf.SUBMAP:
             number = int(submap)
-        elif id_of is IdOf.KEYFRAME:
+        elif id_of in (IdOf.KEYFRAME, IdOf.PASSING_KEYFRAME):
             number = int(keyframe_id(submap, draw.choice((0, 1, 2, draw.randrange(MAX_KEYFRAMES)))))
         return Key(known.kind if draw.random() < 0.98 else draw.randrange(64), number, draw.choice((0, 0, 1, 255)))

@@ -28,7 +28,7 @@ class Profile:
     pixel_step: int = 2  # of an observation, in 1/16 px: 1/8 px, a third of the alignment's deviation
     depth_step: int = 4  # of inverse depths, in 1/1024 of an octave: 0.08 px of disparity at 20 px
     angle_step: int = 1  # of a new landmark's direction, in 1/256 turns
-    landmarks_bytes: int = 1080  # of a section's code; its residual code fills a packet of 1200 bytes with a pose
+    landmarks_bytes: int = 1230  # of a section's code; its residual code fills a packet of 1200 bytes
     observations_bytes: int = 1600  # of a section's code; its residual code takes less than half
     live_gap_ns: int = 95_000_000  # ns between live poses: 10 Hz
     keyframe_bytes: int = 7_500  # on the wire, roughly: with the rate, the pause between two keyframes
@@ -48,7 +48,7 @@ class Profile:
     ) -> tuple[list[NewLandmarks], list[Observations]]:
         """The sections to share, best first. landmarks: their first rows are the best ones. strength: (n,)."""
         n = min(len(landmarks.index), self.landmarks)
-        shared = take(landmarks, np.arange(n))
+        shared = landmarks if n == len(landmarks.index) else take(landmarks, np.arange(n))
         angle = shared.angle.astype(np.int64)
         shared = replace(
             shared,
@@ -67,6 +67,9 @@ class Profile:
             uv=(np.rint(observations.uv / step) * step).astype(np.float32),
             inv_depth=_stepped_depths(observations.inv_depth, self.depth_step),
         )
+        observed = split(observations, np.zeros(len(observations.index)), self.observations_bytes)
+        if n <= self.described:
+            return split(shared, strength[:n], self.landmarks_bytes), observed
         best = np.argsort(-strength[:n], kind="stable")
         described, undescribed = np.sort(best[: self.described]), np.sort(best[self.described :])
         parts = split(take(shared, described), strength[described], self.landmarks_bytes)
@@ -74,7 +77,7 @@ class Profile:
         blank = replace(blank, descriptor=np.zeros_like(blank.descriptor))
         for part in split(blank, strength[undescribed], self.landmarks_bytes):
             parts.append(replace(part, part=len(parts)))
-        return parts, split(observations, np.zeros(len(observations.index)), self.observations_bytes)
+        return parts, observed
 
     def cached_sections(self, landmarks: CachedLandmarks, strength: F64) -> list[CachedLandmarks]:
         """The sections of a cached keyframe, best first. strength: (n,)."""
@@ -97,14 +100,14 @@ RADIO = Profile(
     angle_step=4,
     landmarks_bytes=190,
     observations_bytes=400,
-    live_gap_ns=245_000_000,  # 4 Hz, so that two lost poses still leave one a second
+    live_gap_ns=195_000_000,  # 5 Hz, so that three lost poses still leave one a second
     keyframe_bytes=2_000,
     thin=True,
     inertial_steps=False,
     landmark_bytes=25,
     undescribed_bytes=11,
     observations_room_bytes=220,
-    packet_bytes=220,  # a quarter of a second at 1000 B/s: a pose waits no longer
+    packet_bytes=220,  # holds a section of landmarks and a pose
     cached_landmarks=40,  # a kilobyte: two seconds of the whole link
     cached_ahead=1,
     overhead_bytes=7,  # two zeros, COBS and CRC-32 of a frame on a serial line

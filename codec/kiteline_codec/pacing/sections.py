@@ -8,6 +8,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from kiteline_codec.coding.packing import Writer
 from kiteline_codec.schema import CachedLandmarks, NewLandmarks, Observations, messages
 
 F64 = NDArray[np.float64]
@@ -23,14 +24,16 @@ def split(record: _Section, value: F64, section_bytes: int = SECTION_BYTES) -> l
     Codes are shortest if neighbouring indices lie near each other in the image, or, for observations, if the order of
     indices is that of landmark ids. Raises ValueError when a single row does not fit, or for values that have no code.
     """
-    best = np.argsort(-np.asarray(value), kind="stable")
+    best, codes = np.argsort(-np.asarray(value), kind="stable"), record.COLUMNS.codes(record)
     parts: list[_Section] = []
     start, rows = 0, max(1, section_bytes // 32)
     may_grow = True
     while start < len(best):
         chosen = best[start : start + rows]
-        part = take(record, chosen[np.argsort(record.index[chosen], kind="stable")], len(parts))
-        size = messages.length(part)
+        chosen = chosen[np.argsort(record.index[chosen], kind="stable")]
+        out = Writer()
+        record.write_rows(out, codes, chosen)
+        size = len(out)
         if size > section_bytes:
             if len(chosen) == 1:
                 raise ValueError(f"one keypoint takes {size} bytes, expected at most {section_bytes}")
@@ -41,7 +44,8 @@ def split(record: _Section, value: F64, section_bytes: int = SECTION_BYTES) -> l
         if may_grow and start + len(chosen) < len(best) and more > len(chosen) * 1.15:
             rows = max(len(chosen) + 1, int(0.95 * more))  # enough larger to be worth another try
             continue
-        parts.append(part)
+        parts.append(take(record, chosen, len(parts)))
+        messages.keep(parts[-1], out.bytes())
         start += len(chosen)
         may_grow = True
     return parts

@@ -53,6 +53,11 @@ class Predictors:
         self._keyframes: OrderedDict[int, _Keyframe] = OrderedDict()
         self._cameras: dict[int, tuple[int, F64]] = {}
 
+    def clear(self) -> None:
+        """Drop what is decoded."""
+        self._keyframes.clear()
+        self._cameras.clear()
+
     def _keyframe(self, keyframe: int) -> _Keyframe:
         entry = self._keyframes.get(keyframe)
         if entry is None:

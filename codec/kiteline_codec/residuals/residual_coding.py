@@ -27,13 +27,17 @@ class ResidualCoder:
     """Makes and reads residual codes, with a cache of decoded predictors."""
 
     def __init__(self) -> None:
-        predictors = Predictors()
+        self._predictors = predictors = Predictors()
         self._coders: dict[int, _Coder] = {
             NewLandmarks.KIND: NewLandmarkResiduals(),
             Observations.KIND: ObservationResiduals(predictors),
             RefinedLandmarks.KIND: RefinedLandmarkResiduals(predictors),
         }
         self._new_landmarks: OrderedDict[Key, tuple[bytes, bytes | None]] = OrderedDict()  # codes, residual codes
+
+    def restart(self) -> None:
+        """Drop the decoded predictors: a new session of the peer numbers its values anew."""
+        self._predictors.clear()
 
     def compress(self, key: Key, code: bytes, held: Held, own: Held) -> bytes | None:
         """The residual code of a code, for a peer that holds what `held` gives; None where it would not be shorter.

@@ -12,6 +12,7 @@ from kiteline_codec.schema.agent.keyframe_scan import KeyframeScan as KeyframeSc
 from kiteline_codec.schema.agent.live_pose import LivePose as LivePose
 from kiteline_codec.schema.agent.new_landmarks import NewLandmarks as NewLandmarks
 from kiteline_codec.schema.agent.observations import Observations as Observations
+from kiteline_codec.schema.agent.scan_images import ScanImages as ScanImages
 from kiteline_codec.schema.agent.stereo_alignment import StereoAlignment as StereoAlignment
 from kiteline_codec.schema.agent.submap_scale import SubmapScale as SubmapScale
 from kiteline_codec.schema.agent.submap_tie import SubmapTie as SubmapTie
@@ -36,5 +37,6 @@ from kiteline_codec.schema.record import kinds_keyed_by
 KEYFRAME_KINDS = kinds_keyed_by(IdOf.KEYFRAME)
 SUBMAP_KINDS = kinds_keyed_by(IdOf.SUBMAP)
 CACHED_KINDS = kinds_keyed_by(IdOf.CACHED_KEYFRAME)
+PASSING_KINDS = kinds_keyed_by(IdOf.PASSING_KEYFRAME)
 AGENT_KINDS = frozenset(kind for kind, record in RECORD_TYPES.items() if record.written_by_agent())
 PREDICTOR_KINDS = frozenset(kind for kind, record in RECORD_TYPES.items() if record.PREDICTS)

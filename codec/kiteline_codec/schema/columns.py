@@ -57,19 +57,27 @@ class Columns:
         self._low = np.array([_FIELDS[name].low for name in self._column_names], np.int64)
         self._high = np.array([_FIELDS[name].high for name in self._column_names], np.int64)
 
-    def write(self, out: Writer, record: Any) -> None:
-        """Append the number of rows and the columns. Raises ValueError for values that have no code."""
-        n = len(record.index)
-        if n > MAX_KEYPOINTS:
-            raise ValueError(f"found {n} keypoints, expected at most {MAX_KEYPOINTS}")
-        out.varint(n)
-        codes = np.empty((len(self._column_names), n), np.int64)
+    def codes(self, record: Any) -> I64:
+        """The codes (columns, n) of a record, unchecked. Raises ValueError for values that have no code."""
+        codes = np.empty((len(self._column_names), len(record.index)), np.int64)
         at = 0
         for name, field in self._fields:
             codes[at : at + field.columns] = field.codes(getattr(record, name))
             at += field.columns
+        return codes
+
+    def write(self, out: Writer, record: Any) -> None:
+        """Append the number of rows and the columns. Raises ValueError for values that have no code."""
+        self.write_codes(out, self.codes(record))
+
+    def write_codes(self, out: Writer, codes: I64) -> None:
+        """Append the number of rows and the columns (columns, n). Raises ValueError for invalid ones."""
+        n = codes.shape[1]
+        if n > MAX_KEYPOINTS:
+            raise ValueError(f"found {n} keypoints, expected at most {MAX_KEYPOINTS}")
         if fault := self._fault(codes):
             raise ValueError(fault)
+        out.varint(n)
         out.columns(codes)
 
     def read_codes(self, source: Reader) -> I64:

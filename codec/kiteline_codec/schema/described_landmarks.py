@@ -16,6 +16,7 @@ from kiteline_core.imaging import descriptors
 from kiteline_core.imaging.descriptors import DESCRIPTOR_BYTES, NARROW_BYTES
 
 F32 = NDArray[np.float32]
+I64 = NDArray[np.int64]
 U8 = NDArray[np.uint8]
 U16 = NDArray[np.uint16]
 
@@ -45,9 +46,12 @@ class DescribedLandmarks(Record):
         if descriptor.shape != (len(self.index), DESCRIPTOR_BYTES):
             raise ValueError(f"descriptors are {descriptor.shape}, expected {(len(self.index), DESCRIPTOR_BYTES)}")
         self.COLUMNS.write(out, self)
-        if descriptor.any():
-            narrow = descriptors.is_narrow(descriptor).all()
-            out.raw((descriptors.packed(descriptor) if narrow else descriptor).tobytes())
+        _write_descriptors(out, descriptor)
+
+    def write_rows(self, out: Writer, codes: I64, rows: I64) -> None:
+        """The same of some rows. codes: (6,n) of the columns of all."""
+        self.COLUMNS.write_codes(out, codes.take(rows, 1))
+        _write_descriptors(out, self.descriptor.take(rows, 0))
 
     @classmethod
     def read(cls, source: Reader, key: Key) -> Self:
@@ -61,3 +65,9 @@ class DescribedLandmarks(Record):
         if n and size and (not raw.any() or (size == DESCRIPTOR_BYTES and descriptors.is_narrow(raw).all())):
             raise WireError("descriptors are written in the fewest bytes that hold them")
         return cls(KeyframeId(key.id), key.part, descriptor=raw, **columns)
+
+
+def _write_descriptors(out: Writer, descriptor: U8) -> None:
+    if descriptor.any():
+        narrow = descriptors.is_narrow(descriptor).all()
+        out.raw((descriptors.packed(descriptor) if narrow else descriptor).tobytes())

@@ -32,8 +32,13 @@ def encode(record: Record) -> bytes:
 def length(record: Record) -> int:
     """Bytes of a record's code. `encode` of the very same record then returns that code; records are never changed."""
     code = encode(record)
-    _measured.append((record, code))
+    keep(record, code)
     return len(code)
+
+
+def keep(record: Record, code: bytes) -> None:
+    """Keep the code of a record for `encode` of the very same one."""
+    _measured.append((record, code))
 
 
 def decode(key: Key, code: bytes) -> Record:

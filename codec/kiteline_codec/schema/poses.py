@@ -1,4 +1,4 @@
-"""Poses, scales and standard deviations in codes."""
+"""Poses, directions, scales and standard deviations in codes."""
 
 from __future__ import annotations
 
@@ -37,6 +37,25 @@ def read_coarse_pose(source: Reader) -> NDArray[np.float64]:
     rotation = [source.signed(quantise.COARSE_ROTATION_STEPS) for _ in range(3)]
     try:
         return quantise.coarse_pose((*translation, *rotation))
+    except ValueError as e:
+        raise WireError(str(e)) from None
+
+
+def write_direction(out: Writer, direction: NDArray[np.float64]) -> None:
+    """Append a unit vector (3,). Raises ValueError."""
+    half, a, b = quantise.direction_codes(direction)
+    out.u8(half)
+    out.signed(a)
+    out.signed(b)
+
+
+def read_direction(source: Reader) -> NDArray[np.float64]:
+    """A unit vector (3,). Raises WireError."""
+    half = source.u8()
+    if half > 1:
+        raise WireError(f"a half is 0 or 1, found {half}")
+    try:
+        return quantise.direction(half, *(source.signed(quantise.DIRECTION_STEPS) for _ in range(2)))
     except ValueError as e:
         raise WireError(str(e)) from None
 

@@ -36,6 +36,7 @@ class IdOf(Enum):
     SUBMAP = "submap", MAX_SUBMAP_ID
     KEYFRAME = "keyframe", MAX_KEYFRAME_ID  # of the agent's own map: archived, restored and deleted with the keyframe
     CACHED_KEYFRAME = "keyframe", MAX_KEYFRAME_ID, "cached"  # of a map cache: made anew by each base process
+    PASSING_KEYFRAME = "keyframe", MAX_KEYFRAME_ID, "passing"  # of what is used up at arrival: removed then, not stored
     TILE = "tile", MAX_TILE_ID
 
     def __init__(self, field: str, max_id: int, _sort: str = "") -> None:

@@ -124,16 +124,22 @@ class PeerValues:
         self.state = PeerState.UNCOMPARED
         self.equal_at: int | None = None  # newest version of the peer that was equal here
         self.different_at: int | None = None  # version that was different here, until the peer voids it
+        self._untold: int | None = None  # version that was equal, until a packet says so
 
     def new_session(self) -> None:
         """Begin with a new session of the peer, of which nothing was compared."""
         self._go(Event.SESSION)
-        self.equal_at = self.different_at = None
+        self.equal_at = self.different_at = self._untold = None
 
     def found_equal(self, version: int) -> None:
         """Our copy is equal to the peer's values at a version."""
         self._go(Event.EQUAL)
-        self.equal_at = version
+        self.equal_at = self._untold = version
+
+    def take_verdict(self) -> int | None:
+        """The version that was found equal, for one packet: should it be lost, the peer sends its digest again."""
+        version, self._untold = self._untold, None
+        return version
 
     def found_different(self, version: int) -> bool:
         """Our copy differs from the peer's values at a version. Returns False if that is known already."""

@@ -37,6 +37,8 @@ class SyncConfig:
     window_packets: int = 64  # in flight at once: what one acknowledgement covers
     ack_delay_ns: int = 20_000_000  # so that an acknowledgement can ride on a packet with values
     ack_packets: int = 16  # acknowledge at once after so many: well inside the window
+    # A scan or a tile that fills less than half a packet waits so long for one that leaves anyway, as with a pose.
+    gather_ns: int = 100_000_000
     # Overtaken by so many, a packet that took longer than a round trip and two deviations is lost (as RFC 9002).
     reorder_packets: int = 3
     first_rto_ns: int = 500_000_000  # time-out before any round trip has been measured
@@ -44,11 +46,14 @@ class SyncConfig:
     max_rto_ns: int = 2_000_000_000  # a link that comes back is found again within this time
     hello_ns: int = 250_000_000  # between greetings while the peer is unknown
     heartbeat_ns: int = 1_000_000_000  # longest silence while the peer is known
+    digest_gap_ns: int = 1_000_000_000  # between digests of two versions: poses alone make a version ten times a second
     # In every eighth packet the value that has waited longest follows the poses, so that none starves.
     oldest_every: int = 8
     max_value_bytes: int = 1 << 20  # of one value; longer ones are refused
     max_assembly_bytes: int = 16 << 20  # of values that have arrived in part
     max_inbox_bytes: int = 2 << 30  # memory for what the peer wrote, and what that claims in the map: 40,000 keyframes
+    # Of that, what the peer may claim before anything that it sent was of use (`Claims.earned`).
+    unused_inbox_bytes: int | None = None  # None: all
     resident_bytes: int | None = None  # memory for own values of keyframes, archived pages apart; None: unlimited
     resident_inbox_bytes: int | None = None  # the same for the peer's values of keyframes; needs a spill
     order: Callable[[Key], Order] = default_order
@@ -62,10 +67,10 @@ class SyncConfig:
 
     @property
     def filled_bytes(self) -> int:
-        """Length of full packets: at most a quarter of a tight budget, or the pose would wait."""
+        """Length of full packets: at most a fifth of a tight budget, or the pose would wait."""
         if self.budget_bytes is None:
             return self.packet_bytes
-        return max(MIN_PACKET_BYTES, min(self.packet_bytes, self.budget_bytes // 4 - self.overhead_bytes))
+        return max(MIN_PACKET_BYTES, min(self.packet_bytes, self.budget_bytes // 5 - self.overhead_bytes))
 
     @property
     def burst_bytes(self) -> int:

@@ -15,7 +15,7 @@ from kiteline_codec.pacing.budget import SlidingBudget
 from kiteline_codec.pacing.congestion_window import CongestionWindow
 from kiteline_codec.pacing.throughput import Throughput
 from kiteline_codec.residuals.residual_coding import ResidualCoder
-from kiteline_codec.schema import PREDICTOR_KINDS, Key, WireError
+from kiteline_codec.schema import PREDICTOR_KINDS, Key, Priority, WireError
 from kiteline_codec.sync import resumption
 from kiteline_codec.sync.agreement import OwnState, OwnValues, PeerValues
 from kiteline_codec.sync.archive import Spill
@@ -62,9 +62,9 @@ class Endpoint:
         self.peer_session: int | None = None  # None before the first packet of the peer
         self._own_values = OwnValues()
         self._peer_values = PeerValues()
-        self._earlier = EarlierValues()
         self._may_write = may_write
-        self._claims = Claims(claimed_bytes)
+        self.claims = Claims(claimed_bytes)
+        self.earlier = EarlierValues(self.claims)
         self._resumable: dict[Key, int] = {}  # checksums of what the peer holds of earlier sessions of this side
         self._overtaken_below = 0  # packets with lower numbers have been overtaken by enough acknowledged ones
         self._unanswered = 0  # packets to acknowledge, and news to send
@@ -115,13 +115,11 @@ class Endpoint:
 
     def earlier_values(self) -> dict[Key, bytes]:
         """What earlier sessions of the peer wrote and its present one has not replaced, by key; a copy."""
-        return dict(self._earlier.codes)
+        return dict(self.earlier.codes)
 
     def resume(self, values: Mapping[Key, bytes]) -> None:
         """Take over values of earlier sessions of the peer from a store; the peer need not send them again."""
-        self._earlier.keep(values)
-        for key, code in values.items():
-            self._claims.add(key, code)
+        self.earlier.resume(values)
 
     # ---- agreement
 
@@ -150,7 +148,7 @@ class Endpoint:
         return SyncStats(
             traffic.bytes_sent, traffic.packets_sent, traffic.bytes_received, traffic.packets_received, packets.lost,
             traffic.duplicates, sum(n for _, n in reasons), reasons, self._round_trip.mean_ns, out.pending,
-            packets.in_flight, len(self._in), len(self._earlier.codes), self.peer_session, traffic.restarts,
+            packets.in_flight, len(self._in), len(self.earlier.codes), self.peer_session, traffic.restarts,
             traffic.mismatches, self.backlog_bytes, out.resident_bytes, out.archive.values, out.dropped,
             self.throughput_bytes_s,
         )  # fmt: skip
@@ -196,14 +194,14 @@ class Endpoint:
                 items = self._own_items(self._expanded(items))
             except WireError as e:
                 return self._refuse(str(e))
-            taken = self._earlier.bytes + self._claims.bytes
-            if not self._in.room_for(items, self.config.max_inbox_bytes - taken, self.config.max_assembly_bytes):
+            allowed = self.claims.allowed_bytes(self.config) - self.earlier.bytes
+            if not self._in.room_for(items, allowed - self.claims.bytes, self.config.max_assembly_bytes):
                 self._refuse("no memory left for it")
                 return updates
             self._in.packets.mark(number)
             self._owe_answer(now_ns)
             self._in.raise_watermark(watermark)
-            limit = self.config.max_inbox_bytes - self._earlier.bytes - self._in.held_bytes
+            limit = allowed - self._in.held_bytes
             for item in items:
                 known = self._in.held(item.key) is not None
                 update = self._in.apply(item)
@@ -213,9 +211,9 @@ class Endpoint:
                     if update.key.kind == resumption.SUMMARY_KIND:
                         self._take_summary(update.code or b"")
                         continue
-                    known = known or update.key in self._earlier.codes
-                    self._earlier.drop(update.key)
-                    if update.code is not None and not known and not self._claims.fit(update.key, update.code, limit):
+                    known = known or update.key in self.earlier.codes
+                    self.earlier.drop(update.key)
+                    if update.code is not None and not known and not self.claims.fit(update.key, update.code, limit):
                         self._refuse("no memory left for what it claims")
                         continue
                     updates.append(update)
@@ -236,7 +234,7 @@ class Endpoint:
             return items
         if self._coder is None:
             raise WireError("a residual code, which this side does not read")
-        return resumption.expand_items(items, self._coder, self._held, self._earlier.codes)
+        return resumption.expand_items(items, self._coder, self._held, self.earlier.codes)
 
     def _own_items(self, items: list[Item]) -> list[Item]:
         """The items without those of values that the peer may not write, which are counted."""
@@ -266,12 +264,13 @@ class Endpoint:
         if self.peer_session is not None:
             self._traffic.restarts += 1
         self.peer_session = session
-        self._earlier.keep(self.peer_values())
+        self.earlier.keep(self.peer_values())
         self._in = Inbox(self.config.resident_inbox_bytes, self._spill)
         self._resumable.clear()
-        self._out.restart()
+        self._out.restart(resumption.outlived(self.earlier.is_gone, session))
         if self._coder is not None:
-            for key, code in resumption.summaries(self._earlier.codes, session).items():
+            self._coder.restart()
+            for key, code in resumption.summaries(self.earlier.codes, session).items():
                 self._out.put(key, code, self.config.order(key))
         self._own_values.new_session()
         self._peer_values.new_session()
@@ -331,27 +330,31 @@ class Endpoint:
     def poll(self, now_ns: int) -> bytes | None:
         """The next packet to send now, or None. Call until None."""
         c = self.config
-        self._throughput.busy(self._out.has_work(), now_ns)
+        self._throughput.busy(self._out.urgency() is not None, now_ns)
         self.throughput_bytes_s = self._throughput.bytes_s(now_ns)
         self._out.give_up(now_ns - self._round_trip.overdue_ns, self._overtaken_below)
         if self._out.give_up(now_ns - self._round_trip.timeout_ns):
             self._round_trip.timed_out()
         left = self._budget.left(now_ns) - c.overhead_bytes
         unheard = self._own_values.state is OwnState.UNHEARD
-        if not unheard and self._window_open() and self._out.has_work():
+        waited_ns = now_ns - self._unanswered_since_ns
+        answer = self._unanswered > 0 and (self._unanswered >= c.ack_packets or waited_ns >= c.ack_delay_ns)
+        if not unheard and self._window_open() and self._due(self._out.urgency(), answer, now_ns):
             if left < c.filled_bytes:
                 return None
             return self._packet(now_ns, values=True, digest=False)
-        answer = self._unanswered and (
-            self._unanswered >= c.ack_packets or now_ns - self._unanswered_since_ns >= c.ack_delay_ns
-        )
         digest = self._digest_due(now_ns)
         silence_ns = c.hello_ns if unheard else c.heartbeat_ns
-        if not (answer or digest or self._sent_ns is None or now_ns - self._sent_ns >= silence_ns):
-            return None
-        if left < MIN_PACKET_BYTES:
+        silent = self._sent_ns is None or now_ns - self._sent_ns >= silence_ns
+        if left < MIN_PACKET_BYTES or not (answer or digest or silent):
             return None
         return self._packet(now_ns, values=False, digest=digest)
+
+    def _due(self, urgency: int | None, answers: bool, now_ns: int) -> bool:
+        """True if values wait, and these are not so few and little urgent that they wait for a packet of others."""
+        if urgency is None or urgency < Priority.GRID or answers or self._sent_ns is None:
+            return urgency is not None
+        return self.backlog_bytes >= self.config.filled_bytes // 2 or now_ns - self._sent_ns >= self.config.gather_ns
 
     def _window_open(self) -> bool:
         """True if another packet may be in flight. A budget limits the rate by itself."""
@@ -360,14 +363,15 @@ class Endpoint:
         return self._out.packets.window_open(max(1, packets >> self._round_trip.doublings))
 
     def _digest_due(self, now_ns: int) -> bool:
-        """True if all has arrived, the peer has not found it equal, and no digest was sent just now."""
+        """True if all has arrived, the peer has not found it equal, and no digest was sent lately."""
         out = self._out
         if self._own_values.state is OwnState.UNHEARD or not out.clean or self._own_values.equal_at == out.newest:
             return False
         if self._digest_sent is None:
             return True
         version, sent_ns = self._digest_sent
-        return version != out.newest or now_ns - sent_ns >= self._round_trip.timeout_ns
+        gap_ns = self._round_trip.timeout_ns if version == out.newest else self.config.digest_gap_ns
+        return now_ns - sent_ns >= gap_ns
 
     def _packet(self, now_ns: int, values: bool, digest: bool) -> bytes:
         out, own = self._out, self._own_values
@@ -377,7 +381,7 @@ class Endpoint:
             self.peer_session or 0,
             None if own.state is OwnState.UNHEARD else self._in.acknowledgement(),
             (out.newest, out.digest.bytes()) if digest else None,
-            self._peer_values.equal_at,
+            self._peer_values.take_verdict(),
             self._peer_values.different_at,
             own.void_up_to if own.state is OwnState.VOIDING else None,
             (out.packets.next_number, watermark) if values else None,

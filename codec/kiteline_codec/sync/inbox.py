@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from kiteline_codec.schema import KEYFRAME_KINDS, Key
 from kiteline_codec.sync import ranges
 from kiteline_codec.sync.archive import Archive, Row, Spill
+from kiteline_codec.sync.config import SyncConfig
 from kiteline_codec.sync.digest import MODULUS, Digest, hash_value
 from kiteline_codec.sync.resident import ResidentValues
 from kiteline_codec.transport.packet import MASK_BITS, Item
@@ -36,38 +37,28 @@ class _Assembly:
     received: ranges.Ranges
 
 
-class EarlierValues:
-    """What earlier sessions of the peer wrote and its present one has not replaced, and the memory that it takes."""
-
-    def __init__(self) -> None:
-        self.codes: dict[Key, bytes] = {}
-        self.bytes = 0
-
-    def keep(self, values: Mapping[Key, bytes]) -> None:
-        """Add values."""
-        for key, code in values.items():
-            self.drop(key)
-            self.codes[key] = code
-            self.bytes += len(code) + VALUE_BYTES
-
-    def drop(self, key: Key) -> None:
-        """Remove a value, if it is here."""
-        code = self.codes.pop(key, None)
-        if code is not None:
-            self.bytes -= len(code) + VALUE_BYTES
-
-
 class Claims:
-    """Memory that values of the peer claim for good where they are used: removing a value gives nothing back."""
+    """Memory that values of the peer claim where they are used until that is deleted: removing a value frees nothing.
+
+    earned: bytes that the peer may claim because what it sent was of use.
+    """
 
     def __init__(self, claimed_bytes: Callable[[Key, bytes], int]) -> None:
         """claimed_bytes: of a code under a key."""
         self._claimed_bytes = claimed_bytes
-        self.bytes = 0
+        self.bytes = self.earned = 0
 
-    def add(self, key: Key, code: bytes) -> None:
-        """Count a value."""
-        self.bytes += self._claimed_bytes(key, code)
+    def allowed_bytes(self, config: SyncConfig) -> int:
+        """Memory for all that the peer wrote and claims."""
+        if config.unused_inbox_bytes is None:
+            return config.max_inbox_bytes
+        return min(config.max_inbox_bytes, config.unused_inbox_bytes + self.earned)
+
+    def resume(self, key: Key, code: bytes) -> None:
+        """Count a value that was here before the start."""
+        claimed = self._claimed_bytes(key, code)
+        self.bytes += claimed
+        self.earned += claimed + len(code) + VALUE_BYTES
 
     def fit(self, key: Key, code: bytes, limit: int) -> bool:
         """Count a value unless all claims would then be above the limit; returns whether it was counted."""
@@ -76,6 +67,50 @@ class Claims:
             return False
         self.bytes += claimed
         return True
+
+    def release(self, key: Key, code: bytes) -> None:
+        """Count a value no more: where it was used, it is deleted. What it had earned goes with it."""
+        claimed = self._claimed_bytes(key, code)
+        self.bytes = max(0, self.bytes - claimed)
+        self.earned = max(0, self.earned - claimed - len(code) - VALUE_BYTES)
+
+
+class EarlierValues:
+    """What earlier sessions of the peer wrote and its present one has not replaced, and the memory that it takes.
+
+    is_gone: whether nobody needs a value any more; such values end with the session that wrote them.
+    """
+
+    def __init__(self, claims: Claims) -> None:
+        self.is_gone: Callable[[Key], bool] = lambda key: False
+        self.codes: dict[Key, bytes] = {}
+        self.bytes = 0
+        self._claims = claims
+
+    def keep(self, values: Mapping[Key, bytes]) -> None:
+        """Add values, and drop those that are gone."""
+        for key in [key for key in self.codes if key in values or self.is_gone(key)]:
+            if key not in values:
+                self._claims.release(key, self.codes[key])
+            self.drop(key)
+        for key, code in values.items():
+            if self.is_gone(key):
+                self._claims.release(key, code)
+                continue
+            self.codes[key] = code
+            self.bytes += len(code) + VALUE_BYTES
+
+    def resume(self, values: Mapping[Key, bytes]) -> None:
+        """Add values that were here before the start."""
+        for key, code in values.items():
+            self._claims.resume(key, code)
+        self.keep(values)
+
+    def drop(self, key: Key) -> None:
+        """Remove a value, if it is here."""
+        code = self.codes.pop(key, None)
+        if code is not None:
+            self.bytes -= len(code) + VALUE_BYTES
 
 
 class Inbox:

@@ -155,8 +155,10 @@ class Outbox:
         """Make all residual codes anew: what they are predicted from has changed."""
         self._predictors_state += 1
 
-    def restart(self) -> None:
-        """Send everything again: a new session of the peer holds nothing. Removals are forgotten."""
+    def restart(self, gone: Callable[[Key], bool] = lambda key: False) -> None:
+        """Send all again but what is gone: a new session of the peer holds nothing. Removals are forgotten."""
+        for key in [key for key in self._entries if gone(key)]:
+            self.remove(key)
         self.predictors_changed()
         self.packets.restart()
         lost, hashes = self.archive.restart()
@@ -267,9 +269,10 @@ class Outbox:
         least = self.newest + 1 if archived is None else archived[0]
         return (least if here is None else min(here, least)) - 1
 
-    def has_work(self) -> bool:
-        """True if any value waits to be sent."""
-        return self._top() is not None
+    def urgency(self) -> int | None:
+        """The priority of what is sent next, least first; None if nothing waits."""
+        key = self._top()
+        return None if key is None else self._entries[key].order[0]
 
     def _top(self) -> Key | None:
         key = self._queue.top()

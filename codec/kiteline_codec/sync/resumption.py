@@ -6,7 +6,7 @@ then sends a checksum in place of such a code. See SPEC.md, "Session resumption"
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from struct import pack
 from zlib import crc32
 
@@ -14,6 +14,7 @@ from kiteline_codec.coding.packing import Reader, WireError, Writer
 from kiteline_codec.residuals.predictors import Held
 from kiteline_codec.residuals.residual_coding import ResidualCoder
 from kiteline_codec.schema import AGENT_KINDS, KEYFRAME_KINDS, Key
+from kiteline_codec.schema.owners import submap_of
 from kiteline_codec.transport.packet import MAX_KIND, Item
 from kiteline_core.ids import SEQUENCE_BITS, SUBMAP_BITS
 
@@ -80,6 +81,18 @@ def summaries(values: Mapping[Key, bytes], session: int) -> dict[Key, bytes]:
             writer.raw((crc32(values[key]) & _SHORT_CHECKSUM).to_bytes(3, "little"))
         out[Key(SUMMARY_KIND, 0, part)] = writer.bytes()
     return out
+
+
+def outlived(is_gone: Callable[[Key], bool], session: int) -> Callable[[Key], bool]:
+    """Whether a new session of the peer need not have an own value: one that is gone and not of its boot, or a summary
+    for the session before. What is gone of its boot it may hold, and has to be told.
+    """
+
+    def of_other_boot(key: Key) -> bool:
+        submap = submap_of(key)
+        return submap is not None and not _is_of(submap << SEQUENCE_BITS, session)
+
+    return lambda key: key.kind == SUMMARY_KIND or (is_gone(key) and of_other_boot(key))
 
 
 def _is_of(keyframe: int, session: int) -> bool:

@@ -30,6 +30,7 @@ _MAX_AGENT = 63
 _MAX_BOOT = (1 << 48) - 1
 _MAX_COUNTER = (1 << 40) - 1
 SALT_BYTES = {0: 8, 1: 0}  # by suite: a tag needs none
+_MOST_HEAD_BYTES = 1 + 7 + 6 + 8  # of a packet before its content
 
 
 class Suite(IntEnum):
@@ -177,12 +178,23 @@ class Opener:
         self._direction = direction
         self._keys = {(a, s): _derived(key, s, direction) for a, key in keys.items() for s in Suite}
         self._writers = {a: _Writer((boots or {}).get(a, 0) - 1) for a in keys}
-        self._salted: dict[tuple[int, bytes], bytes] = {}  # key of the last salt of each agent
+        self._salted: dict[int, tuple[bytes, bytes]] = {}  # the salt that was heard last of each agent, and its key
+        self._tagged: set[int] = set()  # agents whose newest packet was tagged
 
     @property
     def boots(self) -> dict[int, int]:
         """The newest boot received, by agent."""
         return {a: w.boot for a, w in self._writers.items() if w.packets is not None}
+
+    def is_familiar(self, agent: int, sealed: bytes) -> bool:
+        """True if a packet names the salt of the start of its writer that was heard last: no stranger who does not
+        listen can guess it. Tagged packets have none: they are familiar of agents that send them, over links that are
+        too slow to flood. Cheap.
+        """
+        if sealed[:1] >= b"\x80":
+            return agent in self._tagged
+        heard = self._salted.get(agent)
+        return heard is not None and heard[0] in sealed[:_MOST_HEAD_BYTES]
 
     def open(self, sealed: bytes) -> tuple[int, bytes] | None:
         """The agent and the packet, or None. Never raises."""
@@ -208,15 +220,18 @@ class Opener:
             if boot < writer.boot or writer.packets is None:
                 self.refusal = EARLIER_BOOT
             return None
+        heard = self._salted.get(agent)
         if salt:
-            key = self._salted.get((agent, salt)) or _salted(key, salt)
+            key = heard[1] if heard is not None and heard[0] == salt else _salted(key, salt)
         packet = self._opened(key, suite, sealed[:body_at], sealed[body_at:], _nonce(first, boot, counter))
         if packet is None:
             self._refuse("forged", agent)
             return None
-        if salt and (agent, salt) not in self._salted:
-            self._salted = {held: k for held, k in self._salted.items() if held[0] != agent}
-            self._salted[agent, salt] = key
+        if salt:
+            self._salted[agent] = salt, key
+            self._tagged.discard(agent)
+        else:
+            self._tagged.add(agent)
         writer.mark(boot, counter)
         self.counters.opened += 1
         return agent, packet
@@ -237,7 +252,8 @@ class Opener:
 
     def set_key(self, agent: int, key: bytes | None) -> None:
         """Open an agent's packets with another key from now on, and none under the one before. None: it has no key."""
-        self._salted = {held: k for held, k in self._salted.items() if held[0] != agent}
+        self._salted.pop(agent, None)
+        self._tagged.discard(agent)
         for suite in Suite:
             self._keys.pop((agent, suite), None)
             if key is not None:

@@ -10,10 +10,11 @@ from enum import IntEnum
 from zlib import crc32
 
 from kiteline_codec.transport.packet import CRC_BYTES
-from kiteline_codec.transport.seal import EARLIER_BOOT, Direction, Opener
+from kiteline_codec.transport.seal import EARLIER_BOOT, Direction, Opener, Suite
 
 _MAGIC = b"\0kiteline"
 _REPLY_EVERY = 32  # refused packets for one notice
+_AGENT_BITS = 63
 _SURE = 3  # refused packets in a row before it is said: one may be damaged
 _WELL = 500  # sound packets in a row after which a trouble is over, and is said anew if it comes again
 
@@ -78,6 +79,11 @@ def is_plain(packet: bytes) -> bool:
     return len(packet) >= CRC_BYTES + 4 and crc32(packet[:-CRC_BYTES]).to_bytes(CRC_BYTES, "little") == packet[-4:]
 
 
+def named_agent(packet: bytes) -> int:
+    """The agent that a packet of a thin link names; 0 where it names none."""
+    return packet[0] & _AGENT_BITS if packet and packet[0] >> 7 == Suite.TAGGED else 0
+
+
 class SealWatch:
     """Looks at what an end receives, and finds words for what it refuses. Pure."""
 
@@ -90,8 +96,12 @@ class SealWatch:
         self._said: set[tuple[int, str]] = set()
         self._lines: list[str] = []
 
-    def take(self, agent: int, packet: bytes) -> tuple[tuple[int, bytes] | None, bytes | None]:
-        """Open a packet of an agent's link: its agent and content, or None; and a notice to be sent back, or None."""
+    def take(self, agent: int | None, packet: bytes) -> tuple[tuple[int, bytes] | None, bytes | None]:
+        """Open a packet of an agent's link: its agent and content, or None; and a notice to be sent back, or None.
+
+        agent: None on a line, where a packet itself says whose it is.
+        """
+        agent = named_agent(packet) if agent is None else agent
         told = read_notice(packet)
         if told is not None:
             self._sound[agent] = 0
@@ -119,6 +129,10 @@ class SealWatch:
         if count >= _SURE or trouble is Trouble.UNSEALED:
             self._say(agent, (_AT_BASE if self._at_base else _AT_AGENT)[trouble])
         return None, notice(trouble) if count % _REPLY_EVERY in (1, _SURE) else None
+
+    def is_familiar(self, agent: int, packet: bytes) -> bool:
+        """True if a packet looks like those of an agent that was heard; False costs it a place among strangers'."""
+        return self._opener is None or self._opener.is_familiar(agent, packet)
 
     def lines(self) -> list[str]:
         """What is new since the last call."""

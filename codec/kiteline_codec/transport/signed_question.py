@@ -1,7 +1,8 @@
 """Questions to a base, signed by who has the right to change maps. Pure: time and random bytes are handed in.
 
-A signed question is a JSON object: `signed`, the question; `t_s`, Unix time in s; `nonce`; `tag`, BLAKE2b of verb,
-question, time and nonce under the key. Each is taken once, and only near its time.
+A signed question is a JSON object: `signed`, the question; `start`, what this start of the base drew; `t_s`, Unix time
+in s; `nonce`; `tag`, BLAKE2b of verb and all of these under the key. Each is taken once, only near its time, and by no
+other start of the base. A question with another `start` is refused with an error that names the right one.
 """
 
 from __future__ import annotations
@@ -21,9 +22,18 @@ _REMEMBERED = 10_000  # nonces; more questions within their time are refused
 _TAG_BYTES = 16
 
 
-def sign(key: bytes, verb: str, text: str, t_s: int, nonce: str) -> str:
-    """The signed question. nonce: random, never used again."""
-    return json.dumps({"signed": text, "t_s": t_s, "nonce": nonce, "tag": _tag(key, verb, text, t_s, nonce)})
+class OtherStartError(WireError):
+    """A question to another start of the base. start: of this one."""
+
+    def __init__(self, start: str) -> None:
+        super().__init__("the question names no start of this base, or an earlier one: sign it with this `start`")
+        self.start = start
+
+
+def sign(key: bytes, verb: str, text: str, t_s: int, nonce: str, start: str) -> str:
+    """The signed question. nonce: random, never used again. start: that of the base, which its refusal names."""
+    tag = _tag(key, verb, text, t_s, nonce, start)
+    return json.dumps({"signed": text, "start": start, "t_s": t_s, "nonce": nonce, "tag": tag})
 
 
 def unsigned(text: str) -> str:
@@ -42,31 +52,35 @@ def _signed(text: str) -> dict[str, Any] | None:
     return given if isinstance(given, dict) and "signed" in given else None
 
 
-def _tag(key: bytes, verb: str, text: str, t_s: int, nonce: str) -> str:
-    signed = json.dumps([verb, text, t_s, nonce]).encode()
+def _tag(key: bytes, verb: str, text: str, t_s: int, nonce: str, start: str) -> str:
+    signed = json.dumps([verb, text, t_s, nonce, start]).encode()
     return blake2b(signed, key=key, digest_size=_TAG_BYTES, person=b"kiteline-maps").hexdigest()
 
 
 class QuestionGuard:
     """Lets questions pass that are signed with the key."""
 
-    def __init__(self, key: Callable[[], bytes | None]) -> None:
-        """key: that of the right, now; None if nobody has it."""
-        self._key = key
+    def __init__(self, key: Callable[[], bytes | None], start: str) -> None:
+        """key: that of the right, now; None if nobody has it. start: drawn at this start of the base."""
+        self._key, self._start = key, start
         self._taken: OrderedDict[str, int] = OrderedDict()  # nonces, and when they may be forgotten
 
     def open(self, verb: str, text: str, now_s: int) -> str | None:
-        """The question in a signed one; None for one that is not signed. Raises WireError for a wrong signature."""
+        """The question in a signed one; None for one that is not signed. Raises WireError for a wrong one,
+        OtherStartError.
+        """
         given = _signed(text)
         if given is None:
             return None
         question, t_s, nonce, tag = (given.get(name) for name in ("signed", "t_s", "nonce", "tag"))
         if not (isinstance(question, str) and isinstance(nonce, str) and isinstance(tag, str) and type(t_s) is int):
-            raise WireError("a signed question has a text, a time, a nonce and a tag")
+            raise WireError("a signed question has a text, a start, a time, a nonce and a tag")
+        if given.get("start") != self._start:
+            raise OtherStartError(self._start)
         key = self._key()
         if key is None:
             raise WireError("nobody has the right to change this base's maps: `kiteline keys new maps` there gives it")
-        expected = _tag(key, verb, question, t_s, nonce)
+        expected = _tag(key, verb, question, t_s, nonce, self._start)
         if not hmac.compare_digest(expected.encode(), tag.encode(errors="replace")):
             raise WireError(
                 "the question is signed with another key than this base's for maps: `kiteline maps --key FILE`, with "

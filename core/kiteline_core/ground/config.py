@@ -50,6 +50,7 @@ class GroundConfig:
     ground_most_m: float = 0.15  # m; farther above or below nothing is ground, however uncertain: it may be a low box
     columns: int = 64  # of a scan over the field of view: 1.3 degrees each, 0.1 m at 5 m; 80 to 110 bytes in all
     bands_m: tuple[float, ...] = (0.1, 0.5, 1.2, 2.0)  # m above ground between which obstacles count: foot, table, head
+    least_known: float = 0.7  # of a column's pixels below the horizon: among more unknown ones an obstacle may hide
     column_pixels: int = 5  # of an obstacle in a column, at least: fewer are chance
     slab_m: float = 0.2  # m above and below the camera within which the line of sight must be clear: a small drone
     max_range_m: float = 60.0  # m; farther ground and obstacles are left out

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_core.geometry.cameras import RectifiedCamera
+from kiteline_core.ground import level_kernels
 from kiteline_core.ground.config import GroundConfig
 
 F32 = NDArray[np.float32]
@@ -85,7 +86,11 @@ class DisparityStripes:
 
     def begin(self, left: U8, right: U8) -> None:
         """Take a pair, rectified and of half size (h,w)."""
-        self.pair = self._camera.reduced(left), self._camera.reduced(right)
+        self.begin_reduced((self._camera.reduced(left), self._camera.reduced(right)))
+
+    def begin_reduced(self, pair: tuple[U8, U8]) -> None:
+        """Take a pair of the size of disparities (h,w)."""
+        self.pair = pair
         self._padded = _padded(self.pair[0]), _padded(self.pair[1])
 
     def match(self, stripe: int) -> None:
@@ -101,7 +106,7 @@ class DisparityStripes:
         """Disparities (h,w) in px, 0 where unknown, once all stripes were matched."""
         cv2.filterSpeckles(self._raw, -_STEPS, _SPECKLE_PX, _STEPS)
         self._padded = None
-        return unlocked(self._raw[:, _PAD_PX:])
+        return unlocked(self._raw, _PAD_PX)
 
     @property
     def stripe_px(self) -> int:
@@ -109,8 +114,12 @@ class DisparityStripes:
         return self._raw.size // self.stripes
 
     def measure(self, left: U8, right: U8) -> F32:
-        """The disparity image of a pair at once."""
+        """The disparity image of a pair, as `begin` takes it, at once."""
         self.begin(left, right)
+        return self.measure_begun()
+
+    def measure_begun(self) -> F32:
+        """The disparity image of the pair that was begun, at once."""
         for stripe in range(self.stripes):
             self.match(stripe)
         return self.finish()
@@ -120,8 +129,8 @@ def _padded(image: U8) -> U8:
     return np.asarray(cv2.copyMakeBorder(image, 0, 0, _PAD_PX, 0, cv2.BORDER_REPLICATE), np.uint8)
 
 
-def unlocked(raw: NDArray[np.int16]) -> F32:
-    """Disparities (h,w) in px of OpenCV's, in 1/16 px; 0 where unknown.
+def unlocked(raw: NDArray[np.int16], first: int = 0) -> F32:
+    """Disparities (h,w) in px of OpenCV's, in 1/16 px, from a column on; 0 where unknown.
 
     OpenCV's parabolas draw them to whole pixels. Its costs are nearly those of absolute differences, |t - s| at steps s
     of a surface t px off the whole pixel: the parabola through three of them has its summit at m = t / (2 - 2 t).
@@ -130,5 +139,6 @@ def unlocked(raw: NDArray[np.int16]) -> F32:
     """
     table = np.arange(-_STEPS // 2, _STEPS // 2, dtype=np.float64) / _STEPS
     table = np.where(np.abs(table) < 0.5, 2.0 * table * (1.0 - np.abs(table)), table).astype(np.float32)
-    whole = (raw + _STEPS // 2) >> 4
-    return np.where(raw > 0, whole + table[(raw + _STEPS // 2) & (_STEPS - 1)], np.float32(0.0)).astype(np.float32)
+    out = np.empty((raw.shape[0], raw.shape[1] - first), np.float32)
+    level_kernels.unlock(raw, first, table, out)
+    return out

@@ -4,19 +4,56 @@ from __future__ import annotations
 
 import numpy as np
 
-from kiteline_core.jit import njit
+from kiteline_core.jit import helper, njit
 
 BIN_PX = 0.25  # px of levelled disparity to a bin
+_MATCHED = 0.2  # of an image column's pixels below the horizon that have a disparity: else both eyes did not see it
 NO_COLUMN = -1
 
 
 @njit
-def level_points(disparity, rotation, camera, bf, offset, far_px, slopes, x_out, z_out, column_out):  # type: ignore[no-untyped-def]
+def unlock(raw, first, table, out):  # type: ignore[no-untyped-def]
+    """Disparities (h,w) in px of raw ones (h,first+w) int16, in 1/16 px; 0 where they are not positive.
+
+    table: (16,) float32 px, what parts of -8..7 steps beside a whole pixel stand for.
+    """
+    for v in range(out.shape[0]):
+        for u in range(out.shape[1]):
+            at = np.int64(raw[v, first + u]) + 8
+            out[v, u] = np.float32(at >> 4) + table[at & 15] if at > 8 else np.float32(0.0)
+
+
+@helper
+def _below(rotation, x, y):  # type: ignore[no-untyped-def]
+    """True if a ray looks below the horizon."""
+    return rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] < 0.0
+
+
+@helper
+def _matched_columns(disparity, rotation, camera):  # type: ignore[no-untyped-def]
+    """First and last image column that both eyes saw; none if the first is not below the last."""
+    h, w = disparity.shape
+    first, last = w, -1
+    for u in range(w):
+        x, known, pixels = (u - camera[2]) / camera[0], 0, 0
+        for v in range(h):
+            if _below(rotation, x, (v - camera[3]) / camera[1]):
+                pixels += 1
+                known += disparity[v, u] > 0.0
+        if known > _MATCHED * pixels:
+            first, last = min(first, u), u
+    return first, last
+
+
+@njit
+def level_points(disparity, rotation, camera, bf, offset, far_px, slopes, x_out, z_out, column_out, known_out):  # type: ignore[no-untyped-def]
     """Points of pixels in the levelled frame: ahead x_out, up z_out (h,w) m, and their column (h,w), NO_COLUMN without.
 
     disparity: (h,w) px, <= 0 unknown. rotation: (3,3) camera to levelled frame. camera: fx, fy, cx, cy in px. bf: px m.
     offset: (5,) error of disparities over normalised image coordinates. far_px: least disparity; smaller ones
-    are taken as far. slopes: (n+1,) y/x of the borders of columns, increasing; column n-1 is the last.
+    are taken as far. slopes: (n+1,) y/x of the borders of columns, increasing; column n-1 is the last. known_out: (n,2)
+    of a column's pixels below the horizon that both eyes saw: how many have a disparity, and how many there are;
+    zero before.
     """
     h, w = disparity.shape
     fx, fy, cx, cy = camera[0], camera[1], camera[2], camera[3]
@@ -29,16 +66,16 @@ def level_points(disparity, rotation, camera, bf, offset, far_px, slopes, x_out,
         while at < n - 1 and slopes[at + 1] <= low + (i + 0.5) / scale:
             at += 1
         table[i] = at
+    first, last = _matched_columns(disparity, rotation, camera)
     for v in range(h):
         y = (v - cy) / fy
         for u in range(w):
             column_out[v, u] = NO_COLUMN
             d = disparity[v, u]
-            if not d > 0.0:
-                continue
             x = (u - cx) / fx
-            d -= offset[0] + offset[1] * x + offset[2] * y + offset[3] * x * x + offset[4] * x * y
-            depth = bf / max(d, far_px)
+            below = first <= u <= last and _below(rotation, x, y)
+            if not (d > 0.0 or below):
+                continue
             ahead = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2]
             if ahead < 0.2:
                 continue
@@ -46,6 +83,12 @@ def level_points(disparity, rotation, camera, bf, offset, far_px, slopes, x_out,
             i = int((slope - low) * scale)
             if slope < low or i >= 1024:
                 continue
+            known_out[table[i], 1] += below
+            if not d > 0.0:
+                continue
+            known_out[table[i], 0] += below
+            d -= offset[0] + offset[1] * x + offset[2] * y + offset[3] * x * x + offset[4] * x * y
+            depth = bf / max(d, far_px)
             x_out[v, u] = ahead * depth
             z_out[v, u] = (rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2]) * depth
             column_out[v, u] = table[i]

@@ -64,6 +64,49 @@ def ground_path(counts, first, hint, hint_rows, bf, step_m, max_slope, sigma_px,
 
 
 @njit
+def count_near(counts, height_m, step_m, sigma_px, found):  # type: ignore[no-untyped-def]
+    """Pixels (bins,) of counts (bins, heights) near a height (bins,) in m, as noise of sigma_px spreads them."""
+    bins, heights = counts.shape
+    for j in range(bins):
+        row = height_m[j] / step_m - 0.5
+        spread = 1.5 + 2.0 * row * sigma_px / ((j + 0.5) * BIN_PX)
+        found[j] = 0
+        for k in range(heights):
+            if abs(k - row) <= spread:
+                found[j] += counts[j, k]
+
+
+@njit
+def count_path(counts, path, sigma_px, found, total):  # type: ignore[no-untyped-def]
+    """Pixels (bins,) of counts (bins, heights) near a path (bins,), and all of each bin."""
+    bins, heights = counts.shape
+    for j in range(bins):
+        spread = 2.0 + 3.0 * (path[j] + 0.5) * sigma_px / ((j + 0.5) * BIN_PX)
+        found[j], total[j] = 0, 0
+        for k in range(heights):
+            total[j] += counts[j, k]
+            if abs(k - path[j]) <= spread:
+                found[j] += counts[j, k]
+
+
+@njit
+def cells_near(counts, disparities, slopes, path, first, last, sigma_px, out):  # type: ignore[no-untyped-def]
+    """Cells (bins, heights) with pixels near a path, of bins first..last. Returns how many there are.
+
+    disparities, slopes: sums over pixels. out: (3, m) number of pixels, and the means of both.
+    """
+    n = 0
+    for j in range(first, last + 1):
+        spread = 2.0 + 3.0 * (path[j] + 0.5) * sigma_px / ((j + 0.5) * BIN_PX)
+        for k in range(counts.shape[1]):
+            if counts[j, k] > 0 and abs(k - path[j]) <= spread:
+                pixels = float(counts[j, k])
+                out[0, n], out[1, n], out[2, n] = pixels, disparities[j, k] / pixels, slopes[j, k] / pixels
+                n += 1
+    return n
+
+
+@njit
 def _basis(s):  # type: ignore[no-untyped-def]
     """The four cubic basis functions at s of a section, 0..1."""
     r = 1.0 - s

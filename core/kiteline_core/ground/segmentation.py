@@ -115,7 +115,7 @@ class GroundSegmenter:
         self._lowest_px = max(self.sigma_px / config.max_range_sigma, self.bf / config.max_range_m)
         self._bands = np.array(config.bands_m)
         self.x, self.z = np.empty((h, w), np.float32), np.empty((h, w), np.float32)
-        self._column = np.empty((h, w), np.int16)
+        self._column, self._known = np.empty((h, w), np.int16), np.empty((n, 2), np.int32)
         self.labels = np.zeros((h, w), np.uint8)
         self._textured = np.ones((h, w), np.bool_)
         self._counts, self._sums = np.empty((4, n, bins), np.int32), np.empty((n, bins))
@@ -126,6 +126,7 @@ class GroundSegmenter:
         self._heights = np.empty((bins, heights), np.int32)
         self._depths = np.empty(round(config.largest_height_m / _DEPTH_STEP_M), np.int32)
         self._height_sums = np.empty((2, bins, heights))
+        self._cells = np.empty((3, bins * heights))  # of the v-disparity near a path
 
     def segment(
         self, disparity: F32, pair: tuple[U8, U8] | None, up_c: F64, offset_px: F64 | None = None,
@@ -140,9 +141,10 @@ class GroundSegmenter:
         config = self.config
         offset_px = disparity_offset.none() if offset_px is None else offset_px
         view = _View(up_c, np.ascontiguousarray(level_rotation(up_c).T), offset_px, pair)
+        self._known.fill(0)
         level_kernels.level_points(
             disparity, view.rotation, self._camera, self.bf, offset_px, self._far_px, self._slopes, self.x, self.z,
-            self._column,
+            self._column, self._known,
         )  # fmt: skip
         if pair is not None:
             label_kernels.mark_texture(pair[0], config.texture, config.texture_px, self._textured)
@@ -217,16 +219,13 @@ class GroundSegmenter:
 
     def _pixels_near(self, height_m: F64) -> NDArray[np.int64]:
         """Pixels (bins,) of the v-disparity near a height (bins,) of the camera."""
-        centres = (np.arange(self._bins) + 0.5) * level_kernels.BIN_PX
-        rows = height_m / _HEIGHT_STEP_M - 0.5
-        spread = 1.5 + 2.0 * rows * self.sigma_px / centres
-        near = np.abs(np.arange(self._heights.shape[1]) - rows[:, None]) <= spread[:, None]
-        return np.asarray((self._heights * near).sum(1), np.int64)
+        found = np.empty(self._bins, np.int64)
+        profile_kernels.count_near(self._heights, height_m, _HEIGHT_STEP_M, self.sigma_px, found)
+        return found
 
     def _curved_ground(self, expected: ExpectedGround | None) -> Ground | None:
         """The ground as a curve over the distance; None if too little of it is seen."""
         config, bf, heights = self.config, self.bf, self._heights
-        disparities, slopes = self._height_sums
         path = np.zeros(self._bins, np.int64)
         first, hint, near = int(config.least_height_m / _HEIGHT_STEP_M), -1, 0
         if expected is not None:
@@ -236,16 +235,18 @@ class GroundSegmenter:
         )
         # Cells near the path, in bins of which enough pixels lie there.
         centres = (np.arange(self._bins) + 0.5) * level_kernels.BIN_PX
-        spread = 2.0 + 3.0 * (path + 0.5) * self.sigma_px / centres
-        used = (np.abs(np.arange(heights.shape[1]) - path[:, None]) <= spread[:, None]) & (heights > 0)
-        found = (heights * used).sum(1)
+        found, total = np.empty((2, self._bins), np.int64)
+        profile_kernels.count_path(heights, path, self.sigma_px, found, total)
         bins = np.flatnonzero((found >= max(0.02 * found.max(), 3.0)) & (centres >= self._lowest_px))
-        enough = max(config.least_pixels, config.least_share * heights[bins].sum())
+        enough = max(config.least_pixels, config.least_share * total[bins].sum())
         if found[bins].sum() < enough or len(bins) < config.least_bins:
             return None
-        used[: bins[0]] = used[bins[-1] + 1 :] = False
-        n = heights[used].astype(np.float64)
-        d, slope = disparities[used] / n, slopes[used] / n
+        disparities, slopes = self._height_sums
+        first_bin, last_bin = int(bins[0]), int(bins[-1])
+        m = profile_kernels.cells_near(
+            heights, disparities, slopes, path, first_bin, last_bin, self.sigma_px, self._cells
+        )  # fmt: skip
+        n, d, slope = self._cells[:, :m]
         sigma = np.hypot(slope * self.sigma_px / d, 0.3 * _HEIGHT_STEP_M * d / bf)
         low, high = float(centres[bins[0]]), float(centres[bins[-1]])
         coefficients = np.zeros(profile_kernels.COEFFICIENTS)
@@ -336,6 +337,8 @@ class GroundSegmenter:
         nearer = np.minimum(padded[:-2], padded[2:])
         ends = (free_from < nearer) & (nearer < np.minimum(free, obstacle - _NEARER_M))
         free[ends] = nearer[ends]
+        hidden = self._known[:, 0] < config.least_known * self._known[:, 1]
+        free[hidden] = free_from[hidden] = 0.0
         some = np.flatnonzero((free > 0.0) | (bands > 0) | (clear > 0.0))
         first, last = (int(some[0]), int(some[-1]) + 1) if len(some) else (0, n)
         free_from, free, obstacle, clear = (row[first:last].copy() for row in (free_from, free, obstacle, clear))

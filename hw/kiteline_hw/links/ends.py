@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from kiteline_hw.ports import ByteLink, Framer
 
@@ -14,13 +14,15 @@ class LinkOptions:
 
     agent: number of the agent at this end or, for a base on a serial line, at the other end. group: flights with
     different group names on one network do not see each other (zenoh). framer: makes the framing of a byte stream
-    (serial). required: a port that cannot be opened is an error; else the link waits for it.
+    (serial). required: a port that cannot be opened is an error; else the link waits for it. logins: users and
+    passwords (zenoh): that of an agent, for bases that ask for one; those without which a base takes no connection.
     """
 
     agent: int = 0
     group: str = "default"
     framer: Callable[[], Framer] | None = None
     required: bool = True
+    logins: Mapping[str, str] = field(default_factory=dict)
 
 
 class OneLinkHub:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from importlib import import_module
 from typing import Literal, overload
 
@@ -15,15 +15,18 @@ from kiteline_hw.ports import ByteLink, Framer, LinkError, LinkHub
 def open_link(
     spec: str, role: Literal["agent"], agent: int = ..., *,
     group: str = ..., framer: Callable[[], Framer] | None = ..., required: bool = ...,
+    logins: Mapping[str, str] | None = ...,
 ) -> ByteLink: ...  # fmt: skip
 @overload
 def open_link(
     spec: str, role: Literal["base"], agent: int = ..., *,
     group: str = ..., framer: Callable[[], Framer] | None = ..., required: bool = ...,
+    logins: Mapping[str, str] | None = ...,
 ) -> LinkHub: ...  # fmt: skip
 def open_link(
     spec: str, role: Literal["agent", "base"], agent: int = 0, *,
     group: str = "default", framer: Callable[[], Framer] | None = None, required: bool = True,
+    logins: Mapping[str, str] | None = None,
 ) -> ByteLink | LinkHub:  # fmt: skip
     """Open one end of a link: a ByteLink for an agent, a LinkHub for a base. See LinkOptions. Raises LinkError."""
     scheme, _, address = spec.partition(":")
@@ -31,6 +34,6 @@ def open_link(
     if kind is None or bool(address) != bool(kind.address):
         raise LinkError(f"unknown link {spec!r}: expected {kinds.link_forms()}")
     module = import_module(kind.module)
-    options = LinkOptions(agent, group, framer, required)
+    options = LinkOptions(agent, group, framer, required, logins or {})
     end: ByteLink | LinkHub = (module.open_agent_end if role == "agent" else module.open_base_end)(address, options)
     return end

@@ -10,7 +10,8 @@ from kiteline_hw.system.closing import Closing
 
 OUTBOX_PACKETS = 256  # packets; one second of the fastest profile: the sender builds older ones anew
 INBOX_PACKETS = 4096  # packets
-INBOX_BYTES = 1 << 20  # of them: a second of a fast Wi-Fi; the loop takes them every 5 to 50 ms
+INBOX_BYTES = 1 << 20  # memory for them: a second of a fast Wi-Fi; the loop takes them every 5 to 50 ms
+PACKET_BYTES = 64  # memory of a packet beside its bytes, roughly
 MOST_PACKET_BYTES = (1 << 16) + 64  # of a packet with its seal
 
 
@@ -43,6 +44,7 @@ class QueuedLink(Closing):
         self._inbox: deque[bytes] = deque()
         self._inbox_bytes = 0
         self._inbox_lock = threading.Lock()
+        self.inbox_limit = INBOX_BYTES  # bytes
 
     @property
     def counters(self) -> LinkCounters:
@@ -98,11 +100,12 @@ class QueuedLink(Closing):
                 self._counters.overrun_packets += 1
                 return
             while self._inbox and (
-                len(self._inbox) >= INBOX_PACKETS or self._inbox_bytes + len(packet) > INBOX_BYTES
+                len(self._inbox) >= INBOX_PACKETS
+                or self._inbox_bytes + len(packet) + PACKET_BYTES > self.inbox_limit
             ):  # fmt: skip
-                self._inbox_bytes -= len(self._inbox.popleft())
+                self._inbox_bytes -= len(self._inbox.popleft()) + PACKET_BYTES
                 self._counters.overrun_packets += 1
             self._inbox.append(packet)
-            self._inbox_bytes += len(packet)
+            self._inbox_bytes += len(packet) + PACKET_BYTES
             self._counters.received_packets += 1
             self._counters.received_bytes += len(packet)

@@ -1,7 +1,7 @@
 """Whether a link is sealed, and with which file of keys: what its end was told, else by who can reach it.
 
-Sealed by default is what strangers can reach: IP links beyond this machine. On one machine, the base's and its agents'
-common file of keys is used where there is one. Cables, radios and tunnels have one peer; they are sealed with --key.
+Sealed by default is every link that others can reach: IP networks, routers, radios, tunnels, cables. On one machine,
+the base's and its agents' common file of keys is used where there is one.
 """
 
 from __future__ import annotations
@@ -13,7 +13,8 @@ from typing import Literal
 from kiteline_hw.ports import LinkError
 from kiteline_hw.system import key_store
 
-_IP = "zenoh"
+_IP = "zenoh:"
+_ROUTER = "router/"  # before a locator: whom a router lets in, this end cannot know
 _UNSEALED = "NOT SEALED: whoever reaches this link can read, write and delete"
 
 
@@ -34,14 +35,11 @@ def sealing_of(link: str, role: Literal["agent", "base"], agent: int, key: str, 
         raise LinkError("--key seals packets, --insecure does not: choose one")
     if key:
         return Sealing(key)
-    scheme = link.partition(":")[0]
     if link == "none":
         return Sealing("")
     if insecure:
         return Sealing("", (f"--insecure: {_UNSEALED}",))
     path = key_store.default_path()
-    if scheme != _IP:
-        return Sealing("", (f"{link} is not sealed; --key FILE seals it",))
     if is_loopback(link):
         if not path.exists() or (role == "agent" and agent not in key_store.read_keys(path)):
             return Sealing("", ("not sealed: on this machine alone",))
@@ -59,8 +57,10 @@ def sealing_of(link: str, role: Literal["agent", "base"], agent: int, key: str, 
 
 
 def is_loopback(link: str) -> bool:
-    """True if only this machine can reach an IP link."""
-    address = link.partition(":")[2].removeprefix("router/").partition("/")[2].partition("?")[0].partition("#")[0]
+    """True if only this machine can reach a link: an IP link whose base listens on a loopback address itself."""
+    if not link.startswith(_IP) or link.startswith(_IP + _ROUTER):
+        return False
+    address = link.removeprefix(_IP).partition("/")[2].partition("?")[0].partition("#")[0]
     host = address.rpartition(":")[0].strip("[]")
     if host == "localhost":
         return True

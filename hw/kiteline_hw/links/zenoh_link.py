@@ -18,7 +18,7 @@ from typing import Any
 import zenoh
 
 from kiteline_hw.links.ends import LinkOptions
-from kiteline_hw.links.queued_link import MOST_PACKET_BYTES, LinkCounters, QueuedLink
+from kiteline_hw.links.queued_link import INBOX_BYTES, MOST_PACKET_BYTES, LinkCounters, QueuedLink
 from kiteline_hw.links.zenoh_access import Instances, access_of_base
 from kiteline_hw.links.zenoh_session import close_session, direct, open_session
 from kiteline_hw.ports import ByteLink, LinkError
@@ -30,6 +30,7 @@ _NEW_AGENT_S = 0.05  # s until the hub's sender thread notices a new agent
 # session is opened anew. The limit doubles each time, because the link may just be slow.
 _SILENCE_S = 3.0
 _LONGEST_SILENCE_S = 24.0
+_INBOXES_BYTES = 8 << 20  # memory for the packets of all agents: strangers may fill the inboxes of 64
 _JOIN_S = 0.3  # s for the sender thread to notice the end; it is a daemon and never keeps the process alive
 
 
@@ -99,8 +100,12 @@ def _note_instance(instances: Instances, sample: Any) -> None:
 class ZenohLink(_PeerLink):
     """A drone's ByteLink. Connects and reconnects in the background; the constructor does not wait for a base."""
 
-    def __init__(self, endpoint: str, agent: int, *, group: str = "default") -> None:
+    def __init__(
+        self, endpoint: str, agent: int, *, group: str = "default", logins: Mapping[str, str] | None = None
+    ) -> None:
+        """logins: user and password, for a base that asks for them."""
         super().__init__()
+        self._logins, self._by_login = logins, False
         self._agent = _checked_agent(agent)
         self._endpoint = endpoint
         self._prefix = _prefix(group)
@@ -128,8 +133,12 @@ class ZenohLink(_PeerLink):
         while not self._closed.is_set():
             session: zenoh.Session | None = None
             with contextlib.suppress(LinkError):
-                session = open_session(self._endpoint, "client", connect_timeout_s=0.0, give_up=self._closed)
+                session = open_session(
+                    self._endpoint, "client", connect_timeout_s=0.0, give_up=self._closed,
+                    logins=self._logins if self._by_login else None,
+                )  # fmt: skip
             if session is None:
+                self._by_login = bool(self._logins) and not self._by_login  # bases take the one or the other
                 self._closed.wait(0.2)
                 continue
             with self._session_lock:
@@ -208,14 +217,15 @@ class _AgentLink(_PeerLink):
 class ZenohHub(Closing):
     """The base's end: one ByteLink per agent, made when the agent appears. Raises LinkError if it cannot listen."""
 
-    def __init__(self, endpoint: str, *, group: str = "default") -> None:
+    def __init__(self, endpoint: str, *, group: str = "default", logins: Mapping[str, str] | None = None) -> None:
+        """logins: users and passwords without which nobody connects; None: anyone may."""
         self._prefix = prefix = _prefix(group)
         self._wake = threading.Condition()
         self._lock = threading.Lock()
         self._links: dict[int, _AgentLink] = {}
         self._closed = threading.Event()
         self.counters = LinkCounters()
-        self.session = open_session(endpoint, "base", access=access_of_base(prefix))
+        self.session = open_session(endpoint, "base", access=access_of_base(prefix), logins=logins)
         on_packet, on_agent = _guarded(self.counters, self._on_packet), _guarded(self.counters, self._on_agent)
         try:
             liveliness = self.session.liveliness()
@@ -240,6 +250,8 @@ class ZenohHub(Closing):
             if link is None:
                 publisher = _publisher(self.session, f"{self._prefix}/{agent}/down")
                 link = self._links[agent] = _AgentLink(self._wake, publisher)
+                for each in self._links.values():
+                    each.inbox_limit = min(INBOX_BYTES, _INBOXES_BYTES // len(self._links))
             return link
 
     def _on_packet(self, sample: Any) -> None:
@@ -295,9 +307,9 @@ class ZenohHub(Closing):
 
 def open_agent_end(address: str, options: LinkOptions) -> ZenohLink:
     """Connect to the base at an endpoint, in the background."""
-    return ZenohLink(address, options.agent, group=options.group)
+    return ZenohLink(address, options.agent, group=options.group, logins=options.logins)
 
 
 def open_base_end(address: str, options: LinkOptions) -> ZenohHub:
     """Listen on an endpoint. Raises LinkError."""
-    return ZenohHub(address, group=options.group)
+    return ZenohHub(address, group=options.group, logins=options.logins)

@@ -10,6 +10,7 @@ import contextlib
 import json
 import queue
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -111,10 +112,20 @@ def _reply(query: Any, ok: bool, text: str) -> None:
             query.reply_err(text.encode(), encoding=zenoh.Encoding.APPLICATION_JSON)
 
 
-def ask(endpoint: str, service: str, verb: str, text: str, timeout_s: float = 10.0) -> tuple[bool, str]:
-    """Send a request, again until it is answered. Returns whether it succeeded, and the answer. Raises LinkError."""
+def ask(
+    endpoint: str, service: str, verb: str, text: str, timeout_s: float = 10.0, logins: Mapping[str, str] | None = None
+) -> tuple[bool, str]:
+    """Send a request, again until it is answered. Returns whether it succeeded, and the answer. Raises LinkError.
+
+    logins: user and password, for a base that asks for them.
+    """
     deadline_s = time.monotonic() + timeout_s
-    session = open_session(endpoint, "client", connect_timeout_s=timeout_s)
+    try:
+        session = open_session(endpoint, "client", connect_timeout_s=0.0 if logins else timeout_s)
+    except LinkError:
+        if not logins:
+            raise
+        session = open_session(endpoint, "client", connect_timeout_s=timeout_s, logins=logins)
     try:
         while (left_s := deadline_s - time.monotonic()) > 0.0:
             replies: queue.SimpleQueue[tuple[bool, str] | None] = queue.SimpleQueue()

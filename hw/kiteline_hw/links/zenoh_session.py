@@ -9,9 +9,10 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import tempfile
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, Literal
 
 import zenoh
@@ -28,8 +29,12 @@ _ROUTER = "router/"  # before a locator: a Zenoh router listens there, and both 
 Role = Literal["client", "base"]
 
 
-def session_config(endpoint: str, role: Role, lease_ms: int, access: dict[str, Any] | None = None) -> zenoh.Config:
-    """The configuration of a session. access: what clients may do at a base, whose memory is bounded then, too.
+def session_config(
+    endpoint: str, role: Role, lease_ms: int, access: dict[str, Any] | None = None,
+    logins: Mapping[str, str] | None = None, list_of_logins: str = "",
+) -> zenoh.Config:  # fmt: skip
+    """The configuration of a session. access: what clients may do at a base, whose memory is bounded then, too. logins:
+    the user and password of a client; list_of_logins: a file of those without which a base takes no connection.
 
     Raises LinkError.
 
@@ -53,6 +58,10 @@ def session_config(endpoint: str, role: Role, lease_ms: int, access: dict[str, A
         "transport/shared_memory/enabled": False,
         "transport/link/tx/lease": lease_ms,
     }
+    for user, password in (logins or {}).items() if role == "client" else ():
+        options |= {"transport/auth/usrpwd/user": user, "transport/auth/usrpwd/password": password}
+    if list_of_logins:
+        options["transport/auth/usrpwd/dictionary_file"] = list_of_logins
     if access is not None and role == "base":
         options["transport/link/rx/max_message_size"] = _MOST_MESSAGE_BYTES
         options["transport/unicast/max_sessions"] = _MAX_SESSIONS
@@ -74,12 +83,29 @@ def open_session(
     access: dict[str, Any] | None = None,
     connect_timeout_s: float = 10.0,
     give_up: threading.Event | None = None,
+    logins: Mapping[str, str] | None = None,
 ) -> zenoh.Session:
     """Listen (base) or connect (client, with retries until the timeout or until `give_up` is set). Raises LinkError.
 
+    logins: user and password of a client, or those without which a base takes no connection. A client that names one is
+    refused by a base that asks for none.
+
     Blocks: never call it in a tracking loop.
     """
-    config = session_config(endpoint, role, lease_ms, access)
+    with contextlib.ExitStack() as stack:
+        listed = ""
+        if logins and role == "base":  # Zenoh reads the file as it opens, and never again
+            file = stack.enter_context(tempfile.NamedTemporaryFile("w", prefix="kiteline-", encoding="ascii"))
+            file.writelines(f"{user}:{password}\n" for user, password in logins.items())
+            file.flush()
+            listed = file.name
+        config = session_config(endpoint, role, lease_ms, access, logins, listed)
+        return _opened(config, endpoint, role, connect_timeout_s, give_up)
+
+
+def _opened(
+    config: zenoh.Config, endpoint: str, role: Role, connect_timeout_s: float, give_up: threading.Event | None
+) -> zenoh.Session:
     deadline_s = time.monotonic() + connect_timeout_s
     while True:
         try:

@@ -25,7 +25,7 @@ def size_of(data: bytes) -> tuple[int, int] | None:
 
 def _size_of(data: bytes) -> tuple[int, int] | None:
     if data[:4] == b"\x89PNG":
-        return struct.unpack_from(">II", data, 16) if data[12:16] == b"IHDR" else None
+        return struct.unpack_from(">II", data, 16) if data[12:16] == b"IHDR" and _png_holds_its_chunks(data) else None
     if data[:2] == b"\xff\xd8":
         return _of_jpeg(data)
     if data[:2] == b"BM":
@@ -35,6 +35,21 @@ def _size_of(data: bytes) -> tuple[int, int] | None:
     if data[:4] in (b"II*\0", b"MM\0*"):
         return _of_tiff(data)
     return _of_webp(data) if data[:4] == b"RIFF" and data[8:12] == b"WEBP" else None
+
+
+def _png_holds_its_chunks(data: bytes) -> bool:
+    """True if no chunk claims more bytes than there are: a decoder takes up to 4 GiB of memory for one that does.
+
+    It looks for an image also beyond an end that comes before one.
+    """
+    at, has_image = 8, False
+    while at + 8 <= len(data):
+        name = data[at + 4 : at + 8]
+        if name == b"IEND":
+            return has_image
+        has_image |= name == b"IDAT"
+        at += 12 + struct.unpack_from(">I", data, at)[0]
+    return at <= len(data)
 
 
 def _of_jpeg(data: bytes) -> tuple[int, int] | None:

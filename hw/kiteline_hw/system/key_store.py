@@ -83,6 +83,12 @@ def read_file(path: Path) -> Keys:
     return keys
 
 
+def login_of(agent: int | str, key: bytes) -> dict[str, str]:
+    """User and password of whoever has a key, for the connection itself. agent: its number, or `maps`."""
+    user = str(agent)
+    return {user: hashlib.blake2b(user.encode(), key=key, digest_size=32, person=b"kiteline-login").hexdigest()}
+
+
 class WatchedKeys:
     """A file of keys that may change while it is used. Raises LinkError.
 

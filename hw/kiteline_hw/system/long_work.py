@@ -27,8 +27,13 @@ def long_work(stop: StopSignal, what: str) -> Iterator[None]:
     what: shown by `systemctl status`. The watchdog, whose pings pause meanwhile, is set to an hour.
     """
 
+    stopped = False
+
     def on_signal(number: int, frame: FrameType | None) -> None:
-        raise StoppedError
+        nonlocal stopped
+        if not stopped:  # a second one would interrupt what the first one ends
+            stopped = True
+            raise StoppedError
 
     watchdog_us = os.environ.get("WATCHDOG_USEC", "")
     notify(f"STATUS={what}" + (f"\nWATCHDOG_USEC={_LIMIT_S * 1_000_000}" if watchdog_us else ""))

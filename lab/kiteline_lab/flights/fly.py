@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import importlib.util
 import sys
 from pathlib import Path
 
+from kiteline_agent.runtime.options import GRIDS, TRACKERS
+from kiteline_basestation.runtime import base_runtime
 from kiteline_hw.logs.mcap_repair import repair
 from kiteline_hw.ports import LinkError, SourceError
 from kiteline_hw.sources.kinds import source_forms
@@ -53,8 +54,12 @@ def parser() -> argparse.ArgumentParser:
                    help="begin with what earlier flights found of the rig, and write what this one finds")  # fmt: skip
     p.add_argument("--calibration", metavar="FILE[,FILE]", default="",
                    help="cameras, extrinsics and IMU noise in place of what each SOURCE says")  # fmt: skip
-    p.add_argument("--grid", choices=("agent", "off"), default="agent",
-                   help="who looks for ground and obstacles: the agents (default), or nobody")  # fmt: skip
+    p.add_argument("--grid", choices=GRIDS, default="agent",
+                   help="who looks for ground and obstacles: the agents (default), the base in images that a wide "
+                   "link carries, or nobody")  # fmt: skip
+    p.add_argument("--tracker", choices=TRACKERS, default="",
+                   help="map (default), or ekf: a Kalman filter for one camera with odometry, without "
+                   "keyframes for the base")  # fmt: skip
     p.add_argument("--seed", metavar="N", type=int, default=0, help="of the link model")
     p.add_argument("--seconds", metavar="S", type=float, default=0.0, help="fly only so much of the source")
     p.add_argument("--store", metavar="DIR", default="", help="the base keeps its map here, and goes on from it")
@@ -83,7 +88,7 @@ def options(argv: list[str]) -> Options:
         tuple(a.sources), a.out, a.mode, a.link, a.profile, a.link_delay, up, down, a.link_loss, a.cpu, a.mono,
         not a.no_imu, a.realtime,
         a.config, a.rig, a.seed, a.seconds, a.store, a.kill_base_at, a.restart_base_at, a.kill_agent_at,
-        calibration=a.calibration, grid=a.grid,
+        calibration=a.calibration, grid=a.grid, tracker=a.tracker,
     )  # fmt: skip
 
 
@@ -128,9 +133,7 @@ def repair_logs(out: Path) -> None:
 
 def missing_extras(mode: str) -> list[str]:
     """What this flight goes without, as the plain install leaves it out; a line each with the mend."""
-    lines = []
-    if mode != "tracker" and importlib.util.find_spec("gtsam") is None:
-        lines.append("gtsam is not installed: no loop closing, no map merging; pip install 'kiteline[base]'")
+    lines = [] if mode == "tracker" else base_runtime.missing_extras()
     if not can_plot():
         lines.append("matplotlib is not installed: no trajectory.png; pip install 'kiteline[lab]'")
     return lines

@@ -43,7 +43,8 @@ class Options:
     # when each base in turn is killed, s of flight time and s of real time after it; the next base follows
     base_kills: tuple[tuple[float, float], ...] = ()
     calibration: str = ""  # FILE[,FILE…] in place of the sources'
-    grid: str = "agent"  # who makes scans of ground and obstacles: agent, or off
+    tracker: str = ""  # map, or ekf; "": what the configuration says
+    grid: str = "agent"  # who makes scans of ground and obstacles: agent, base, or off
 
 
 @dataclass(slots=True)
@@ -68,7 +69,9 @@ def plan(o: Options, quiet: bool = False) -> FlightPlan:
     made = FlightPlan(quiet=quiet, base_kills=o.base_kills)
     try:
         for text in o.sources:
-            made.sources.append(open_source(text, mono=o.mono, imu=o.imu, calibration=o.calibration))
+            made.sources.append(
+                open_source(text, mono=o.mono or o.tracker == "ekf", imu=o.imu, calibration=o.calibration)
+            )
             if is_live(made.sources[-1]):
                 raise SourceError(f"{text}: a camera is flown with `kiteline agent`: expected a recording or sim:SCENE")
         starts = flight_starts(made.sources)
@@ -83,7 +86,7 @@ def plan(o: Options, quiet: bool = False) -> FlightPlan:
             AgentOptions(
                 source=text, folder=str(o.out / f"agent{k}"), agent=k,
                 boot=number % MAX_BOOTS, order=number + 1, mono=o.mono, imu=o.imu,
-                config=o.config, rig=o.rig, calibration=o.calibration, grid=o.grid,
+                config=o.config, rig=o.rig, calibration=o.calibration, grid=o.grid, tracker=o.tracker,
                 start_ns=starts[k], seconds=o.seconds, up_bytes_s=o.up_bytes_s, profile=o.profile,
                 delay_s=o.delay_s, loss=o.loss, disorder=o.loss,
                 seed=o.seed * 64 + k, cpu_percent=o.cpu_percent,

@@ -10,9 +10,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from kiteline_agent.agent import Agent
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.exchange.no_base import NoBaseChannel
+from kiteline_agent.onboard import OnboardAgent, onboard_agent
 from kiteline_agent.runtime import flight_log
 from kiteline_agent.runtime.options import AgentOptions, coded_channel_for
 from kiteline_agent.step import Identity, StepInput
@@ -82,7 +82,7 @@ def check_replayable(log: LogReader, role: str) -> None:
         )
 
 
-def agent_of_log(log: LogReader) -> Agent:
+def agent_of_log(log: LogReader) -> OnboardAgent:
     """An agent like the one that wrote the log. Raises SourceError."""
     check_replayable(log, "agent")
     rig_message = next(log.messages((RIG,)), None)
@@ -97,7 +97,7 @@ def agent_of_log(log: LogReader) -> Agent:
         spill = SpillFile(Path(tempfile.gettempdir())) if options.log_name else None
         channel = coded_channel_for(options, link_traits(options.link), spill)
     config = configuration.apply(AgentConfig(), tomllib.loads(log.metadata["config"]))
-    return Agent(
+    return onboard_agent(
         rig, imu, config, Identity(AgentId(options.agent), options.boot, options.submap), channel, shipped_vocabulary()
     )
 

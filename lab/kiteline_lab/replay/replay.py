@@ -11,21 +11,22 @@ from typing import Any
 
 import cv2
 
-from kiteline_agent.agent import Agent
+from kiteline_agent.onboard import OnboardAgent
 from kiteline_agent.runtime import flight_log as agent_log
 from kiteline_agent.runtime.frame_counts import FrameCounts, live_line, odometry_line
 from kiteline_agent.runtime.warm import warm as agent_warm
 from kiteline_basestation.jobs import Job
 from kiteline_basestation.runtime import flight_log as base_log
-from kiteline_basestation.runtime.base_runtime import load_vocabulary
+from kiteline_basestation.runtime.base_runtime import load_vocabulary, missing_extras
 from kiteline_basestation.runtime.warm import warm as base_warm
 from kiteline_basestation.station import Station
 from kiteline_basestation.store.restore import restore
 from kiteline_basestation.store.saved_map import unpack
 from kiteline_core.ids import AgentId
 from kiteline_hw.links.kinds import link_traits
+from kiteline_hw.logs.log_parts import WholeLog
 from kiteline_hw.logs.mcap_log import LogReader
-from kiteline_hw.logs.mcap_repair import REPAIRED
+from kiteline_hw.system import process
 from kiteline_lab.flights.progress import Progress
 from kiteline_lab.replay.logged_steps import Step, agent_input, agent_of_log, check_replayable, steps
 
@@ -70,7 +71,7 @@ def replay_agent(
     log: LogReader,
     progress: Progress | None = None,
     stop_at_first: bool = True,
-    watch: Callable[[Step, Agent], None] | None = None,
+    watch: Callable[[Step, OnboardAgent], None] | None = None,
 ) -> ReplayResult:
     """Run an agent again. watch: called after each step. Raises SourceError for a log that cannot be replayed."""
     agent = agent_of_log(log)
@@ -170,10 +171,12 @@ def main(argv: list[str]) -> int:
     cv2.setNumThreads(1)
     agent_warm()
     base_warm()
-    with LogReader(a.log) as log, Progress("replaying", log.topics.get(agent_log.STEP), "steps") as progress:
+    with WholeLog(a.log) as log, Progress("replaying", log.topics.get(agent_log.STEP), "steps") as progress:
         is_agent = log.metadata.get("role") == "agent"
+        if not is_agent:
+            process.print_lines(missing_extras())
         done = (replay_agent if is_agent else replay_base)(log, progress, stop_at_first=a.verify)
-        cut = log.cut or log.metadata.get(REPAIRED)
+        cut = log.cut
     if a.out is not None and is_agent:
         a.out.mkdir(parents=True, exist_ok=True)
         (a.out / "live.tum").write_text("".join(done.live))

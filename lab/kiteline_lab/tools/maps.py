@@ -16,7 +16,7 @@ from typing import Any
 
 from kiteline_codec.transport.signed_question import sign
 from kiteline_hw.links.zenoh_queries import ask
-from kiteline_hw.system.key_store import default_path, read_file
+from kiteline_hw.system.key_store import MAPS, default_path, login_of, read_file
 
 _DEFAULT = "tcp/127.0.0.1:7447"
 
@@ -102,8 +102,24 @@ def _of_store(a: argparse.Namespace) -> int:
     values = sum(len(codes.received) + len(codes.own) for codes in checked.saved.agents.values())
     for fault in checked.faults:
         print(f"{a.store}: {fault}", file=sys.stderr)
-    print(f"{a.store}: {values} values of {len(checked.saved.agents)} agents are sound, {len(checked.faults)} faults")
+    agents, faults = len(checked.saved.agents), len(checked.faults)
+    of = f"{agents} agent{'s' * (agents != 1)}"
+    print(f"{a.store}: {values} values of {of} are sound, {faults} fault{'s' * (faults != 1)}")
     return 1 if checked.faults else 0
+
+
+def asked(endpoint: str, verb: str, question: str, key: bytes | None) -> tuple[bool, str]:
+    """Ask a base, signed if there is a key. Whether it succeeded, and the answer. Raises LinkError."""
+    if key is None:
+        return ask(endpoint, "maps", verb, question)
+
+    def ask_signed(start: str) -> tuple[bool, str]:
+        signed = sign(key, verb, question, int(time.time()), secrets.token_hex(16), start)
+        return ask(endpoint, "maps", verb, signed, logins=login_of(MAPS, key))
+
+    ok, text = ask_signed("")  # nothing comes of it: its refusal names the base's start
+    start = None if ok else json.loads(text).get("start")
+    return ask_signed(start) if isinstance(start, str) else (ok, text)
 
 
 def main(argv: list[str]) -> int:
@@ -113,10 +129,7 @@ def main(argv: list[str]) -> int:
         return _of_store(a)
     path: Path = a.key or default_path()
     key = read_file(path).maps if a.key is not None or path.exists() else None
-    question = json.dumps(query(a))
-    if key is not None:
-        question = sign(key, a.verb, question, int(time.time()), secrets.token_hex(16))
-    ok, text = ask(a.base.removeprefix("zenoh:"), "maps", a.verb, question)
+    ok, text = asked(a.base.removeprefix("zenoh:"), a.verb, json.dumps(query(a)), key)
     if a.json:
         print(text)
     elif ok:

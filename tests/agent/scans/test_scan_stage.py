@@ -138,6 +138,15 @@ def test_frames_between_keyframes_are_scanned_and_hang_on_the_one_before(recordi
     assert len(still.scans) < len(channel.scans)
 
 
+def test_the_next_scan_begins_in_the_frame_that_finishes_one(recording: Path) -> None:
+    """At 20 Hz two of three frames match a stripe, but for keyframes; a keyframe takes the place of a begun frame."""
+    _, channel, matched, _ = flown(recording, eager())
+    assert sum(px > 0 for px in matched) >= 14  # 12 with a frame of nothing after each scan
+    assert len([scan for scan in channel.scans if scan.part == 0]) >= 3  # then, 2
+    keys = [scan.key() for scan in channel.scans]
+    assert len(set(keys)) == len(keys)
+
+
 def test_a_view_that_stays_is_scanned_again_and_not_shared(recording: Path) -> None:
     source = open_source(str(recording))
     channel = Heard(busy=False)

@@ -38,6 +38,7 @@ from kiteline_codec.schema import (
     Record,
     RefinedLandmarks,
     RemovedObservations,
+    ScanImages,
     StereoAlignment,
     SubmapPlacement,
     SubmapScale,
@@ -150,6 +151,8 @@ def some_records(seed: int, n: int) -> list[Record]:
         SubmapTie(submap, KeyframeId(keyframe - 9), pose, 0.0123 * (n + 1), 0.0021),
         KeyframeScan(keyframe, a_scan(seed, n + 1), steps.integers(0, 3, n).astype(np.uint8)),
         KeyframeScan(keyframe, a_scan(seed + 1, n + 1), np.zeros(0, np.uint8), 1 + n % 15, pose),
+        ScanImages(keyframe, pose, 3 * n, pose[2, :3].copy(), bytes(range(1, n + 2))),
+        ScanImages(keyframe, pose, 0, pose[1, :3].copy(), b"\xff\xd8" + bytes(n), 1 + n % 15, se3.inverse(pose)),
     ]  # fmt: skip
 
 
@@ -197,7 +200,19 @@ def test_decoding_gives_what_encodes_to_the_same_code(seed: int, n: int) -> None
         assert messages.key(decoded) == key
         assert messages.encode(decoded) == code
         assert_same(messages.decode(key, code), decoded)
-        exact = ("index", "octave", "angle", "descriptor", "point", "t_ns", "quality", "parent", "keypoints", "batch")
+        exact = (
+            "index",
+            "octave",
+            "angle",
+            "descriptor",
+            "point",
+            "t_ns",
+            "quality",
+            "parent",
+            "keypoints",
+            "batch",
+            "images",
+        )
         for name in exact:
             if hasattr(record, name):
                 assert np.array_equal(getattr(record, name), getattr(decoded, name)), name

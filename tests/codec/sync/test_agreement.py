@@ -324,7 +324,7 @@ def acknowledgements_clear_newer_versions(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def a_restart_goes_unnoticed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Outbox, "restart", lambda self: None)
+    monkeypatch.setattr(Outbox, "restart", lambda self, gone: None)
 
 
 def the_last_fragment_completes_a_value(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,6 +17,7 @@ from kiteline_codec.schema import (
     Key,
     KeyframeHeader,
     KeyframePose,
+    KeyframeScan,
     LivePose,
     NewLandmarks,
     Observations,
@@ -82,6 +83,45 @@ def test_the_same_code_again_costs_nothing() -> None:
     assert pair.a.digest_equal
     assert pair.a.poll(pair.now_ns) is None
     assert pair.a.stats.bytes_sent == before
+
+
+def test_digests_of_a_value_that_changes_all_the_time_are_few() -> None:
+    pair = Pair()
+    pair.run(100)
+    for i in range(50):
+        pair.a.put(Key(LivePose.KIND, 1), bytes([i]) * 30)
+        pair.run(100)
+    digests = [at_ns for at_ns, packet in pair.sent[0] if parse(packet, 1 << 20)[0].digest is not None]
+    assert 4 <= len(digests) <= 6  # one a second
+    pair.settle(1200)
+
+
+@pytest.mark.parametrize(
+    ("size", "pose_after_ms", "left_after_ms"),
+    [(100, 50, 50), (100, 500, 90), (700, 50, 0)],
+    ids=["goes with the pose", "does not wait for long", "fills a packet"],
+)
+def test_a_scan_waits_for_a_packet_that_leaves_anyway(size: int, pose_after_ms: int, left_after_ms: int) -> None:
+    pair = Pair(replace(PLAIN, heartbeat_ns=10**11))
+    pair.a.put(Key(LivePose.KIND, 1), b"a pose")
+    pair.settle()
+    pair.run(2000)
+    pair.a.put(Key(LivePose.KIND, 1), b"another one")
+    pair.step()
+    put_ns = pair.now_ns
+    pair.run(20)
+    pair.a.put(Key(KeyframeScan.KIND, 7), b"s" * size)
+    for _ in range(20):
+        if pair.now_ns - put_ns == pose_after_ms * MS - 10 * MS:
+            pair.a.put(Key(LivePose.KIND, 1), b"a third one")
+        pair.step()
+    left = [
+        at_ns
+        for at_ns, packet in pair.sent[0]
+        if any(i.key.kind == KeyframeScan.KIND for i in parse(packet, 1 << 20)[1])
+    ]
+    assert len(left) == 1
+    assert abs(left[0] - put_ns - max(left_after_ms, 30) * MS) <= 10 * MS
 
 
 def test_order_of_sending() -> None:

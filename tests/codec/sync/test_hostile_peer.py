@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from kiteline_codec.channel import coded_channel
+from kiteline_codec.channel import UNUSED_BYTES, coded_channel
 from kiteline_codec.coding.packing import Writer
 from kiteline_codec.residuals.residual_coding import ResidualCoder
 from kiteline_codec.schema import (
@@ -104,7 +104,7 @@ def test_a_packet_longer_than_any_is_refused() -> None:
 
 
 def memory_of(end: Endpoint) -> int:
-    return end._in.held_bytes + end._in.assembly_bytes + end._earlier.bytes + end._claims.bytes
+    return end._in.held_bytes + end._in.assembly_bytes + end.earlier.bytes + end.claims.bytes
 
 
 def test_values_in_part_stay_within_their_limit_however_they_are_begun() -> None:
@@ -174,6 +174,32 @@ def test_headers_claim_the_map_that_they_name() -> None:
         channel.receive([sender.packet([sender.item(messages.key(header), None, 0, b"")])], 0)
     assert 0 < keypoints * 86 <= 16 << 20
     assert dict(channel.stats.reasons)
+
+
+def test_an_agent_fills_no_more_than_its_first_share_until_something_was_of_use() -> None:
+    """With the limits of every base: before, 2 GiB were taken from who had a key."""
+    channel, sender = coded_channel(1, peer=AgentId(3)), Sender()
+
+    def fill(first: int) -> int:
+        for i in range(first, first + 1000):
+            section = Key(NewLandmarks.KIND, keyframe_id(submap_id(3, 0, 0), i))
+            channel.receive([sender.packet([sender.whole(section, bytes(60_000))])], 0)
+            channel.receive([sender.packet([sender.record(header_of(3, i, 2048))])], 0)
+        return memory_of(channel.endpoint)
+
+    assert 0.9 * UNUSED_BYTES < fill(0) <= UNUSED_BYTES + (1 << 20)
+    channel.endpoint.claims.earned += 8 << 20
+    assert 0.9 * (UNUSED_BYTES + (8 << 20)) < fill(2000) <= UNUSED_BYTES + (9 << 20)
+    channel.endpoint.claims.earned += 1 << 40
+    assert channel.endpoint.claims.allowed_bytes(channel.endpoint.config) == 2 << 30
+
+
+def test_what_a_store_holds_leaves_the_first_share_free() -> None:
+    channel, sender = coded_channel(1, peer=AgentId(3)), Sender()
+    held = {Key(NewLandmarks.KIND, keyframe_id(submap_id(3, 0, 0), i)): bytes(100_000) for i in range(500)}
+    channel.endpoint.resume(held)
+    new = header_of(3, 600)
+    assert channel.receive([sender.packet([sender.record(new)])], 0)
 
 
 def test_lists_of_held_values_are_bounded() -> None:

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from kiteline_codec.residuals.residual_coding import ResidualCoder
 from kiteline_codec.schema import AGENT_KINDS, KEYFRAME_KINDS, Key, NewLandmarks, RefinedLandmarks, WireError
+from kiteline_codec.schema.owners import submap_of
 from kiteline_codec.sync import resumption
 from kiteline_codec.sync.config import SyncConfig
 from kiteline_codec.sync.endpoint import Endpoint
@@ -92,6 +93,24 @@ def test_what_the_base_wrote_is_not_sent_again_to_an_agent_that_goes_on() -> Non
     assert agent.peer_values() == own
     assert second < 0.3 * first
     assert again.digest_equal
+
+
+def test_values_that_are_gone_leave_an_endpoint_when_its_agent_starts_again() -> None:
+    base = Endpoint(SyncConfig(), 1, coder=ResidualCoder(), claimed_bytes=lambda key, code: 100)
+    base.claims.earned = 1 << 20
+    gone: set[int] = set()
+    base.earlier.is_gone = lambda key: submap_of(key) in gone
+    sizes = []
+    for order, boot in enumerate(range(4, 9), start=1):
+        agent = end(resumption.agent_session(order, boot))
+        for key, code in values(boot).items():
+            agent.put(key, code)
+        base.put(Key(RefinedLandmarks.KIND, keyframe_id(submap_id(1, boot, 0), 3)), bytes(40))
+        talk(agent, base, order * 10**10, 400)
+        assert base.peer_values() == values(boot) and base.digest_equal
+        sizes.append((len(base.earlier_values()), base.earlier.bytes, base.claims.bytes, len(base.own_values())))
+        gone.add(submap_id(1, boot, 0))
+    assert sizes == [(0, 0, 9000, 1)] * 5
 
 
 def test_another_boot_gets_no_summary() -> None:

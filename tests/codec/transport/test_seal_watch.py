@@ -9,7 +9,7 @@ from kiteline_codec.sync.config import SyncConfig
 from kiteline_codec.sync.endpoint import Endpoint
 from kiteline_codec.transport.seal import Direction, Opener, Sealer, Suite
 from kiteline_codec.transport.seal_watch import SealWatch, Trouble, notice, read_notice
-from kiteline_codec.transport.signed_question import QuestionGuard, sign, unsigned
+from kiteline_codec.transport.signed_question import OtherStartError, QuestionGuard, sign, unsigned
 
 AGENT = 5  # whose seals begin with the byte that unsealed packets begin with
 OURS, OTHER = bytes(32), bytes([1]) * 32
@@ -125,21 +125,44 @@ def test_a_key_can_be_changed_while_packets_arrive() -> None:
 
 
 def test_questions_need_the_key_and_are_taken_once() -> None:
-    guard = QuestionGuard(lambda: OURS)
-    text = sign(OURS, "delete", '{"map": "0.0.0"}', 1000, "n1")
+    guard = QuestionGuard(lambda: OURS, "a")
+    text = sign(OURS, "delete", '{"map": "0.0.0"}', 1000, "n1", "a")
     assert guard.open("delete", text, 1010) == '{"map": "0.0.0"}'
     for verb, again, now_s in (
         ("delete", text, 1011),  # asked before
-        ("merge", sign(OURS, "delete", "{}", 1000, "n2"), 1000),  # another verb
-        ("delete", sign(OTHER, "delete", "{}", 1000, "n3"), 1000),
-        ("delete", sign(OURS, "delete", "{}", 1000, "n4"), 2000),  # too late
+        ("merge", sign(OURS, "delete", "{}", 1000, "n2", "a"), 1000),  # another verb
+        ("delete", sign(OTHER, "delete", "{}", 1000, "n3", "a"), 1000),
+        ("delete", sign(OURS, "delete", "{}", 1000, "n4", "a"), 2000),  # too late
         ("delete", '{"signed": 1}', 1000),
-        ("delete", '{"signed": "{}", "t_s": 1e999, "nonce": "a", "tag": "\ud800"}', 1000),
+        ("delete", text.replace('"start": "a"', '"start": "b"'), 1000),
+        ("delete", '{"signed": "{}", "start": "a", "t_s": 1e999, "nonce": "a", "tag": "\ud800"}', 1000),
     ):
         with pytest.raises(WireError):
             guard.open(verb, again, now_s)
     assert guard.open("delete", '{"map": "0.0.0"}', 1000) is None
     assert guard.open("delete", "[" * 1000, 1000) is None
     with pytest.raises(WireError, match="keys new maps"):
-        QuestionGuard(lambda: None).open("delete", text, 1000)
+        QuestionGuard(lambda: None, "a").open("delete", text, 1000)
     assert unsigned(text) == '{"map": "0.0.0"}' and unsigned("[" * 1000) == "[" * 1000
+
+
+def test_a_question_is_not_taken_by_another_start_of_the_base() -> None:
+    text = sign(OURS, "delete", '{"map": "0.0.0"}', 1000, "n1", "first")
+    assert QuestionGuard(lambda: OURS, "first").open("delete", text, 1010) is not None
+    with pytest.raises(OtherStartError) as refused:
+        QuestionGuard(lambda: OURS, "second").open("delete", text, 1020)
+    assert refused.value.start == "second"
+    moved = text.replace('"start": "first"', '"start": "second"')
+    with pytest.raises(WireError, match="another key"):
+        QuestionGuard(lambda: OURS, "second").open("delete", moved, 1020)
+
+
+@pytest.mark.parametrize("agent", [0, 5, 63])
+def test_a_packet_of_a_line_names_its_agent(agent: int) -> None:
+    base = SealWatch(Direction.DOWN, Opener({agent: OURS}, Direction.UP))
+    opened, _ = base.take(None, Sealer(OURS, agent, 4, Direction.UP, Suite.TAGGED).seal(packet()))
+    assert opened is not None and opened[0] == agent
+    other = Sealer(OTHER, agent, 5, Direction.UP, Suite.TAGGED)
+    for _ in range(4):
+        base.take(None, other.seal(packet()))
+    assert [f"agent {agent} has another key" in line for line in base.lines()] == [True]

@@ -20,18 +20,39 @@ def a_disparity(seed: int) -> np.ndarray:
     return np.where(rng.random((H, W)) < 0.2, 0.0, d).astype(np.float32)
 
 
-def levelled(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """x, z and column by the kernel, of a tilted camera."""
+def levelled(seed: int, disparity: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """x, z, column and known pixels by the kernel, of a tilted camera."""
     rotation = np.ascontiguousarray(level_rotation(np.array([0.1, -0.95, -0.2])).T)
     x, z = np.zeros((H, W), np.float32), np.zeros((H, W), np.float32)
     column = np.zeros((H, W), np.int16)
     offset = np.array([0.1, -0.2, 0.05, 0.3, 0.1])
-    level_kernels.level_points(a_disparity(seed), rotation, CAMERA, BF, offset, 0.25, SLOPES, x, z, column)
-    return x, z, column
+    known = np.zeros((len(SLOPES) - 1, 2), np.int32)
+    disparity = a_disparity(seed) if disparity is None else disparity
+    level_kernels.level_points(disparity, rotation, CAMERA, BF, offset, 0.25, SLOPES, x, z, column, known)
+    return x, z, column, known
+
+
+def test_known_pixels_below_the_horizon_are_counted_where_both_eyes_saw_them() -> None:
+    disparity = a_disparity(3)
+    disparity[:, :7] = 0.0  # not seen by the right eye
+    disparity[::5, 3] = 4.0  # but for errors
+    disparity[10:, 50:60] = 0.0
+    known = levelled(3, disparity)[3]
+    u, v = np.meshgrid((np.arange(W) - CAMERA[2]) / CAMERA[0], (np.arange(H) - CAMERA[3]) / CAMERA[1])
+    ray = np.stack([u, v, np.ones_like(u)], -1) @ level_rotation(np.array([0.1, -0.95, -0.2]))
+    slope = ray[..., 1] / ray[..., 0]
+    use = (ray[..., 2] < 0.0) & (np.arange(W) >= 7) & (ray[..., 0] > 0.2) & (slope >= SLOPES[0]) & (slope < SLOPES[-1])
+    of = np.clip(np.searchsorted(SLOPES, slope, side="right") - 1, 0, len(SLOPES) - 2)
+    n = len(SLOPES) - 1
+    wanted = np.stack([np.bincount(of[use & (disparity > 0)], minlength=n), np.bincount(of[use], minlength=n)], 1)
+    assert known.sum(0).tolist() == wanted.sum(0).tolist()
+    assert np.abs(known - wanted).max() <= 3  # pixels at the border of two columns: the table has 1024 steps
+    share = known[:, 0] / known[:, 1]
+    assert share.min() < 0.5 < share.max()
 
 
 def test_level_points() -> None:
-    x, z, column = levelled(1)
+    x, z, column, _ = levelled(1)
     disparity = a_disparity(1).astype(np.float64)
     u, v = np.meshgrid((np.arange(W) - CAMERA[2]) / CAMERA[0], (np.arange(H) - CAMERA[3]) / CAMERA[1])
     offset = 0.1 - 0.2 * u + 0.05 * v + 0.3 * u * u + 0.1 * u * v
@@ -49,7 +70,7 @@ def test_level_points() -> None:
 
 
 def test_counts_by_column_and_height() -> None:
-    x, z, column = levelled(2)
+    x, z, column, _ = levelled(2)
     n, bins, heights, step_m = 12, 80, 60, 0.05
     counts, sums = np.zeros((n, bins), np.int32), np.zeros((n, bins))
     level_kernels.count_columns(x, z, column, BF, counts, sums)
@@ -150,3 +171,38 @@ def test_the_path_follows_a_ramp_and_not_a_table_above_it() -> None:
     path = np.zeros(bins, np.int64)
     profile_kernels.ground_path(counts, 3, -1, 8, bf, 0.05, 0.35, 0.25, 30.0, path)
     assert np.abs(path[10:40] - truth[10:40]).max() <= 3.0
+
+
+def test_pixels_near_a_height_and_a_path() -> None:
+    rng = np.random.default_rng(5)
+    bins, heights, step_m, sigma_px = 40, 60, 0.05, 0.25
+    counts = rng.integers(0, 4, (bins, heights)).astype(np.int32)
+    sums = rng.random((2, bins, heights)) * counts
+    centres, columns = (np.arange(bins) + 0.5) * BIN_PX, np.arange(heights)
+    height_m = rng.uniform(0.1, 2.5, bins)
+    rows = height_m / step_m - 0.5
+    near = np.abs(columns - rows[:, None]) <= (1.5 + 2.0 * rows * sigma_px / centres)[:, None]
+    found, total = np.empty((2, bins), np.int64)
+    profile_kernels.count_near(counts, height_m, step_m, sigma_px, found)
+    assert np.array_equal(found, (counts * near).sum(1)) and near.any() and not near.all()
+    path = rng.integers(0, heights, bins)
+    near = np.abs(columns - path[:, None]) <= (2.0 + 3.0 * (path + 0.5) * sigma_px / centres)[:, None]
+    profile_kernels.count_path(counts, path, sigma_px, found, total)
+    assert np.array_equal(found, (counts * near).sum(1)) and np.array_equal(total, counts.sum(1))
+    used = near & (counts > 0)
+    used[:3] = used[31:] = False
+    out = np.empty((3, counts.size))
+    m = profile_kernels.cells_near(counts, *sums, path, 3, 30, sigma_px, out)
+    assert np.array_equal(
+        out[:, :m], np.stack([counts[used], sums[0][used] / counts[used], sums[1][used] / counts[used]])
+    )
+
+
+def test_unlock() -> None:
+    rng = np.random.default_rng(6)
+    raw = rng.integers(-16, 700, (9, 30)).astype(np.int16)
+    table = rng.random(16).astype(np.float32)
+    out = np.empty((9, 26), np.float32)
+    level_kernels.unlock(raw, 4, table, out)
+    raw = raw[:, 4:]
+    assert np.array_equal(out, np.where(raw > 0, ((raw + 8) >> 4) + table[(raw + 8) & 15], np.float32(0.0)))

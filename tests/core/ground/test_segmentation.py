@@ -100,6 +100,26 @@ def test_a_ramp_is_ground() -> None:
     assert (scan.free_m > 5.0).mean() > 0.9
 
 
+@pytest.mark.parametrize("roll_deg", [0.0, 180.0])
+def test_nothing_is_free_in_columns_of_which_much_is_unknown(roll_deg: float) -> None:
+    """Between the known pixels of a column something may stand."""
+    segmenter, disparity = view(up(roll_deg), level_ground, wall(4.0))
+    whole = segmenter.segment(disparity, None, up(roll_deg)).scan
+    h, w = disparity.shape
+    below = slice(h // 2, h) if roll_deg == 0.0 else slice(0, h // 2)
+    for rows, free in ((8, True), (2, False)):  # a row of so many is unknown
+        spoilt = disparity.copy()
+        spoilt[below][::rows, w // 3 : w // 2] = 0.0
+        found = segmenter.segment(spoilt, None, up(roll_deg)).scan
+        middle = (w // 3 + 6 - segmenter.camera.cx, w // 2 - 6 - segmenter.camera.cx)
+        azimuth = np.sort(np.arctan(np.array(middle) / segmenter.camera.fx) * (-1.0 if roll_deg == 0.0 else 1.0))
+        inside = (found.azimuths_rad > azimuth[0]) & (found.azimuths_rad < azimuth[1])
+        assert inside.sum() > 5 and ((found.free_m[inside] > 0.0) == free).all()
+        assert np.isfinite(found.obstacle_m[inside]).all()
+        beside = np.abs(found.azimuths_rad - azimuth.mean()) > 0.5 * np.ptp(azimuth) + 0.15
+        assert np.array_equal(found.free_m[beside] > 0.0, whole.free_m[beside] > 0.0)
+
+
 def test_a_wave_is_ground() -> None:
     def wave(_o: np.ndarray, r: np.ndarray) -> np.ndarray:
         t = level_ground(_o, r)

@@ -9,7 +9,7 @@ import pytest
 from kiteline_codec.transport.seal import Direction, Opener, Sealer, Suite
 from kiteline_codec.transport.seal_watch import SealWatch
 from kiteline_hw.links.ends import OneLinkHub
-from kiteline_hw.links.sealed_link import SealedHub, SealedLink
+from kiteline_hw.links.sealed_link import SealedHub, SealedLineHub, SealedLink
 from kiteline_hw.ports import LinkError
 from kiteline_hw.system.key_store import new_key, read_keys
 
@@ -51,11 +51,84 @@ def test_sealed_packets_both_ways(tmp_path: Path) -> None:
     assert agent.send(b"up")
     other = Sealer(keys[2], 2, 4, Direction.UP, Suite.TAGGED)
     down.inbox = [*up.sent, up.sent[0], other.seal(b"not on this link"), b"noise"]
+    assert hub.links() and hub.alive() == frozenset()  # anyone can announce a number
     assert hub.links()[1].receive() == [b"up"]
     assert hub.links()[1].send(b"down")
     up.inbox = list(down.sent)
     assert agent.receive() == [b"down"]
     assert hub.alive() == {1}
+
+
+def test_packets_of_a_flood_are_not_opened(tmp_path: Path) -> None:
+    """Each cost as much as a sound one."""
+    key, forged = bytes(32), bytes([1]) * 32
+    opener, wire = Opener({1: key}, Direction.UP), Wire()
+    link = SealedLink(wire, 1, None, SealWatch(Direction.DOWN, opener))
+    agent = Sealer(key, 1, 4, Direction.UP, Suite.ENCRYPTED)
+    stranger = Sealer(forged, 1, 5, Direction.UP, Suite.ENCRYPTED)
+    wire.inbox = [agent.seal(b"first")]
+    assert link.receive() == [b"first"]
+    for _ in range(3):
+        wire.inbox = [stranger.seal(bytes(100)) for _ in range(500)] + [agent.seal(b"sound")]
+        assert link.receive() == [b"sound"]
+    assert opener.counters.forged <= 3 * 10 and link.unopened > 1400
+    # an agent that starts again is heard within some turns
+    again = Sealer(key, 1, 6, Direction.UP, Suite.ENCRYPTED)
+    wire.inbox = [stranger.seal(bytes(100)), again.seal(b"again"), *(stranger.seal(bytes(100)) for _ in range(100))]
+    assert link.receive() == [b"again"]
+    wire.inbox = [*(stranger.seal(bytes(100)) for _ in range(100)), again.seal(b"more")]
+    assert link.receive() == [b"more"]
+
+
+@pytest.mark.parametrize("first", [Suite.TAGGED << 7 | 1, 0xFF], ids=["of the agent", "of nobody"])
+def test_a_flood_of_tagged_packets_is_not_opened_either(first: int) -> None:
+    """Their first byte alone made them familiar."""
+    opener, wire = Opener({1: bytes(32)}, Direction.UP), Wire()
+    link = SealedLink(wire, 1, None, SealWatch(Direction.DOWN, opener))
+    agent = Sealer(bytes(32), 1, 4, Direction.UP, Suite.ENCRYPTED)
+    wire.inbox = [agent.seal(b"first")]
+    assert link.receive() == [b"first"]
+    wire.inbox = [*(bytes((first, 5, n)) + bytes(1000) for n in range(100)), agent.seal(b"sound")]
+    assert link.receive() == [b"sound"]
+    assert opener.counters.refused <= 10 and link.unopened >= 90
+
+
+def test_tagged_packets_of_an_agent_that_was_heard_all_open() -> None:
+    opener, wire = Opener({1: bytes(32)}, Direction.UP), Wire()
+    link = SealedLink(wire, 1, None, SealWatch(Direction.DOWN, opener))
+    agent = Sealer(bytes(32), 1, 4, Direction.UP, Suite.TAGGED)
+    wire.inbox = [agent.seal(b"first")]
+    assert link.receive() == [b"first"]
+    wire.inbox = [agent.seal(bytes((n,))) for n in range(50)]
+    assert link.receive() == [bytes((n,)) for n in range(50)]
+
+
+def test_the_agent_of_a_line_is_the_one_that_sound_packets_name(tmp_path: Path) -> None:
+    path = tmp_path / "keys"
+    for agent in (2, 3):
+        new_key(path, agent)
+    keys, line = read_keys(path), Wire()
+    made: list[int] = []
+
+    def sealer(agent: int) -> Sealer:
+        made.append(agent)
+        return Sealer(keys[agent], agent, 9, Direction.DOWN, Suite.TAGGED)
+
+    hub = SealedLineHub(OneLinkHub(line, 0), sealer, SealWatch(Direction.DOWN, Opener(keys, Direction.UP)))
+    assert hub.links() == {} and hub.alive() == frozenset()
+    ups = {agent: Sealer(keys[agent], agent, 4, Direction.UP, Suite.TAGGED) for agent in keys}
+    line.inbox = [b"noise", ups[3].seal(b"one"), ups[3].seal(b"two")]
+    assert hub.alive() == {3}
+    assert hub.links()[3].receive() == [b"one", b"two"] and hub.links()[3].receive() == []
+    line.sent.clear()
+    assert hub.links()[3].send(b"down")
+    assert Opener(keys, Direction.DOWN).open(line.sent[0]) == (3, b"down")
+    line.inbox = [ups[2].seal(b"another drone")]
+    assert list(hub.links()) == [2] and hub.links()[2].receive() == [b"another drone"]
+    line.inbox = [ups[3].seal(b"again")]
+    assert list(hub.links()) == [3] and made == [3, 2]  # a sealer goes on counting
+    hub.renew(3)
+    assert hub.links() == {}
 
 
 def test_an_agent_without_a_key_is_left_out(tmp_path: Path) -> None:

@@ -15,9 +15,19 @@ import zenoh
 from kiteline_hw.links.sealing import is_loopback, sealing_of
 from kiteline_hw.links.zenoh_access import Instances
 from kiteline_hw.links.zenoh_link import ZenohHub, ZenohLink
-from kiteline_hw.links.zenoh_session import close_session, direct, open_session
+from kiteline_hw.links.zenoh_session import close_session, direct, open_session, session_config
 from kiteline_hw.ports import LinkError
-from kiteline_hw.system.key_store import default_path, first_keys, new_code, new_maps_key, pair, read_file, read_keys
+from kiteline_hw.system.key_store import (
+    MAPS,
+    default_path,
+    first_keys,
+    login_of,
+    new_code,
+    new_maps_key,
+    pair,
+    read_file,
+    read_keys,
+)
 from kiteline_hw.system.process import state_folder
 
 NETWORK, LOOPBACK = "zenoh:tcp/0.0.0.0:7447", "zenoh:tcp/127.0.0.1:7447"
@@ -49,12 +59,24 @@ def test_an_agent_on_a_network_is_paired_first() -> None:
     assert sealing_of("zenoh:tcp/10.0.0.1:7447", "agent", 3, "", insecure=False).key == str(default_path())
 
 
+@pytest.mark.parametrize(
+    "link", ["serial:/dev/ttyUSB0:57600", "mavlink:udp:127.0.0.1:14550", "zenoh:router/tcp/127.0.0.1:1"]
+)
+def test_radios_tunnels_and_routers_are_sealed_as_networks_are(link: str) -> None:
+    with pytest.raises(LinkError, match="kiteline keys pair 3"):
+        sealing_of(link, "agent", 3, "", insecure=False)
+    base = sealing_of(link, "base", 0, "", insecure=False)
+    assert base.key == str(default_path()) and "kiteline keys pair" in base.lines[0]
+    assert sealing_of(link, "agent", 3, "", insecure=False).key == base.key
+    loud = sealing_of(link, "agent", 3, "", insecure=True)
+    assert loud.key == "" and "NOT SEALED" in loud.lines[0]
+
+
 @pytest.mark.parametrize("role", ["agent", "base"])
-def test_one_machine_cables_and_insecure_links_are_not_sealed_and_it_is_said(role: Any) -> None:
+def test_one_machine_and_insecure_links_are_not_sealed_and_it_is_said(role: Any) -> None:
     assert sealing_of("none", role, 0, "", insecure=False) == sealing_of("none", role, 0, "", insecure=True)
     assert sealing_of(LOOPBACK, role, 0, "", insecure=False).key == ""
     assert "this machine" in sealing_of(LOOPBACK, role, 0, "", insecure=False).lines[0]
-    assert "not sealed" in sealing_of("serial:/dev/ttyUSB0:57600", role, 0, "", insecure=False).lines[0]
     loud = sealing_of(NETWORK, role, 0, "", insecure=True)
     assert loud.key == "" and "NOT SEALED" in loud.lines[0]
     assert sealing_of(NETWORK, role, 0, "some.key", insecure=False).key == "some.key"
@@ -66,7 +88,8 @@ def test_one_machine_cables_and_insecure_links_are_not_sealed_and_it_is_said(rol
 @pytest.mark.parametrize(
     ("link", "own"),
     [("zenoh:tcp/127.0.0.1:1", True), ("zenoh:tcp/[::1]:1", True), ("zenoh:udp/localhost:1", True),
-     ("zenoh:router/tcp/127.0.0.1:1", True), ("zenoh:tcp/0.0.0.0:1", False), ("zenoh:tcp/[::]:1", False),
+     ("zenoh:router/tcp/127.0.0.1:1", False), ("zenoh:tcp/127.0.0.1:1#iface=lo", True),
+     ("mavlink:udp:127.0.0.1:1", False), ("zenoh:tcp/0.0.0.0:1", False), ("zenoh:tcp/[::]:1", False),
      ("zenoh:tcp/base.local:1", False), ("zenoh:tcp/127.0.0.1.evil.org:1", False), ("zenoh:tcp/10.0.0.1:1", False)],
 )  # fmt: skip
 def test_loopback_is_known_by_its_address(link: str, own: bool) -> None:
@@ -190,3 +213,21 @@ def test_what_is_too_long_is_dropped_before_it_takes_memory(endpoint: str) -> No
             assert sum(map(len, hub.links()[3].receive())) <= 1 << 20
         finally:
             close_session(stranger)
+
+
+def test_strangers_take_up_no_place_of_a_base_for_paired_agents_alone(endpoint: str) -> None:
+    """Anyone may open the 96 sessions of another base, and keep agents out."""
+    ours = login_of(3, bytes(32))
+    with ZenohHub(endpoint, logins={**ours, **login_of(MAPS, bytes(32))}) as hub:
+        config = session_config(endpoint, "client", 2000)
+        config.insert_json5("connect/timeout_ms", "300")
+        for logins in ({}, {"3": "guessed"}, {"4": ours["3"]}):
+            for user, password in logins.items():
+                config.insert_json5("transport/auth/usrpwd/user", f'"{user}"')
+                config.insert_json5("transport/auth/usrpwd/password", f'"{password}"')
+            with pytest.raises(zenoh.ZError):
+                zenoh.open(config)
+        with ZenohLink(endpoint, 3, logins=ours) as agent, ZenohLink(endpoint, 4, logins=login_of(4, bytes([1]) * 32)):
+            until(lambda: agent.connected and hub.alive() == {3}, 20.0)
+    with ZenohHub(endpoint) as hub, ZenohLink(endpoint, 3, logins=ours) as agent:  # and one for anyone
+        until(lambda: agent.connected and hub.alive() == {3})

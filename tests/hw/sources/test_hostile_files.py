@@ -53,6 +53,17 @@ def test_images_are_measured_before_they_are_decoded() -> None:
     assert rss_mib() - before < 64
 
 
+def test_a_png_that_ends_before_its_image_is_not_decoded() -> None:
+    """The decoder goes on behind the end: a chunk there took 4 GiB and ten seconds."""
+    sound, end = png(64, 64), struct.pack(">I", 0) + b"IEND" + bytes(4)
+    header = sound[: sound.index(b"IDAT") - 4]
+    for data in (header + end + struct.pack(">I", 1 << 28) + b"IDAT" + bytes(64), header + end):
+        with pytest.raises(BadImage):
+            decode_grey(EncodedImage(data, "png"))
+        assert size_of(data) is None
+    assert size_of(sound) == (64, 64)
+
+
 @pytest.mark.parametrize("ending", [".png", ".jpg", ".bmp", ".pgm", ".ppm", ".tiff", ".webp"])
 @pytest.mark.parametrize("channels", [1, 3])
 def test_the_size_of_each_format_is_known_from_its_head(ending: str, channels: int) -> None:
@@ -194,3 +205,14 @@ def test_a_sound_rig_is_read_to_the_last_bit() -> None:
     again, imu = rig_from_json(json.loads(json.dumps(rig_to_json(rig, None))))
     assert imu is None and again.T_c_r is not None
     assert again.T_c_r.tobytes() == pose.tobytes() and again.left == rig.left
+
+
+@pytest.mark.parametrize("claimed", [1 << 24, 1 << 31, (1 << 32) - 1])
+def test_a_chunk_of_a_png_that_claims_gigabytes_is_refused_before_it_takes_them(claimed: int) -> None:
+    """77 bytes took 4 GiB and two seconds."""
+    data = bytearray(cv2.imencode(".png", np.zeros((48, 64), np.uint8))[1].tobytes())
+    at = data.index(b"IDAT") - 4
+    data[at : at + 4] = claimed.to_bytes(4, "big")
+    assert size_of(bytes(data)) is None
+    with pytest.raises(BadImage, match="no size"):
+        decode_grey(EncodedImage(bytes(data), "png"))

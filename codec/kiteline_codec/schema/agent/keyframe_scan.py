@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from kiteline_codec.coding import quantise
 from kiteline_codec.coding import scan_kernels as kernels
 from kiteline_codec.coding.packing import Reader, WireError, Writer, unzigzag, zigzag
-from kiteline_codec.schema.poses import read_coarse_pose, write_coarse_pose
+from kiteline_codec.schema.poses import read_coarse_pose, read_direction, write_coarse_pose, write_direction
 from kiteline_codec.schema.record import IdOf, Key, Priority, Record, register
 from kiteline_core.geometry import se3
 from kiteline_core.ground.column_scan import MAX_COLUMNS, ColumnScan, level_rotation
@@ -64,10 +64,7 @@ class KeyframeScan(Record):
         if (self.T_k_s is None) != (self.part == 0):
             raise ValueError("the scan of a frame after its keyframe has a pose, and only that")
         if self.T_k_s is None:
-            half, a, b = quantise.direction_codes(scan.up_c)
-            out.u8(half)
-            out.signed(a)
-            out.signed(b)
+            write_direction(out, scan.up_c)
         else:
             write_coarse_pose(out, _levelled(self.T_k_s, scan.up_c))
         first, step = round(scan.azimuth0_rad * _AZIMUTH_STEPS), round(scan.azimuth_step_rad * _STEP_STEPS)
@@ -102,7 +99,9 @@ class KeyframeScan(Record):
     @classmethod
     def read(cls, source: Reader, key: Key) -> Self:
         """The record of a key and a code. Raises WireError."""
-        up_c, T_k_s = (_read_up(source), None) if key.part == 0 else (_LEVEL_UP_C.copy(), read_coarse_pose(source))
+        up_c, T_k_s = (
+            (read_direction(source), None) if key.part == 0 else (_LEVEL_UP_C.copy(), read_coarse_pose(source))
+        )
         first, step, height = source.signed(_MAX_AZIMUTH), source.varint(_STEP_STEPS), source.varint(_MAX_HEIGHT)
         n = source.varint(MAX_COLUMNS)
         if not step or not n:
@@ -133,16 +132,6 @@ class KeyframeScan(Record):
             unzigzag(height - 1) / _HEIGHT_STEPS if height else float("nan"),
         )  # fmt: skip
         return cls(KeyframeId(key.id), scan, labels, key.part, T_k_s)
-
-
-def _read_up(source: Reader) -> F64:
-    half = source.u8()
-    if half > 1:
-        raise WireError(f"a half is 0 or 1, found {half}")
-    try:
-        return quantise.direction(half, *(source.signed(quantise.DIRECTION_STEPS) for _ in range(2)))
-    except ValueError as e:
-        raise WireError(str(e)) from None
 
 
 def _levelled(T_k_s: F64, up_c: F64) -> F64:

@@ -8,9 +8,12 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_codec.schema.columns import Columns, Landmarks
+from kiteline_codec.coding.packing import Writer
+from kiteline_codec.schema.columns import Columns, Landmarks, write_landmarks
 from kiteline_codec.schema.record import MAX_PARTS, IdOf, Priority, Record, register
 from kiteline_core.ids import KeyframeId
+
+I64 = NDArray[np.int64]
 
 
 @register
@@ -34,3 +37,8 @@ class Observations(Record):
     inv_depth: NDArray[np.float32]
     octave: NDArray[np.uint8]
     point: NDArray[np.int64]
+
+    def write_rows(self, out: Writer, codes: I64, rows: I64) -> None:
+        """Append all but the key of some rows. codes: (5,n) of the columns of all."""
+        self.COLUMNS.write_codes(out, codes.take(rows, 1))
+        write_landmarks(out, self.point.take(rows))

@@ -1,0 +1,188 @@
+"""The filter over a flight: odometry moves it, tracked pixels correct it, landmarks enter late and leave."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_agent.ekf import landmark_update
+from kiteline_agent.ekf.filter_state import FilterState, Motion
+from kiteline_agent.ekf.ray_initialisation import initialise, largest_parallax, supporting_views
+from kiteline_agent.ekf.ray_tracks import RayTracks
+from kiteline_agent.ekf_config import EkfConfig
+from kiteline_core.geometry.cameras import RectifiedCamera
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class FrameUpdate:
+    """What a frame did: ids of landmarks that were compatible, rejected, and new; whether it became a past view."""
+
+    compatible: I64
+    rejected: I64
+    entered: I64
+    is_view: bool
+
+
+class EkfSlam:
+    """Estimates pose, odometry scale and landmarks. Sans-IO, deterministic."""
+
+    def __init__(self, camera: RectifiedCamera, config: EkfConfig) -> None:
+        """The body starts at the origin of o."""
+        self._config = config
+        self._focal = np.array([camera.fx, camera.fy])
+        self._centre = np.array([camera.cx, camera.cy])
+        self._sigma = config.sigma_px / camera.fx
+        self.state = FilterState(camera.T_b_c, config)
+        self.slot_of: dict[int, int] = {}  # landmark's slot by the id of its track
+        self._ids = np.full(config.landmarks, -1, np.int64)
+        self._good = np.zeros(config.landmarks, np.int64)
+        self._bad = np.zeros(config.landmarks, np.int64)
+        self._updated_at = np.zeros(config.landmarks, np.int64)  # frame of the last update
+        self._seen_at = np.zeros(config.landmarks, np.int64)
+        self._tracks = RayTracks(config.views)
+        self._view_way = np.zeros(config.views)  # m travelled up to each past view
+        self._way = 0.0
+        self._frame = 0
+
+    def predict(self, motion: Motion) -> None:
+        """Move by odometry."""
+        self.state.propagate(motion)
+        self._way += float(np.linalg.norm(motion.T_c0_c1[:3, 3]))
+
+    def update(self, ids: I64, uv: F64) -> FrameUpdate:
+        """Correct the state by the pixels (n,2) of tracks (n,), ids increasing; new landmarks enter."""
+        self._frame += 1
+        xy = (uv - self._centre) / self._focal
+        slots = np.array([self.slot_of.get(i, -1) for i in ids.tolist()], np.int64)
+        good, bad = self._update_landmarks(slots, xy)
+        fresh = np.flatnonzero(slots < 0)
+        entered: I64 = np.zeros(0, np.int64)
+        is_view = self._is_view_due()
+        if is_view:
+            if int(good.sum()) < self._config.in_view:
+                entered = self._enter(ids[fresh], xy[fresh])
+            self._add_view(ids[fresh], xy[fresh])
+        return FrameUpdate(ids[good], ids[bad], entered, is_view)
+
+    def landmark(self, track: int) -> F64 | None:
+        """Position (3,) in o of the landmark of a track; None without one."""
+        slot = self.slot_of.get(track)
+        return None if slot is None else self.state.points[slot].copy()
+
+    def forget(self, track: int) -> None:
+        """Drop the landmark of a track."""
+        slot = self.slot_of.pop(track)
+        self.state.drop_landmark(slot)
+        self._ids[slot] = -1
+
+    # steps
+
+    def _update_landmarks(self, slots: I64, xy: F64) -> tuple[Bools, Bools]:
+        """Update by the sightings of landmarks; masks (n,) of the compatible and of the rejected ones."""
+        good, bad = np.zeros(len(slots), np.bool_), np.zeros(len(slots), np.bool_)
+        at = np.flatnonzero(slots >= 0)
+        if not len(at):
+            return good, bad
+        found, ahead = landmark_update.innovation(self.state, slots[at], xy[at])
+        bad[at[~ahead]] = True
+        at = at[ahead]
+        if len(at):
+            fits = landmark_update.compatible(self.state, found, self._sigma, self._config)
+            good[at[fits]] = True
+            bad[at[~fits]] = True
+            # Those that waited longest: all that are in view get their turn.
+            waiting = np.flatnonzero(fits)
+            order = np.argsort(self._updated_at[found.slots[waiting]], kind="stable")
+            chosen = np.sort(waiting[order[: self._config.updated]])
+            self._updated_at[found.slots[chosen]] = self._frame
+            part = landmark_update.Innovation(found.slots[chosen], found.residual[chosen], found.M[chosen])
+            landmark_update.update(self.state, part, self._sigma)
+        self._good[slots[good]] += 1
+        self._bad[slots[bad]] += 1
+        self._seen_at[slots[good]] = self._frame
+        for slot in slots[bad][self._bad[slots[bad]] - self._good[slots[bad]] > self._config.misses].tolist():
+            self.forget(int(self._ids[slot]))
+        return good, bad
+
+    def _is_view_due(self) -> bool:
+        used = self.state.view_used
+        return not used.any() or self._way - float(self._view_way[used].max()) >= self._config.view_m
+
+    def _enter(self, ids: I64, xy: F64) -> I64:
+        """Let tracks enter that are seen under enough parallax; returns their ids."""
+        config, state = self._config, self.state
+        known, rows = self._tracks.find(ids)
+        enough = self._tracks.seen[rows].sum(axis=1) >= config.least_rays - 1
+        known, rows = known[enough], rows[enough]
+        if not len(known):
+            return np.zeros(0, np.int64)
+        poses = np.concatenate([state.view_T_o_c, state.T_o_c[None]])
+        points = np.concatenate([self._tracks.xy[rows], xy[known][:, None]], axis=1)
+        seen = np.concatenate([self._tracks.seen[rows], np.ones((len(rows), 1), np.bool_)], axis=1)
+        rays = np.einsum("vij,nvj->nvi", poses[:, :3, :2], points) + poses[:, :3, 2]
+        rays /= np.linalg.norm(rays, axis=2, keepdims=True)
+        wide = np.flatnonzero(largest_parallax(rays, seen) > config.parallax_rad)
+        if not len(wide):
+            return np.zeros(0, np.int64)
+        known, points, rays = known[wide], points[wide], rays[wide]
+        seen = supporting_views(poses[:, :3, 3], rays, seen[wide], config.ray_px / float(self._focal[0]))
+        parallax = largest_parallax(rays, seen)
+        order = np.argsort(-parallax, kind="stable")
+        enough = (parallax > config.parallax_rad) & (seen.sum(axis=1) >= config.least_rays)
+        order = order[enough[order]][: config.entries]
+        entered = []
+        for k in order.tolist():
+            views = np.flatnonzero(seen[k, :-1])
+            at = np.append(views, config.views)
+            new = initialise(state, views, points[k, at], self._sigma, config)
+            slot = self._free_slot() if new is not None else None
+            if new is None or slot is None:
+                continue
+            state.add_landmark(slot, new.point, new.across, new.cov)
+            track = int(ids[known[k]])
+            self.slot_of[track] = slot
+            self._ids[slot], self._good[slot], self._bad[slot] = track, 0, 0
+            self._updated_at[slot] = self._seen_at[slot] = self._frame
+            entered.append(track)
+        out = np.array(sorted(entered), np.int64)
+        self._tracks.drop(out)
+        return out
+
+    def _free_slot(self) -> int | None:
+        """A free slot; if there is none, that of the least seen landmark out of view, if any."""
+        free = np.flatnonzero(~self.state.used)
+        if len(free):
+            return int(free[0])
+        old = np.flatnonzero(self._seen_at < self._frame - 1)
+        if not len(old):
+            return None
+        slot = int(old[np.argmin(self._good[old])])
+        self.forget(int(self._ids[slot]))
+        return slot
+
+    def _add_view(self, ids: I64, xy: F64) -> None:
+        """Keep the camera's pose and what it sees of tracks without a landmark."""
+        left = np.array([int(i) not in self.slot_of for i in ids.tolist()], np.bool_)
+        free = np.flatnonzero(~self.state.view_used)
+        view = int(free[0]) if len(free) else self._view_to_drop()
+        if not len(free):
+            self.state.drop_view(view)
+            self._tracks.drop_view(view)
+        self.state.add_view(view)
+        self._view_way[view] = self._way
+        self._tracks.add(view, ids[left], xy[left])
+
+    def _view_to_drop(self) -> int:
+        """The view without which the others lie most evenly over the logarithm of the way since."""
+        order = np.argsort(self._view_way, kind="stable")
+        way = self._view_way[order]
+        if self._tracks.seen[:, order[0]].sum() < 4:
+            return int(order[0])
+        gap = (way[2:] - way[:-2]) / (self._way - way[1:-1] + self._config.view_m)
+        return int(order[1 + int(np.argmin(gap))])

@@ -1,0 +1,198 @@
+"""State of the filter: camera pose, odometry scale, past views, landmarks, and their joint covariance.
+
+Errors are right-invariant: with R, p of the estimate, the true rotation is exp(xi_R) R, the true position
+exp(xi_R) p + xi_p, that of a landmark exp(xi_R) l + xi_l. Then an update never claims to know the heading and place
+of the whole map, which nothing measures; errors that add up make a filter claim just that.
+Source: A. Barrau, S. Bonnabel, "An EKF-SLAM algorithm with consistency properties", 2015.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_agent.ekf import covariance_kernels as kernels
+from kiteline_agent.ekf_config import EkfConfig
+from kiteline_core.geometry import se3
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+SCALE = 6  # row of the odometry's scale, after position (3) and rotation (3) of the camera
+_VIEWS = 7  # first row of the past views, six each
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """Motion of the camera between two frames by odometry.
+
+    T_c0_c1: (4,4). scaled: (3,) m in c0, the part of the translation that the odometry's scale multiplies. cov: (6,6)
+    of its white error: translation along the axes of c0, rotation about those of c1.
+    """
+
+    T_c0_c1: F64
+    scaled: F64
+    cov: F64
+
+
+class FilterState:
+    """The estimate and its covariance. Rows of free slots are zero."""
+
+    def __init__(self, T_o_c: F64, config: EkfConfig) -> None:
+        """T_o_c: (4,4) the first camera pose, known exactly: it defines o."""
+        self.T_o_c = T_o_c.copy()
+        self.scale = 1.0  # true way over that by odometry
+        self.view_T_o_c = np.tile(np.eye(4), (config.views, 1, 1))
+        self.view_used: Bools = np.zeros(config.views, np.bool_)
+        self.points = np.zeros((config.landmarks, 3))  # (n,3) landmarks in o
+        self.used: Bools = np.zeros(config.landmarks, np.bool_)
+        self._first = _VIEWS + 6 * config.views
+        self.P = np.zeros((self._first + 3 * config.landmarks,) * 2)
+        self.P[SCALE, SCALE] = config.scale_sigma**2
+        self._size = self._first
+
+    @property
+    def size(self) -> int:
+        """Rows up to the last landmark."""
+        return self._size
+
+    def view_row(self, view: int) -> int:
+        """First row of a past view: position, then rotation."""
+        return _VIEWS + 6 * view
+
+    def landmark_row(self, slot: int | I64) -> int | I64:
+        """First row of a landmark."""
+        return self._first + 3 * slot
+
+    def rows(self, index: I64) -> F64:
+        """Whole rows (m, size) of the covariance."""
+        out = np.empty((len(index), self._size))
+        kernels.symmetric_rows(self.P, self._size, index, out)
+        return out
+
+    def block(self, first: int, count: int) -> F64:
+        """A symmetric block (count,count) on the diagonal."""
+        lower = np.tril(self.P[first : first + count, first : first + count])
+        return np.asarray(lower + np.tril(lower, -1).T)
+
+    # changes
+
+    def propagate(self, motion: Motion) -> None:
+        """Move the camera by odometry."""
+        n, R0 = self._size, self.T_o_c[:3, :3]
+        moved = motion.T_c0_c1.copy()
+        moved[:3, 3] += (self.scale - 1.0) * motion.scaled
+        self.T_o_c = se3.orthonormalise(self.T_o_c @ moved)
+        R1, p1 = self.T_o_c[:3, :3], self.T_o_c[:3, 3]
+        # An error of the scale moves the position.
+        along = self.scale * (R0 @ motion.scaled)
+        scale_row = self.rows(np.array([SCALE]))[0]
+        for i in range(3):
+            self.P[i, : i + 1] += along[i] * scale_row[: i + 1] + scale_row[i] * along[: i + 1]
+            self.P[i, : i + 1] += along[i] * scale_row[SCALE] * along[: i + 1]
+            self.P[3:n, i] += along[i] * scale_row[3:n]
+        # White errors: one of the rotation also moves landmarks relative to the camera's heading.
+        factor = np.linalg.cholesky(motion.cov + 1e-18 * np.eye(6))
+        turned = R1 @ factor[3:]  # (3,6)
+        noise = np.zeros((6, n))
+        noise[:, :3] = (R0 @ factor[:3] + np.cross(p1, turned, axisb=0, axisc=0)).T
+        noise[:, 3:6] = turned.T
+        count = (n - self._first) // 3
+        noise[:, self._first :] = np.cross(self.points[None, :count], turned.T[:, None]).reshape(6, -1)
+        kernels.add_rows(self.P, n, noise, 1.0)
+
+    def correct(self, change: F64) -> None:
+        """Apply a correction (size,) in the coordinates of the error."""
+        turn = se3.so3_exp(change[3:6])
+        self.T_o_c = _corrected(self.T_o_c, change[:6])
+        self.scale *= float(np.exp(change[SCALE]))
+        for view in np.flatnonzero(self.view_used):
+            row = self.view_row(int(view))
+            self.view_T_o_c[view] = _corrected(self.view_T_o_c[view], change[row : row + 6])
+        count = (self._size - self._first) // 3
+        used = self.used[:count]
+        moved = change[self._first : self._size].reshape(-1, 3) @ _jacobian(change[3:6]).T
+        self.points[:count][used] = (self.points[:count] @ turn.T + moved)[used]
+
+    def update(self, rows: F64, L: F64, white: F64) -> None:
+        """Kalman update. rows: (m,size) H P, replaced. L: (m,m), L L^T = H P H^T + R. white: L^-1 residual."""
+        m = len(rows)
+        kernels.whiten_rows(L, m, rows)
+        change = np.empty(self._size)
+        kernels.weighted_sum(rows, m, white, change)
+        kernels.add_rows(self.P, self._size, rows, -1.0)
+        self.correct(change)
+
+    def add_view(self, view: int) -> None:
+        """Keep the camera's pose as a past view."""
+        rows = self.rows(np.arange(6))
+        first = self.view_row(view)
+        for k in range(6):
+            row = rows[k].copy()
+            row[first : first + 6] = rows[k, :6]
+            kernels.set_row(self.P, self._size, first + k, row)
+        self.view_T_o_c[view] = self.T_o_c
+        self.view_used[view] = True
+
+    def drop_view(self, view: int) -> None:
+        """Forget a past view."""
+        self._clear(self.view_row(view), 6)
+        self.view_used[view] = False
+
+    def add_landmark(self, slot: int, point: F64, across: F64, cov: F64) -> None:
+        """Add a landmark in a free slot. across: (3,size) covariance with the state; cov: (3,3)."""
+        first = self._first + 3 * slot
+        before = self._size
+        self._size = max(self._size, first + 3)
+        for k in range(3):
+            row = np.zeros(self._size)
+            row[:before] = across[k]
+            row[first : first + 3] = cov[k]
+            kernels.set_row(self.P, self._size, first + k, row)
+        self.points[slot] = point
+        self.used[slot] = True
+
+    def drop_landmark(self, slot: int) -> None:
+        """Forget a landmark."""
+        self._clear(self._first + 3 * slot, 3)
+        self.used[slot] = False
+        self.points[slot] = 0.0
+
+    def _clear(self, first: int, count: int) -> None:
+        none = np.zeros(self._size)
+        for k in range(count):
+            kernels.set_row(self.P, self._size, first + k, none)
+
+    # what is known
+
+    def pose_covariance(self, T_c_b: F64) -> F64:
+        """Covariance (6,6) of the body's pose: translation in o, rotation about the body's axes. T_c_b: (4,4)."""
+        R, p_b = self.T_o_c[:3, :3] @ T_c_b[:3, :3], (self.T_o_c @ T_c_b)[:3, 3]
+        to_error = np.zeros((6, 6))
+        to_error[:3, :3], to_error[:3, 3:], to_error[3:, 3:] = np.eye(3), -se3.skew(p_b), R.T
+        return np.asarray(to_error @ self.block(0, 6) @ to_error.T)
+
+    def landmark_covariance(self, slot: int) -> F64:
+        """Covariance (3,3) of a landmark in o."""
+        rows = np.array([3, 4, 5, *(self._first + 3 * slot + np.arange(3))])
+        both = self.rows(rows)[:, rows]
+        to_error = np.concatenate([-se3.skew(self.points[slot]), np.eye(3)], axis=1)
+        return np.asarray(to_error @ both @ to_error.T)
+
+
+def _jacobian(turn: F64) -> F64:
+    """Left Jacobian (3,3) of a small rotation, to second order."""
+    k = se3.skew(turn)
+    return np.asarray(np.eye(3) + 0.5 * k + k @ k / 6.0)
+
+
+def _corrected(T: F64, change: F64) -> F64:
+    """A pose (4,4) after a correction (6,): position, rotation."""
+    turn = se3.so3_exp(change[3:])
+    out = np.eye(4)
+    out[:3, :3] = turn @ T[:3, :3]
+    out[:3, 3] = turn @ T[:3, 3] + _jacobian(change[3:]) @ change[:3]
+    return out

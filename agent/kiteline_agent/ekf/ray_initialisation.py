@@ -1,0 +1,131 @@
+"""Delayed initialisation of landmarks: the point nearest to its rays, with its covariance, tested before it enters.
+
+Source: "Monocular EKF-SLAM with delayed landmark initialisation" (the analytical initialisation). The covariance is
+that of the linearised pixels given the poses in the state; what the rays say beyond the point tests them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_agent.ekf.filter_state import FilterState
+from kiteline_agent.ekf.ray_kernels import position_by_rays
+from kiteline_agent.ekf_config import EkfConfig
+from kiteline_core.geometry import se3
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class NewLandmark:
+    """A landmark that may enter. across: (3,size) covariance with the state. cov: (3,3)."""
+
+    point: F64
+    across: F64
+    cov: F64
+
+
+def nearest_points(centres: F64, rays: F64, seen: Bools) -> tuple[F64, Bools]:
+    """Point (n,3) nearest to the rays of each of n landmarks, and whether it is well defined (n,).
+
+    centres: (v,3) camera centres. rays: (n,v,3) unit directions. seen: (n,v).
+    """
+    across = (np.eye(3) - rays[..., :, None] * rays[..., None, :]) * seen[..., None, None]
+    a = across.sum(axis=1)
+    b = np.einsum("nvij,vj->ni", across, centres)
+    good = np.abs(np.linalg.det(a)) > 1e-9
+    a[~good] = np.eye(3)
+    return np.asarray(np.linalg.solve(a, b[..., None])[..., 0]), good
+
+
+def supporting_views(centres: F64, rays: F64, seen: Bools, tolerance: float) -> Bools:
+    """Which views (n,v) agree with the last one on a point; rays far from it are wrong matches.
+
+    Each other view in turn gives a point with the last one; the one with most rays near it counts.
+    centres: (v,3). rays: (n,v,3) unit directions. seen: (n,v). tolerance: rad.
+    """
+    n, v = seen.shape
+    best: Bools = np.zeros((n, v), np.bool_)
+    most = np.zeros(n, np.int64)
+    for other in range(v - 1):
+        pair = [other, v - 1]
+        point, good = nearest_points(centres[pair], rays[:, pair], seen[:, pair])
+        to_point = point[:, None] - centres
+        along = np.einsum("nvi,nvi->nv", to_point, rays)
+        off = np.linalg.norm(to_point - along[..., None] * rays, axis=2)
+        near = seen & (along > 0.0) & (off < tolerance * along) & (good & seen[:, other])[:, None]
+        count = near.sum(axis=1) * near[:, -1]
+        better = count > most
+        best[better], most[better] = near[better], count[better]
+    return best
+
+
+def largest_parallax(rays: F64, seen: Bools) -> F64:
+    """Largest angle (n,) in rad between the last view's ray and another one. rays: (n,v,3). seen: (n,v)."""
+    cosine = np.einsum("nvj,nj->nv", rays, rays[:, -1])
+    return np.asarray(np.arccos(np.clip(np.where(seen, cosine, 1.0).min(axis=1), -1.0, 1.0)))
+
+
+def project(xy: F64, T_o_c: F64, point: F64) -> tuple[F64, F64, F64]:
+    """Residual (v,2) of normalised image points (v,2), Jacobian (v,2,3) by the point, depths (v,). T_o_c: (v,4,4)."""
+    local = np.einsum("vji,vj->vi", T_o_c[:, :3, :3], point - T_o_c[:, :3, 3])
+    z = local[:, 2]
+    safe = np.where(z > 1e-3, z, 1e-3)
+    ahead = local[:, :2] / safe[:, None]
+    jacobian = (T_o_c[:, :3, :2] - T_o_c[:, :3, 2:3] * ahead[:, None, :]).transpose(0, 2, 1) / safe[:, None, None]
+    return xy - ahead, jacobian, z
+
+
+def initialise(state: FilterState, views: I64, xy: F64, sigma: float, config: EkfConfig) -> NewLandmark | None:
+    """Position a landmark by its rays; None if they do not meet, or do not tell its distance.
+
+    views: (v,) past views that saw it. xy: (v+1,2) x/z, y/z in them, then in the camera now. sigma: deviation of these.
+    """
+    poses = np.concatenate([state.view_T_o_c[views], state.T_o_c[None]])
+    point = np.empty(3)
+    if not position_by_rays(xy, poses, point):
+        return None
+    residual, by_point, z = project(xy, poses, point)
+    if not (z > 1e-3).all():
+        return None
+    # by_point (xi_l - xi_pi - [l]x (xi_R - xi_Ri)); of the camera now, the rotations cancel.
+    turned = by_point @ se3.skew(point)
+    index = [np.arange(6)]
+    by_state = np.zeros((len(xy), 2, 6 + 6 * len(views)))
+    by_state[-1, :, :3] = -by_point[-1]
+    for k, view in enumerate(views):
+        index.append(state.view_row(int(view)) + np.arange(6))
+        at = 6 + 6 * k
+        by_state[k, :, at : at + 3] = -by_point[k]
+        by_state[k, :, at + 3 : at + 6] = turned[k]
+        by_state[k, :, 3:6] = -turned[k]
+    q, r = np.linalg.qr(by_point.reshape(-1, 3), mode="complete")
+    if np.abs(np.diagonal(r)).min() < 1e-9:
+        return None
+    rows = np.concatenate(index)
+    P = state.rows(rows)
+    flat = q.T @ by_state.reshape(-1, by_state.shape[2])
+    error = q.T @ residual.ravel()
+    block = P[:, rows]
+    rest, beyond = flat[3:], error[3:]
+    spread = rest @ block @ rest.T + sigma * sigma * np.eye(len(rest))
+    if beyond @ np.linalg.solve(spread, beyond) > config.residual_gate * len(rest):
+        return None
+    inverse = np.linalg.inv(r[:3])
+    gain = -inverse @ flat[:3]
+    cov = gain @ block @ gain.T + sigma * sigma * inverse @ inverse.T
+    # The distance from the camera is judged without what moves camera and landmark alike.
+    to_point = point - state.T_o_c[:3, 3]
+    distance = float(np.linalg.norm(to_point))
+    ray = to_point / distance
+    relative = gain.copy()
+    relative[:, :3] -= np.eye(3)
+    depth_var = ray @ (relative @ block @ relative.T + sigma * sigma * inverse @ inverse.T) @ ray
+    if depth_var > (config.depth_share * distance) ** 2:
+        return None
+    return NewLandmark(point, gain @ P, 0.5 * (cov + cov.T))

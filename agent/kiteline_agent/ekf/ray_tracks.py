@@ -1,0 +1,53 @@
+"""Pixels that past views saw of tracks which are not yet landmarks."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+
+class RayTracks:
+    """Sightings of each track by each past view."""
+
+    def __init__(self, views: int) -> None:
+        self._views = views
+        self.ids: I64 = np.zeros(0, np.int64)  # (n,) increasing
+        self.xy = np.zeros((0, views, 2))  # x/z, y/z in the view
+        self.seen: Bools = np.zeros((0, views), np.bool_)
+
+    def add(self, view: int, ids: I64, xy: F64) -> None:
+        """Add what the newest view saw. ids: (m,) increasing. xy: (m,2)."""
+        new = np.setdiff1d(ids, self.ids, assume_unique=True)
+        every = np.concatenate([self.ids, new])
+        order = np.argsort(every, kind="stable")
+        self.ids = every[order]
+        self.xy = np.concatenate([self.xy, np.zeros((len(new), self._views, 2))])[order]
+        self.seen = np.concatenate([self.seen, np.zeros((len(new), self._views), np.bool_)])[order]
+        at = np.searchsorted(self.ids, ids)
+        self.xy[at, view] = xy
+        self.seen[at, view] = True
+
+    def drop_view(self, view: int) -> None:
+        """Forget what a view saw, and tracks that no view saw."""
+        self.seen[:, view] = False
+        self._keep(np.asarray(self.seen.any(axis=1)))
+
+    def drop(self, ids: I64) -> None:
+        """Forget tracks."""
+        self._keep(~np.isin(self.ids, ids))
+
+    def find(self, ids: I64) -> tuple[I64, I64]:
+        """Places (k,) in `ids` of those that are known, and their rows (k,)."""
+        if not len(self.ids):
+            return np.zeros(0, np.int64), np.zeros(0, np.int64)
+        at = np.minimum(np.searchsorted(self.ids, ids), len(self.ids) - 1)
+        known = np.flatnonzero(self.ids[at] == ids)
+        return known, at[known]
+
+    def _keep(self, keep: Bools) -> None:
+        if not keep.all():
+            self.ids, self.xy, self.seen = self.ids[keep], self.xy[keep], self.seen[keep]

@@ -1,0 +1,43 @@
+"""Configuration of the Kalman filter."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class EkfConfig:
+    """The state's size, its noise, and when a landmark enters or leaves."""
+
+    landmarks: int = 300  # in the state at most: the cost of an update grows with their square
+    views: int = 10  # past camera poses in the state, whose rays give new landmarks
+    view_m: float = 0.15  # m between two of them: nearer ones add no parallax indoors
+    sigma_px: float = 2.0  # deviation of a tracked pixel: flow errs by less, but alike over frames
+    gate: float = 10.6  # squared deviations of a pixel beyond which a match is wrong: 0.5 % of right ones
+    seeds: int = 6  # matches with which a compatible set is begun before the largest set is taken
+    agree: float = 0.6  # share of the matches in a set at which no other set is tried
+    updated: int = 16  # landmarks that one frame updates at most: bounds its cost
+    least_rays: int = 4  # sightings from which a landmark is positioned
+    ray_px: float = 10.0  # px from the point that two views give beyond which a third one's ray is a wrong match
+    parallax_rad: float = 0.05  # rad: three degrees between its first and its last ray, at least
+    depth_share: float = 0.1  # deviation of its distance over that distance, at most: beyond, it is not Gaussian
+    residual_gate: float = 2.0  # chi-square over its degrees of freedom above which its rays do not meet
+    entries: int = 6  # landmarks that enter at one frame at most
+    in_view: int = 45  # landmarks in view from which no more enter: the state is kept for what is seen next
+    misses: int = 4  # rejected matches in excess of the good ones after which a landmark is dropped
+    scale_sigma: float = 0.01  # relative deviation of the odometry's scale, constant over a flight
+    path_noise: float = 0.02  # m per sqrt(m) of way: the odometry's white error, along each axis
+    turn_noise: float = 0.005  # rad per sqrt(m) of way: the same of the heading
+    turn_share: float = 0.02  # rad per sqrt(rad) turned
+    idle_m_s: float = 0.005  # m per sqrt(s): the error of a vehicle that stands
+    idle_rad_s: float = 0.001  # rad per sqrt(s): the same of its heading
+    unmeasured_m_s: float = 0.02  # m/s along axes that the odometer does not measure: wheels do not slide sideways
+    unmeasured_rad_s: float = 0.2  # rad/s about axes that it does not measure
+    gap_m_s: float = 1.0  # m/s by which the velocity may have changed where samples are missing
+    gap_rad_s: float = 0.5  # rad/s, likewise
+    corners: int = 120  # followed in the image at most
+    replenish: float = 0.75  # share of them below which new ones are searched
+    window_px: int = 21  # px of the flow's window
+    anchor_frames: int = 8  # frames between two comparisons of corners with an earlier frame
+    slide_px: float = 0.5  # px by which such a comparison may differ
+    backward_px: float = 0.5  # px by which flow back to the image before may miss

@@ -1,0 +1,63 @@
+"""Makes a column scan of images that an agent sent, as a job: what the agent would do with them on board."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_basestation.jobs import JobKind
+from kiteline_core.geometry.cameras import RectifiedCamera
+from kiteline_core.ground.config import GroundConfig
+from kiteline_core.ground.disparity import DisparityStripes
+from kiteline_core.ground.image_codes import decode_pair
+from kiteline_core.ground.segmentation import ExpectedGround, GroundSegmenter, Segmented
+
+F64 = NDArray[np.float64]
+U8 = NDArray[np.uint8]
+
+_PIXEL_OPS = 110  # of matching, ground and labels, by pixel of a disparity image
+
+
+@dataclass(frozen=True, slots=True)
+class ScanInputs:
+    """Images as coded, and what is known of them. offset_px: (5,) of the full image's disparities. uv: (n,2) pixels to
+    label. expected: the height of the ground, where it is known.
+    """
+
+    images: bytes
+    camera: RectifiedCamera
+    config: GroundConfig
+    up_c: F64
+    offset_px: F64
+    expected: ExpectedGround | None
+    uv: F64
+
+
+@dataclass(frozen=True, slots=True)
+class ScanResult:
+    """What the images show. labels: (n,) of the pixels."""
+
+    seen: Segmented
+    labels: U8
+
+
+def _run(inputs: ScanInputs) -> ScanResult | None:
+    """None where the bytes are no images of this camera."""
+    segmenter = GroundSegmenter(inputs.camera, inputs.config)
+    pair = decode_pair(inputs.images, segmenter.camera)
+    if pair is None:
+        return None
+    stripes = DisparityStripes(segmenter.camera, inputs.config)
+    stripes.begin_reduced(pair)
+    offset_px = inputs.offset_px * (segmenter.camera.bf / inputs.camera.bf)
+    seen = segmenter.segment(stripes.measure_begun(), stripes.pair, inputs.up_c, offset_px, inputs.expected)
+    return ScanResult(seen, segmenter.label_of(inputs.uv))
+
+
+def _cost_ops(inputs: ScanInputs, result: ScanResult | None) -> int:
+    return _PIXEL_OPS * (inputs.camera.width // 2) * (inputs.camera.height // 4)
+
+
+SCAN = JobKind("scan", _run, _cost_ops, rank=3)

@@ -1,0 +1,1 @@
+"""The experiments of the papers that kiteline builds on, beside its own figures."""

@@ -1,0 +1,8 @@
+"""`kiteline bench papers`: each paper's experiments beside kiteline's."""
+
+from __future__ import annotations
+
+from kiteline_bench.harness.bars import Run
+from kiteline_bench.papers import ekf
+
+PARTS: dict[str, tuple[str, Run]] = {"ekf": (ekf.TITLE, ekf.run)}

@@ -1,0 +1,1 @@
+"""Benchmarks of size: many agents, large maps, long days."""

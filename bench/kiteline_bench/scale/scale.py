@@ -1,0 +1,12 @@
+"""`kiteline bench scale`: a base of any size."""
+
+from __future__ import annotations
+
+from kiteline_bench.harness.bars import Run
+from kiteline_bench.scale import agents, sizes
+
+PARTS: dict[str, tuple[str, Run]] = {
+    "agents": ("Scale: 50 agents", agents.run),
+    "map": ("Scale: a map of 20,000 keyframes", sizes.run_map),
+    "day": ("Scale: a day of flights", sizes.run_day),
+}

@@ -1,0 +1,274 @@
+"""Trials that need a process of their own, because their memory is measured: a large map, and a long day.
+
+`python -m kiteline_bench.scale.trials map|day …` prints the outcome as JSON.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_basestation.config import BaseConfig
+from kiteline_basestation.jobs import JobDone
+from kiteline_basestation.management import Command
+from kiteline_basestation.runtime.warm import warm, warm_graphs
+from kiteline_basestation.runtime.worker import LockstepJobs, Workers
+from kiteline_basestation.station import Station, StationOutput
+from kiteline_bench.harness.bars import run_command
+from kiteline_bench.scale.recorded import Name, RecordedFlight, mask_of, record_flight, renamed, rounds
+from kiteline_codec import warm as codec_warm
+from kiteline_codec.channel import CodedChannel, coded_channel
+from kiteline_codec.schema import LivePose, Record
+from kiteline_codec.sync.resumption import agent_session
+from kiteline_core.geometry import se3
+from kiteline_core.ids import AgentId
+from kiteline_hw.system.memory import return_large_arrays, rss_mib
+from kiteline_hw.system.vocabulary import shipped_vocabulary
+
+F64 = NDArray[np.float64]
+
+_MODULE = "kiteline_bench.scale.trials"
+_STEP_NS = 50_000_000
+_KEYFRAME_NS = 1_000_000_000
+_PLACE_M = 40.0  # between two places of a large map
+_ERROR = np.array([0.06, 0.0, 0.0, 0.0, 0.0, 0.0004])  # of an agent between two places: 0.15 %, and a slow turn
+_LAST = 1000  # keyframes over which steps are judged
+
+
+def start(trial: str, source: str, *options: str, timeout_s: float = 7200.0) -> dict[str, Any]:
+    """Run a trial in a process of its own and return its outcome. Raises RuntimeError with the end of its stderr."""
+    done = run_command([sys.executable, "-m", _MODULE, trial, source, *options], timeout_s)
+    if done.returncode:
+        raise RuntimeError(f"{trial} {source}: {done.stderr[-600:]}")
+    found: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+    return found
+
+
+@dataclass(slots=True)
+class Link:
+    """One agent's end of a link to a station in the same process; real packets, no time on the way."""
+
+    agent: AgentId
+    end: CodedChannel
+    down: Sequence[bytes] = ()
+
+    def exchange(self, records: Sequence[Record], now_ns: int) -> list[bytes]:
+        """Take in packets, share records, and give the packets for the base."""
+        self.end.receive(self.down, now_ns)
+        self.down = ()
+        for record in records:
+            self.end.put(record)
+        return self.end.poll(now_ns)
+
+
+def _station() -> Station:
+    return Station(BaseConfig(), lambda agent: coded_channel(1, 0, "wifi", peer=agent), shipped_vocabulary())
+
+
+# a large map
+
+
+@dataclass(slots=True)
+class LargeMap:
+    """keyframes, rss_mib: at each sample. step_ms, most_ms: mean and largest CPU of the steps of a keyframe. last_ms:
+    of each step with the last keyframes before the loop. loop_s: from the recognition of the first place until pose
+    graph and bundle are applied, and the longest step meanwhile. error_m: of the last place before that and after.
+    """
+
+    keyframes: list[int]
+    rss_mib: list[float]
+    step_ms: list[float]
+    most_ms: list[float]
+    last_ms: list[float]
+    loops: int = 0
+    loop_s: float = float("inf")
+    loop_step_ms: float = 0.0
+    error_m: tuple[float, float] = (float("inf"), float("inf"))
+    built_s: float = 0.0
+
+
+class _Flown:
+    """A station that one agent's records reach, and the jobs that it starts, on the modelled or on the real clock."""
+
+    def __init__(self, station: Station, link: Link, worker: Workers) -> None:
+        self.station, self.link, self.worker = station, link, worker
+        self.now_ns = 0
+        self.step_ms: list[float] = []
+        self.open = 0
+
+    def step(self, records: Sequence[Record]) -> StationOutput:
+        """One step; jobs that are done by now are taken in."""
+        up = self.link.exchange(records, self.now_ns)
+        done = self.worker.done(self.now_ns)
+        begin_ns = time.process_time_ns()
+        output = self.station.step({self.link.agent: up}, done, self.now_ns)
+        self.step_ms.append((time.process_time_ns() - begin_ns) / 1e6)
+        self.worker.add(output.jobs, self.now_ns)
+        self.link.down = dict(output.packets).get(self.link.agent, ())
+        self.now_ns += _STEP_NS
+        return output
+
+
+def large_map(flight: RecordedFlight, keyframes: int) -> LargeMap:
+    """Fly through so many keyframes in one submap, back to where it began, until the loop is closed."""
+    station, worker = _station(), Workers()
+    flown = _Flown(station, Link(AgentId(0), coded_channel(1, 0, "wifi", bounded=True)), worker)
+    places = max(3, round(keyframes / len(flight.keyframes)))
+    angle = 2.0 * np.pi * np.arange(places) / (places - 1)
+    radius = _PLACE_M * (places - 1) / (2.0 * np.pi)
+    shift = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), np.zeros(places)])
+    found = LargeMap([], [], [], [], [])
+    begin_s = time.monotonic()
+    count = edges = 0
+    loop_begin_s: float | None = None
+    n = len(flight.keyframes)
+    boundary = (places - 1) * n
+    begin, end = Name(AgentId(0), 0, 0, mask_of(0)), Name(AgentId(0), 0, boundary, mask_of(0))
+    mapper, map_id = station.mapper, begin.submap
+    assert mapper.merger is not None
+    try:
+        for group in rounds(flight, AgentId(0), 0, places, shift, se3.exp(_ERROR)):
+            about = () if count else map_all(flight.about, begin)
+            records = [*about, *group]
+            flown.step_ms.clear()
+            flown.step(records)
+            for _ in range(3):
+                flown.step(())
+            deadline_s = time.monotonic() + (0.5 if loop_begin_s is None else 0.1)
+            while not worker.idle and time.monotonic() < deadline_s:  # the worker keeps up, as at one keyframe a second
+                time.sleep(0.002)
+                if worker.idle or loop_begin_s is not None:
+                    flown.step(())
+            count += 1
+            found.step_ms.append(float(np.mean(flown.step_ms)))
+            found.most_ms.append(max(flown.step_ms))
+            if count > boundary - _LAST and count <= boundary:
+                found.last_ms += flown.step_ms
+            if count % 100 == 0 or count == boundary:
+                found.keyframes.append(count)
+                found.rss_mib.append(rss_mib())
+            if any(e.new >= end.keyframe(0) and e.old < begin.keyframe(n) for e in mapper.merger.edges[edges:]):
+                loop_begin_s = time.monotonic()
+                break
+            edges = len(mapper.merger.edges)
+        found.built_s = time.monotonic() - begin_s
+        found.loops = int(loop_begin_s is not None)
+        if loop_begin_s is not None:
+            before_m = _error_m(station, begin, end, count - boundary)
+            flown.step_ms.clear()
+            while time.monotonic() < loop_begin_s + 120.0:
+                flown.step(())
+                if not mapper.merger.is_busy(map_id):
+                    found.loop_s = time.monotonic() - loop_begin_s
+                    break
+                time.sleep(0.005)
+            found.loop_step_ms = max(flown.step_ms)
+            found.error_m = before_m, _error_m(station, begin, end, count - boundary)
+    finally:
+        worker.close()
+    return found
+
+
+def _error_m(station: Station, begin: Name, end: Name, count: int) -> float:
+    """Mean distance between the keyframes of the first place and those of the last one, which is the same place."""
+    sparse_map = station.mapper.map
+    ends = ([sparse_map.rows[name.keyframe(k)] for k in range(count)] for name in (begin, end))
+    first, last = (sparse_map.keyframes.T_w_k[rows, :3, 3] for rows in ends)
+    return float(np.linalg.norm(last - first, axis=1).mean())
+
+
+# a long day
+
+
+@dataclass(slots=True)
+class Day:
+    """rss_mib: after each flight and the silence behind it. flights: how many. keyframes: used in all."""
+
+    rss_mib: list[float]
+    flights: int
+    keyframes: int
+
+
+def day(flight: RecordedFlight, hours: float, flights: int) -> Day:
+    """Hours of silence with flights in between; each is deleted when the next one has landed."""
+    station, jobs = _station(), LockstepJobs()
+    found = Day([], 0, 0)
+    hour_ns = 3_600_000_000_000
+    now_ns = 0
+    gap_ns = round(hours * hour_ns / flights)
+    deleted = 0
+    for number in range(flights):
+        agent = AgentId(number % 4)
+        name = Name(agent, number, 0, mask_of(number + 1))
+        link = Link(agent, coded_channel(agent_session(number + 1, number), 0, "wifi"))
+        begin_ns = now_ns
+        orders: list[Command] = []
+        groups = [(*(renamed(r, name) for r in flight.about), *map_all(flight.keyframes[0], name))]
+        groups += [map_all(group, name) for group in flight.keyframes[1:]]
+        for group in groups:
+            done: tuple[JobDone, ...] = ()
+            for k in range(_KEYFRAME_NS // _STEP_NS):
+                records: list[Record] = list(group) if k == 0 else []
+                records.append(LivePose(agent, now_ns, name.keyframe(0), np.eye(4), 100))
+                up = link.exchange(records, now_ns)
+                done = jobs.done(now_ns)
+                output = station.step({agent: up}, done, now_ns, orders)
+                orders = []
+                jobs.add(output.jobs, now_ns)
+                link.down = dict(output.packets).get(agent, ())
+                now_ns += _STEP_NS
+        found.flights += 1
+        found.keyframes += len(groups)
+        if number:
+            old = Name(AgentId((number - 1) % 4), number - 1, 0, mask_of(0)).submap
+            text = json.dumps({"map": ".".join(map(str, (int(old) >> 29, number - 1, 0)))})
+            orders.append(Command(number, "delete", text))
+        while now_ns < begin_ns + gap_ns:  # silence: the base steps on
+            output = station.step({}, jobs.done(now_ns), now_ns, orders)
+            for answer in output.answers:
+                deleted += answer.ok
+            orders = []
+            jobs.add(output.jobs, now_ns)
+            now_ns += 20 * _STEP_NS
+        found.rss_mib.append(rss_mib())
+    if deleted != flights - 1:
+        raise RuntimeError(f"{deleted} maps deleted, expected {flights - 1}")
+    return found
+
+
+def map_all(group: Sequence[Record], name: Name) -> tuple[Record, ...]:
+    """Records of a recorded flight under another name."""
+    return tuple(renamed(record, name) for record in group)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run one trial and print its outcome."""
+    p = argparse.ArgumentParser(description="Trials of size that need a process of their own.")
+    p.add_argument("trial", choices=("map", "day"))
+    p.add_argument("source")
+    p.add_argument("--keyframes", type=int, default=2000)
+    p.add_argument("--hours", type=float, default=24.0)
+    p.add_argument("--flights", type=int, default=24)
+    p.add_argument("--recorded", type=int, default=60, help="keyframes of the recorded flight")
+    a = p.parse_args(argv)
+    cv2.setNumThreads(1)
+    return_large_arrays()
+    flight = record_flight(a.source, a.recorded)
+    codec_warm.warm()
+    warm(BaseConfig(), shipped_vocabulary())
+    warm_graphs()
+    print(json.dumps(asdict(large_map(flight, a.keyframes) if a.trial == "map" else day(flight, a.hours, a.flights))))
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

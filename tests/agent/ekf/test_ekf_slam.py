@@ -1,0 +1,80 @@
+"""The filter along simulated loops: accuracy, honesty, wrong matches, determinism, and the limits of its state."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from kiteline_agent.ekf.ekf_slam import EkfSlam
+from kiteline_agent.ekf.filter_state import FilterState, Motion
+from kiteline_agent.ekf_config import EkfConfig
+from kiteline_bench.papers import ekf
+from kiteline_bench.papers import simulated_vehicle as vehicle
+from kiteline_core.geometry import se3
+
+
+@pytest.mark.parametrize("planar", [True, False])
+@pytest.mark.parametrize("wrong", [0.0, 0.3])
+def test_loop_is_closer_than_odometry_and_errs_as_it_says(planar: bool, wrong: bool) -> None:
+    model = vehicle.VehicleModel(planar, wrong=wrong)
+    flown = [ekf.fly(model, seed) for seed in (0, 1)]
+    assert sum(f.rmse_m for f in flown) < 0.35 * sum(f.odometry_m for f in flown)
+    assert np.mean([f.nees for f in flown]) < 2.5 * (3 if planar else 6)
+
+
+def _flown(frames: list[vehicle.SimulatedFrame], config: EkfConfig) -> EkfSlam:
+    slam = EkfSlam(vehicle.camera(), config)
+    for frame in frames:
+        if frame.motion is not None:
+            slam.predict(frame.motion)
+        slam.update(frame.ids, frame.uv)
+    return slam
+
+
+def test_same_input_gives_the_same_bits() -> None:
+    frames = vehicle.flight(vehicle.VehicleModel(planar=False, wrong=0.1), 3, laps=0.2)
+    a, b = (_flown(frames, EkfConfig()) for _ in range(2))
+    assert a.state.P.tobytes() == b.state.P.tobytes()
+    assert a.state.T_o_c.tobytes() == b.state.T_o_c.tobytes()
+
+
+def test_full_state_lets_go_of_what_is_out_of_view() -> None:
+    config = replace(EkfConfig(), landmarks=30)
+    slam = _flown(vehicle.flight(vehicle.VehicleModel(planar=True), 0, laps=0.4), config)
+    assert 20 <= int(slam.state.used.sum()) <= 30
+    assert sorted(slam.slot_of.values()) == np.flatnonzero(slam.state.used).tolist()
+    assert (np.diagonal(slam.state.P) >= 0.0).all()
+    assert np.linalg.eigvalsh(slam.state.block(0, slam.state.size)).min() > -1e-12
+
+
+def test_vehicle_that_sees_nothing_follows_its_odometry() -> None:
+    slam, poses, none = EkfSlam(vehicle.camera(), EkfConfig()), vehicle.loop(planar=True), np.zeros(0, np.int64)
+    cam = vehicle.camera()
+    for before, after in pairwise(poses[:41]):
+        motion = vehicle.camera_motion(se3.inverse(before) @ after, 1e-6 * np.eye(6), cam.T_b_c)
+        slam.predict(motion)
+        slam.update(none, np.zeros((0, 2)))
+    np.testing.assert_allclose(slam.state.T_o_c @ se3.inverse(cam.T_b_c), poses[40], atol=1e-9)
+
+
+def test_prediction_moves_the_covariance_as_perturbed_motions_do() -> None:
+    """Against draws: pose and landmark relative to it, after white errors and an error of the scale."""
+    rng, config = np.random.default_rng(0), EkfConfig(scale_sigma=0.02)
+    motion = Motion(
+        se3.exp(np.array([0.3, -0.1, 0.2, 0.1, -0.2, 0.05])), np.array([0.3, -0.1, 0.2]),
+        np.diag([1e-4, 2e-4, 3e-4, 1e-4, 2e-4, 1e-4]),
+    )  # fmt: skip
+    start = se3.exp(np.array([1.0, 2.0, 0.5, 0.3, 0.1, 0.6]))
+    state = FilterState(start, config)
+    state.propagate(motion)
+    draws = []
+    for _ in range(20_000):
+        error = np.sqrt(np.diagonal(motion.cov)) * rng.standard_normal(6)
+        moved = motion.T_c0_c1.copy()
+        moved[:3, 3] += 0.02 * rng.standard_normal() * motion.scaled + error[:3]
+        moved[:3, :3] = moved[:3, :3] @ se3.so3_exp(error[3:])
+        draws.append(ekf.pose_error(start @ moved, state.T_o_c))
+    np.testing.assert_allclose(state.pose_covariance(np.eye(4)), np.cov(np.array(draws).T), atol=2e-5)

@@ -1,0 +1,96 @@
+"""When a monocular map in metres begins: the window is solved again until the newest keyframe sees enough landmarks."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from kiteline_agent.config import AgentConfig
+from kiteline_agent.governor.cost_model import Work
+from kiteline_agent.initialisation import inertial_start
+from kiteline_agent.initialisation.corner_tracks import CornerObservations
+from kiteline_agent.initialisation.inertial_start import InertialStart, _with_found
+from kiteline_agent.initialisation.inertial_window import WindowSolution
+from kiteline_agent.initialisation.metric_restart import MetricPoints
+from kiteline_agent.initialisation.window_noise import WindowNoise
+from kiteline_agent.tracking.frame_context import FrameContext
+from tests.agent.test_inertial_bundle import CALIBRATION, FOCAL, T_B_C, window
+
+CAMERA: Any = SimpleNamespace(fx=FOCAL, fy=FOCAL, cx=376.0, cy=240.0, width=752, height=480, T_b_c=T_B_C)
+
+
+class Tracks:
+    """Recorded corners, one keyframe more at each call of `add`."""
+
+    def __init__(self, corners: CornerObservations) -> None:
+        self._corners, self.keyframes = corners, list[Any]()
+
+    def add(self, t_ns: int, _left: object) -> bool:
+        self.keyframes.append(SimpleNamespace(t_ns=t_ns))
+        return True
+
+    def drop_before(self, t_ns: int) -> None:
+        pass
+
+    def clear(self) -> None:
+        raise AssertionError("samples are missing")
+
+    def flow_px(self) -> float:
+        return 100.0
+
+    def observations(self) -> CornerObservations:
+        n = len(self.keyframes)
+        corners = CornerObservations(self._corners.xy[:n], self._corners.seen[:n], self._corners.ids)
+        return corners.part(np.flatnonzero(corners.seen.sum(axis=0) >= 3))
+
+
+def begins_after(monkeypatch: pytest.MonkeyPatch, poor: int) -> tuple[float, float]:
+    """Seconds until the scale is known, and until the map begins, if after that `poor` keyframes see few landmarks."""
+    corners, samples, _ = window(1, keyframes=24, noise_px=0.2)
+    asked: list[float] = []
+
+    def points(
+        self: InertialStart, ctx: FrameContext, corners: CornerObservations, solution: WindowSolution
+    ) -> MetricPoints:
+        asked.append(ctx.t_ns * 1e-9)
+        few: Any = SimpleNamespace(sigma_rho=np.ones(5 if len(asked) <= poor else 100))
+        return few  # type: ignore[no-any-return]
+
+    monkeypatch.setattr(InertialStart, "_points", points)
+    monkeypatch.setattr(inertial_start, "realigned", lambda _keyframes, observations, *_: observations)
+    start = InertialStart(CAMERA, CALIBRATION, AgentConfig(), Work())
+    start._tracks = Tracks(corners)  # type: ignore[assignment]
+    monkeypatch.setattr(start, "_intervals", lambda keyframes, _offset: samples[: len(keyframes) - 1])
+    monkeypatch.setattr(start, "_measured_noise", WindowNoise)
+    for k in range(24):
+        ctx: Any = SimpleNamespace(t_ns=250_000_000 * k, images=SimpleNamespace(left=None))
+        if start.add(ctx, None, 0.0) is not None:
+            return asked[0], asked[-1]
+    raise AssertionError("the map never begins")
+
+
+def test_a_map_that_lacks_landmarks_begins_at_one_of_the_next_keyframes(monkeypatch: pytest.MonkeyPatch) -> None:
+    known, begun = begins_after(monkeypatch, 0)
+    assert known == begun
+    assert begins_after(monkeypatch, 3) == (known, pytest.approx(known + 3 * 0.25))
+
+
+def test_corners_that_alignment_finds_again_count_where_flow_lost_them() -> None:
+    rng = np.random.default_rng(0)
+    corners = CornerObservations(rng.normal(size=(4, 6, 2)), rng.random((4, 6)) < 0.5, np.arange(6))
+    columns = np.array([0, 2, 5])
+    aligned = replace(corners.part(columns), xy=rng.normal(size=(4, 3, 2)), seen=rng.random((4, 3)) < 0.7)
+    both = _with_found(corners, columns, aligned)
+    for k in range(4):
+        for i in range(6):
+            at = np.flatnonzero(columns == i)
+            again = len(at) == 1 and bool(aligned.seen[k, at[0]])
+            assert both.seen[k, i] == (corners.seen[k, i] or again)
+            if corners.seen[k, i]:
+                np.testing.assert_array_equal(both.xy[k, i], corners.xy[k, i])
+            elif again:
+                np.testing.assert_array_equal(both.xy[k, i], aligned.xy[k, at[0]])

@@ -1,0 +1,336 @@
+"""Maps of any size: regions, parts, memory that serves again, loops that many votes close."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter, deque
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from kiteline_basestation.config import BaseConfig, PublishConfig
+from kiteline_basestation.exchange.publisher import Publisher
+from kiteline_basestation.intake.intake import Intake
+from kiteline_basestation.job_kinds import run_job
+from kiteline_basestation.jobs import Job, JobDone
+from kiteline_basestation.management import Command
+from kiteline_basestation.map.free_runs import FreeRuns
+from kiteline_basestation.map.sparse_map import SparseMap
+from kiteline_basestation.mapper import Mapper, MapperInput
+from kiteline_basestation.merging.correction import full_bundle_window, keyframes_of, move_keyframes, part_spans
+from kiteline_basestation.merging.correction_jobs import FullBundle
+from kiteline_basestation.merging.loop_detector import LoopDetector
+from kiteline_basestation.refinement.bundle_window import bundle_window
+from kiteline_basestation.station import Station
+from kiteline_basestation.store.integrity import contradictions
+from kiteline_codec.channel import coded_channel
+from kiteline_codec.schema import CameraIntrinsics, Key, KeyframePose
+from kiteline_codec.sync.resumption import agent_session
+from kiteline_core.geometry import se3
+from kiteline_core.ids import NO_KEYFRAME, KeyframeId, keyframe_id, submap_id, submap_of_keyframe
+from kiteline_core.optimisation.bundle import BundleResult
+from tests.basestation.feeding import STEP_NS, feed
+
+MakeFlight = Callable[..., Any]
+
+
+@pytest.fixture(scope="module")
+def mapped(make_flight: MakeFlight) -> tuple[Any, Mapper]:
+    """A flight of 30 keyframes and a mapper that has it."""
+    flight, mapper = make_flight(keyframes=30), Mapper()
+    feed(mapper, [flight])
+    return flight, mapper
+
+
+@given(st.lists(st.integers(1, 9), min_size=1, max_size=30), st.randoms(use_true_random=False))
+def test_freed_runs_are_given_again_and_none_twice(lengths: list[int], draw: Any) -> None:
+    runs, used, top = FreeRuns(), dict[int, int](), 0
+    for length in lengths:
+        begin = runs.take(length)
+        if begin is None:
+            begin, top = top, top + length
+        assert all(begin + length <= b or b + n <= begin for b, n in used.items())
+        used[begin] = length
+        if draw.random() < 0.5:
+            gone = draw.sample(sorted(used), draw.randint(1, len(used)))
+            runs.free([(used.pop(b), b) for b in gone])
+    runs.free([(n, b) for b, n in used.items()])
+    assert runs.take(top) == 0 and runs.take() is None  # all of it is one run again
+
+
+def test_pairs_of_keyframes_are_those_that_covisibility_tells(mapped: tuple[Any, Mapper]) -> None:
+    flight, mapper = mapped
+    sparse_map = mapper.map
+    rows = sparse_map.rows_of_map(submap_of_keyframe(flight.keyframes[0]))
+    ids = sparse_map.keyframes.id[rows].tolist()
+    for least in (1, 60, 100):
+        wanted = {
+            (ids.index(other), i)
+            for i, keyframe in enumerate(map(KeyframeId, ids))
+            for other in sparse_map.covisible_keyframes(keyframe, least)
+            if other < keyframe
+        }
+        found = sparse_map.covisible_pairs(rows, least)
+        assert set(map(tuple, found.tolist())) == wanted and len(found) == len(wanted) > 0
+
+
+def test_rows_nearby_are_those_of_the_map_within_a_cube(mapped: tuple[Any, Mapper]) -> None:
+    flight, mapper = mapped
+    sparse_map = mapper.map
+    submap = submap_of_keyframe(flight.keyframes[0])
+    at = sparse_map.keyframes.T_w_k[sparse_map.rows[flight.keyframes[7]], :3, 3]
+    rows = sparse_map.rows_of_map(submap)
+    inside = np.abs(sparse_map.keyframes.T_w_k[rows, :3, 3] - at).max(axis=1) <= 0.6
+    assert np.array_equal(sparse_map.rows_near(submap, at, 0.6), rows[inside])
+    assert 1 < np.count_nonzero(inside) < len(rows)
+
+
+def test_rows_and_numbers_follow_keyframes_that_come_in_any_order(make_flight: MakeFlight) -> None:
+    flight, sparse_map = make_flight(keyframes=40), SparseMap()
+    order = np.random.default_rng(2).permutation(40).tolist()
+    for n in order:
+        header = flight.records[n][0]
+        sparse_map.add_keyframe(header.keyframe, header.t_ns, header.parent, header.T_p_k, header.keypoints)
+    submap = submap_of_keyframe(flight.keyframes[0])
+    assert sparse_map.keyframes.id[sparse_map.rows_of(submap)].tolist() == flight.keyframes
+    assert [sparse_map.number_of(k) for k in flight.keyframes] == list(range(40))
+
+
+def test_keyframes_after_a_moved_one_move_along_and_those_before_stay(mapped: tuple[Any, Mapper]) -> None:
+    flight, mapper = mapped
+    sparse_map = mapper.map
+    submap = submap_of_keyframe(flight.keyframes[0])
+    keyframes = keyframes_of(sparse_map, submap)
+    before = {k: sparse_map.world_pose(k) for k in keyframes}
+    step = se3.exp(np.array([0.2, -0.1, 0.05, 0.0, 0.0, 0.1]))
+    chosen, held = keyframes[12], keyframes[20]
+    publisher = Publisher(sparse_map)
+    targets = {chosen: step @ before[chosen], held: before[held]}
+    assert not move_keyframes(sparse_map, submap, targets, publisher, PublishConfig())
+    for k in keyframes:
+        moved = np.allclose(sparse_map.world_pose(k), step @ before[k], atol=1e-9)
+        stays = np.array_equal(sparse_map.world_pose(k), before[k])
+        assert moved if chosen <= k < held else stays
+    sent = [r.keyframe for _, records in publisher.collect() for r in records if isinstance(r, KeyframePose)]
+    assert sent == [k for k in keyframes if chosen <= k < held]
+    move_keyframes(sparse_map, submap, before, publisher, PublishConfig())
+
+
+def test_many_corrections_are_sent_newest_first_a_batch_at_a_time(mapped: tuple[Any, Mapper]) -> None:
+    flight, mapper = mapped
+    publisher = Publisher(mapper.map, replace(PublishConfig(), batch_values=8))
+    agent = flight.agent
+    for keyframe in flight.keyframes[1:]:
+        publisher.mark_changed(KeyframePose.KIND, keyframe)
+    assert publisher.collect({agent: 0}) == () and publisher.waiting
+    sent = []
+    while publisher.waiting:
+        ((_, records),) = publisher.collect()
+        sent.append([r.keyframe for r in records])
+    live = flight.keyframes[1:]
+    assert sent == [live[max(0, n - 8) : n] for n in range(len(live), 0, -8)]
+
+
+def test_deleted_maps_leave_their_memory_to_the_next_ones(make_flight: MakeFlight, words: Any) -> None:
+    stays = make_flight(keyframes=24, agent=1, seed=5)
+    mapper, alone = Mapper(BaseConfig(), words), Mapper(BaseConfig(), words)
+    feed(alone, [stays])
+    feed(mapper, [stays])
+    sizes = []
+    for number in range(4):
+        flight = make_flight(keyframes=24, submap=number, seed=20 + number)
+        feed(mapper, [flight])
+        sizes.append((mapper.map.height, mapper.map.slots, mapper.map.nbytes()))
+        command = Command(number, "delete", f'{{"map": "0.1.{number}"}}')
+        for n in range(2):
+            output = mapper.step(MapperInput((), (), (command,) if n == 0 else ()), (10**6 + number * 10 + n) * STEP_NS)
+            assert all(answer.ok for answer in output.answers)
+        assert contradictions(mapper) == []
+        assert len(mapper.map) == 24 and mapper.idle
+    assert {height for height, _, _ in sizes} == {48}
+    assert max(slots for _, slots, _ in sizes) < 1.05 * sizes[0][1]  # flights are not all of one size
+    for keyframe in stays.keyframes:
+        assert np.array_equal(mapper.map.pose(keyframe), alone.map.pose(keyframe))
+    assert mapper.map.count_live() == alone.map.count_live() == len(mapper.map.live_landmarks())
+
+
+def test_flights_that_come_and_are_deleted_leave_nothing_behind(
+    make_flight: MakeFlight, words: Any, lively_room: Any
+) -> None:  # fmt: skip
+    station = Station(BaseConfig(), lambda agent: coded_channel(1, 0, "wifi", peer=agent), words)
+    done: tuple[JobDone, ...] = ()
+    counts = []
+    now_ns = 0
+    for boot in range(1, 8):
+        looks = np.random.default_rng(boot).integers(0, 256, lively_room.descriptors.shape, np.uint8)
+        scene = replace(lively_room, descriptors=looks)
+        flight = make_flight(keyframes=10, boot=boot, submap=boot, turns=0.2, scene=scene)
+        end, down = coded_channel(agent_session(boot, boot), 0, "wifi"), list[bytes]()
+        end.put(CameraIntrinsics(flight.agent, flight.camera))
+        for n in range(70):
+            end.receive(down, now_ns)
+            for record in flight.records[n] if n < len(flight.records) else ():
+                end.put(record)
+            delete = Command(n, "delete", f'{{"map": "0.{boot - 1}.{boot - 1}"}}')
+            orders = [delete] if n == 40 and boot > 1 else []
+            output = station.step({flight.agent: end.poll(now_ns)}, done, now_ns, orders)
+            assert all(answer.ok for answer in output.answers)
+            done = tuple(run_job(job) for job in output.jobs)
+            down = list(dict(output.packets).get(flight.agent, ()))
+            now_ns += STEP_NS
+        counts.append(entries_of(station))
+    before, after = counts[2], counts[6]  # one flight in two is placed: it comes when there is no other map
+    grown = {name: after[name] - before[name] for name in after if after[name] > before[name]}
+    assert {name for name in grown if not name.endswith(_MAY_GROW)} == set()
+
+
+# Ids of what was deleted, which are ignored for ever, and times, of which the newest are kept.
+_MAY_GROW = (".deleted", ".grid_ns")
+
+
+def entries_of(root: object) -> Counter[str]:
+    """Number of entries of all containers that an object holds, by the attributes that lead there."""
+    found, seen, open_ = Counter[str](), set[int](), deque([(root, "")])
+    while open_:
+        item, name = open_.popleft()
+        if id(item) in seen or isinstance(item, type | str | bytes | Key):
+            continue
+        seen.add(id(item))
+        if isinstance(item, dict | list | set | frozenset | tuple | deque):
+            found[name] += len(item)
+            open_ += [(entry, name) for entry in (item.values() if isinstance(item, dict) else item)]
+            continue
+        slots = [slot for one in type(item).__mro__ for slot in getattr(one, "__slots__", ())]
+        fields = {slot: getattr(item, slot) for slot in slots if hasattr(item, slot)} | getattr(item, "__dict__", {})
+        open_ += [(value, f"{name}.{field}") for field, value in fields.items()]
+    return found
+
+
+def test_nothing_is_left_of_a_forgotten_submap_whose_keyframes_did_not_all_come(make_flight: MakeFlight) -> None:
+    flight, sparse_map = make_flight(keyframes=12), SparseMap()
+    intake = Intake(BaseConfig().intake, sparse_map)
+    never = flight.keyframes[5]
+    for records in flight.records:
+        intake.take(flight.agent, tuple(r for r in records if getattr(r, "keyframe", None) != never), 0)
+    sparse_map.up[never] = np.array([0.0, -1.0, 0.0]), 0.01
+    assert sparse_map._waiting and sparse_map.children_of(never)
+    sparse_map.forget([submap_of_keyframe(never)])
+    assert len(sparse_map) == 0
+    assert not (sparse_map._waiting or sparse_map.up or any(sparse_map._children.values()))
+
+
+def test_a_large_map_is_merged_in_a_step(words: Any) -> None:
+    mapper = Mapper(BaseConfig(), words)
+    assert mapper.merger is not None
+    for submap in (submap_id(0, 1, 0), submap_id(1, 1, 0)):
+        for k in range(20_000 if submap > submap_id(0, 1, 0) else 1):
+            mapper.map.add_keyframe(keyframe_id(submap, k), k, NO_KEYFRAME, np.eye(4), 0)
+    begin_ns = time.process_time_ns()
+    mapper.merger.merge(submap_id(1, 1, 0), submap_id(0, 1, 0), np.eye(4))
+    mapper.merger.search_overlap(submap_id(1, 1, 0), submap_id(0, 1, 0))
+    assert time.process_time_ns() - begin_ns < 1_500_000_000
+
+
+def test_a_keyframe_whose_time_changed_leaves_no_frame_behind(words: Any) -> None:
+    sparse_map = SparseMap()
+    detector = LoopDetector(BaseConfig().loops, sparse_map, words)
+    a, b = keyframe_id(submap_id(0, 1, 0), 0), keyframe_id(submap_id(0, 1, 1), 0)
+    for t_ns in (5, 7):
+        sparse_map.add_keyframe(a, t_ns, NO_KEYFRAME, np.eye(4), 0)
+        if t_ns == 5:
+            detector.add(a)
+    detector.remove(a)
+    sparse_map.forget([submap_id(0, 1, 0)])
+    sparse_map.add_keyframe(b, 5, NO_KEYFRAME, np.eye(4), 0)
+    detector.add(b)
+    assert detector.query(b) is None
+
+
+def test_parts_overlap_by_half_and_cover_everything() -> None:
+    for count in (1, 799, 800, 801, 1199, 1200, 1201, 20_000):
+        spans = part_spans(count, 800)
+        assert spans[0][0] == 0 and spans[-1][1] == count
+        assert all(b[0] - a[0] == 400 and b[0] < a[1] for a, b in pairwise(spans))
+        assert all(end - begin <= 800 for begin, end in spans)
+
+
+@pytest.mark.parametrize("most", [0, 1])
+def test_without_full_bundles_a_base_goes_on(make_flight: MakeFlight, most: int) -> None:
+    config = BaseConfig()
+    mapper = Mapper(replace(config, graph=replace(config.graph, max_full=most)), _no_words())
+    feed(mapper, [make_flight(keyframes=6)])
+    assert mapper.counts.bundles > 0
+
+
+def test_a_map_too_large_for_one_bundle_is_bundled_in_parts(make_flight: MakeFlight, ring: Any) -> None:
+    flight = make_flight(keyframes=70, turns=0.8, scene=ring, drift_m=0.01, seed=3)
+    errors = {}
+    for most in (0, 24):
+        config = BaseConfig()
+        graph = replace(config.graph, max_full=most or 800, full_share=1.0)
+        jobs: list[Job] = []
+
+        def run(job: Job, jobs: list[Job] = jobs) -> JobDone:
+            jobs.append(job)
+            return run_job(job)
+
+        mapper = Mapper(replace(config, graph=graph), _no_words())
+        feed(mapper, [flight], run=run)
+        full = [job for job in jobs if job.kind == "full"]
+        if most:
+            assert max(len(job.inputs.problem.T_c_m) for job in full) <= 24 + 24  # free, and held around them
+            assert mapper.merger is not None
+            bundled = mapper.merger._corrections._schedule.bundled
+            assert {part for _, part in bundled} >= set(range(len(part_spans(70, 24))))
+        poses = [mapper.map.pose(k) for k in flight.keyframes]
+        errors[most] = np.sqrt(np.mean([np.sum((p - t)[:3, 3] ** 2) for p, t in zip(poses, flight.true_T_m_k)]))
+    assert errors[24] < 1.5 * errors[0] + 0.01
+
+
+def test_what_follows_a_part_is_held_also_behind_culled_keyframes(make_flight: MakeFlight) -> None:
+    flight, mapper, config = make_flight(keyframes=20), Mapper(), BaseConfig()
+    feed(mapper, [flight])
+    for k in (10, 11):
+        mapper.map.cull_keyframe(flight.keyframes[k])
+    alone = replace(config.bundle_window, max_fixed=0)
+    free = flight.keyframes[2:10]
+    window = bundle_window(mapper.map, free, alone, config.measurement, set(), with_children=True)
+    assert window is not None
+    held = mapper.map.keyframes.id[window.rows[~window.problem.free]].tolist()
+    assert held == [flight.keyframes[1], flight.keyframes[12]]
+
+
+def test_a_part_tells_all_that_it_moves_also_what_came_since_it_began(make_flight: MakeFlight) -> None:
+    flight, config = make_flight(keyframes=30), BaseConfig()
+    mapper = Mapper(replace(config, graph=replace(config.graph, max_full=16)), _no_words())
+    assert mapper.merger is not None
+    camera = CameraIntrinsics(flight.agent, flight.camera)
+    for n, records in enumerate(flight.records[:20]):
+        mapper.step(MapperInput(((flight.agent, (camera, *records)),)), n * STEP_NS)
+    submap = submap_of_keyframe(flight.keyframes[0])
+    window = full_bundle_window(mapper.map, submap, (), mapper.config, (submap, 1))
+    assert window is not None
+    for n, records in enumerate(flight.records[20:], 20):
+        mapper.step(MapperInput(((flight.agent, tuple(records)),)), n * STEP_NS)
+    T_c_m = window.problem.T_c_m.copy()
+    T_c_m[window.problem.free] = T_c_m[window.problem.free] @ se3.exp(np.array([0.1, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    points = window.problem.points
+    result = BundleResult(T_c_m, points, np.ones(len(window.slots), np.bool_), 0.0, 0.0, 1, 0)
+    before = mapper.map.keyframes.T_w_k.copy()
+    changes = mapper.merger._apply_full_bundle(FullBundle(submap, window, (), part=(submap, 1)), result)
+    moved = np.flatnonzero((before != mapper.map.keyframes.T_w_k).any(axis=(1, 2))).tolist()
+    assert mapper.map.rows[flight.keyframes[-1]] in moved
+    assert changes.bent == frozenset(moved)
+
+
+def _no_words() -> Any:
+    from kiteline_core.places.place_index import Vocabulary, nodes
+
+    centres = np.random.default_rng(5).integers(0, 2**64, (nodes(20, 2), 4), dtype=np.uint64)
+    return Vocabulary(20, 2, centres, np.ones(400, np.float32))
