@@ -20,7 +20,7 @@ import zenoh
 from kiteline_hw.links.ends import LinkOptions
 from kiteline_hw.links.queued_link import INBOX_BYTES, MOST_PACKET_BYTES, LinkCounters, QueuedLink
 from kiteline_hw.links.zenoh_access import Instances, access_of_base
-from kiteline_hw.links.zenoh_session import close_session, direct, open_session
+from kiteline_hw.links.zenoh_session import close_session, direct, no_stop_at_exit, open_session, stop_at_exit
 from kiteline_hw.ports import ByteLink, LinkError
 from kiteline_hw.system.closing import Closing
 
@@ -118,6 +118,7 @@ class ZenohLink(_PeerLink):
         self._instances = Instances()
         self._thread = threading.Thread(target=self._run, name="zenoh-send", daemon=True)
         self._thread.start()
+        stop_at_exit(self, self._stop_sending)
 
     @property
     def connected(self) -> bool:
@@ -189,12 +190,16 @@ class ZenohLink(_PeerLink):
         ]
         return _publisher(session, f"{key}/up")
 
-    def close(self) -> None:
-        """Leave, within 2 s whatever the base does. May be called twice."""
+    def _stop_sending(self) -> None:
         self._closed.set()
         with self._wake:
             self._wake.notify_all()
         self._thread.join(_JOIN_S)
+
+    def close(self) -> None:
+        """Leave, within 2 s whatever the base does. May be called twice."""
+        self._stop_sending()
+        no_stop_at_exit(self)
         with self._session_lock:
             session = self._session
         if session is not None:
@@ -242,6 +247,7 @@ class ZenohHub(Closing):
             raise LinkError(f"cannot set up the hub on {endpoint}: {error}") from error
         self._thread = threading.Thread(target=self._run, name="zenoh-send", daemon=True)
         self._thread.start()
+        stop_at_exit(self, self._stop_sending)
 
     def _link(self, key: Any) -> _AgentLink:
         agent = _checked_agent(int(str(key).split("/")[-2]))
@@ -296,12 +302,16 @@ class ZenohHub(Closing):
         with self._lock:
             return frozenset(agent for agent, link in self._links.items() if link.alive)
 
-    def close(self) -> None:
-        """Stop listening, within 2 s whatever the agents do. May be called twice."""
+    def _stop_sending(self) -> None:
         self._closed.set()
         with self._wake:
             self._wake.notify_all()
         self._thread.join(_JOIN_S)
+
+    def close(self) -> None:
+        """Stop listening, within 2 s whatever the agents do. May be called twice."""
+        self._stop_sending()
+        no_stop_at_exit(self)
         close_session(self.session)
 
 

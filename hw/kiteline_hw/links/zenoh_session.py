@@ -1,7 +1,8 @@
 """Zenoh sessions that never hang a process: client (drone) or listening peer (base), no discovery.
 
 A process that ends while a session is open hangs for ever if a callback has a Python thread of its own. Therefore
-callbacks are `direct`, and every session opened here is closed at the latest when the main thread ends.
+callbacks are `direct`, and every session opened here is closed at the latest when the main thread ends. The interpreter
+waits for that: a thread that is inside Zenoh while Python ends makes the process abort.
 """
 
 from __future__ import annotations
@@ -132,23 +133,53 @@ def _opened(
 
 
 _open: dict[int, zenoh.Session] = {}  # sessions that are not closed yet
-_closers: list[threading.Thread] = []  # the one thread that closes them at the end
+_senders: dict[int, Callable[[], None]] = {}  # by owner: ends the owner's thread that sends over a session
+_exit_threads: list[threading.Thread] = []  # the two that close everything at the end
 _open_lock = threading.Lock()
 
 
 def _close_at_exit(session: zenoh.Session) -> None:
     with _open_lock:
         _open[id(session)] = session
-        if not _closers:
-            _closers.append(threading.Thread(target=_close_after_main, name="zenoh-exit", daemon=True))
-            _closers[0].start()
+        if not _exit_threads:
+            closed = threading.Event()
+            # Two threads, since a close may stall: the daemon closes, and Python waits for the other one.
+            _exit_threads.extend(
+                (
+                    threading.Thread(target=_close_after_main, args=(closed,), name="zenoh-exit", daemon=True),
+                    threading.Thread(target=_wait_after_main, args=(closed,), name="zenoh-exit-wait", daemon=False),
+                )
+            )
+            for thread in _exit_threads:
+                thread.start()
 
 
-def _close_after_main() -> None:
+def stop_at_exit(owner: object, stop: Callable[[], None]) -> None:
+    """Call `stop` before sessions are closed at the end of the main thread; it ends the owner's sending thread."""
+    with _open_lock:
+        _senders[id(owner)] = stop
+
+
+def no_stop_at_exit(owner: object) -> None:
+    """Forget the owner's `stop`: its thread has ended."""
+    with _open_lock:
+        _senders.pop(id(owner), None)
+
+
+def _close_after_main(closed: threading.Event) -> None:
     """Close all open sessions when the main thread has ended: atexit handlers run too late for that."""
     threading.main_thread().join()
+    for stop in list(_senders.values()):
+        stop()
     for session in list(_open.values()):
         _close(session)
+    closed.set()
+
+
+def _wait_after_main(closed: threading.Event) -> None:
+    """Keep Python from ending until the sessions are closed, or have taken too long."""
+    threading.main_thread().join()
+    closed.wait(CLOSE_TIMEOUT_S)
 
 
 def _close(session: zenoh.Session) -> None:
@@ -159,7 +190,10 @@ def _close(session: zenoh.Session) -> None:
 def close_session(session: zenoh.Session) -> bool:
     """Close a session within CLOSE_TIMEOUT_S; False if it had to be abandoned. May be called twice."""
     thread = threading.Thread(target=_close, args=(session,), name="zenoh-close", daemon=True)
-    thread.start()
+    try:
+        thread.start()
+    except RuntimeError:  # Python 3.12 starts no thread once the main one has ended: the thread for the end closes it
+        return False
     thread.join(CLOSE_TIMEOUT_S)
     closed = not thread.is_alive()
     if closed:

@@ -161,7 +161,7 @@ def test_a_frozen_base_never_blocks_the_sender_nor_close() -> None:
 
 
 AGENT = """
-import signal, sys, time
+import atexit, signal, sys, threading, time
 from kiteline_hw.system.process import StopSignal
 from kiteline_hw.links.zenoh_link import ZenohHub, ZenohLink
 from kiteline_hw.links.zenoh_session import open_session
@@ -172,6 +172,7 @@ if way == "flag":
     stop = StopSignal()
 link = ZenohLink(sys.argv[1], 1)
 hub = ZenohHub(sys.argv[3])
+atexit.register(lambda: print(*(thread.name for thread in threading.enumerate()), flush=True))
 while not link.connected:
     time.sleep(0.01)
 print("connected", flush=True)
@@ -200,8 +201,10 @@ def test_a_process_with_an_open_link_ends(way: str, status: int) -> None:
                 hub.links()[1].send(b"%d" % i)  # callbacks are running while the process ends
             if way not in ("end", "raise"):
                 process.send_signal(signal.SIGTERM)
-            process.communicate(timeout=5)
+            running, _ = process.communicate(timeout=5)
             assert process.returncode == status
+            # Python aborts if it ends while a thread is inside Zenoh.
+            assert running.split() == ([] if way == "default" else ["MainThread"])
             wait_for(lambda: hub.alive() == frozenset())
         finally:
             process.kill()
