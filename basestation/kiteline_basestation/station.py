@@ -51,6 +51,8 @@ class Station:
         self._batches: dict[AgentId, CorrectionBatches] = {}  # of corrections, by agent
         self._publish = config.publish
         self.changed: dict[tuple[AgentId, bool, Key], bytes | None] | None = None  # see `track_changes`
+        self.received = 0  # records of agents in the last step
+        self.published = 0  # records for agents in the last step
         self.unreadable = 0  # imported values whose code is no valid record
         self._open_channel = open_channel
 
@@ -84,6 +86,7 @@ class Station:
             (agent, tuple(channel.receive(packets.get(agent, ()), now_ns)))
             for agent, channel in sorted(self.channels.items())
         ]
+        self.received = sum(len(records) for _, records in arrivals)
         for agent, records in arrivals:
             self._track(agent, False, records)
         arrivals += [(order.agent, self._imported(order)) for order in orders if isinstance(order, Import)]
@@ -94,6 +97,7 @@ class Station:
         for agent, keyframes in self.mapper.take_confirmed().items():
             if isinstance(end := self.channels.get(agent), CodedChannel):
                 end.endpoint.claims.earned += KEYFRAME_BYTES * keyframes
+        self.published = sum(len(records) for _, records in output.publish)
         for agent, records in output.publish:
             self.join(agent)
             self._put(agent, self._batches[agent].numbered(records, now_ns))

@@ -26,6 +26,7 @@ from kiteline_basestation.refinement.bundle_job import FULL_BUNDLE, LOCAL_BUNDLE
 from kiteline_basestation.runtime import worker as worker_module
 from kiteline_basestation.runtime.flight_log import fingerprint
 from kiteline_basestation.runtime.worker import LockstepJobs, Worker, Workers
+from kiteline_hw.lockstep.shared_core import SharedCore
 from kiteline_hw.system.process import is_stopped
 from tests.basestation.feeding import feed
 
@@ -235,3 +236,14 @@ def _collected(workers: Workers, number: int) -> list[int]:
         done += [job.id for job in workers.done(0)]
         time.sleep(0.005)
     return done
+
+
+def test_jobs_on_a_shared_core_take_longer() -> None:
+    core = SharedCore(50.0)
+    other, jobs = core.process(), LockstepJobs(core.process())
+    jobs.add([graph_job(1)], 0)
+    cost_ns = run_job(graph_job(1)).cost_ops
+    other.spend(10 * cost_ns, 0)
+    assert not jobs.done(3 * cost_ns)
+    assert [done.id for done in jobs.done(4 * cost_ns + 1)] == [1]
+    assert jobs.idle

@@ -99,3 +99,13 @@ def test_without_matplotlib_the_flight_says_so_first_and_leaves_the_plot_out(
     assert "plot:" not in out
     assert not (tmp_path / "trajectory.png").exists()
     assert (tmp_path / "report.json").exists()
+
+
+def test_a_limit_covers_the_base_in_the_same_computer(recording: Path, tmp_path: Path) -> None:
+    dropped, tracking_ms = {}, {}
+    for mode in ("tracker", "local"):
+        report, _ = fly(Options((str(recording),), tmp_path / mode, mode, cpu_percent=5.0), quiet=True)
+        dropped[mode] = report["agents"][0]["dropped"]
+        tracking_ms[mode] = report["agents"][0]["timing"]["tracking_ms"]["mean"]
+    assert dropped["local"] > dropped["tracker"]
+    assert tracking_ms["local"] > 1.5 * tracking_ms["tracker"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
@@ -37,6 +38,7 @@ from kiteline_core.frame import Frame, ImuBatch, OdometryBatch
 from kiteline_core.ids import AgentId
 from kiteline_hw.links.kinds import link_traits
 from kiteline_hw.lockstep.messages import Down, Phase, Up
+from kiteline_hw.lockstep.shared_core import CoreProcess
 from kiteline_hw.logs.image_encoder import EncodingPolicy, ImageEncoder
 from kiteline_hw.logs.log_budget import LogBudget
 from kiteline_hw.logs.mcap_log import LogWriter
@@ -50,6 +52,7 @@ from kiteline_hw.system.memory import release_memory, rss_mib
 from kiteline_hw.system.notices import Notices
 from kiteline_hw.system.vocabulary import shipped_vocabulary
 
+_SAMPLES = 1 << 15  # newest tracking times that are kept: half an hour of frames
 SAVE_FRAMES = 200  # frames between two looks at whether the rig file is up to date
 PROGRESS_FRAMES = 10  # frames between two reports of progress, and between two readings of the memory in use
 
@@ -58,12 +61,13 @@ class AgentRuntime:
     """Drives one agent step by step, in lock-step or live: reads frames, logs, counts, and models link and CPU.
 
     whole_process: the agent is alone in this process. Then all CPU time between two frames but for decoding counts as
-    the agent's, else only that of its steps. config: in place of what the options name.
+    the agent's, else only that of its steps. config: in place of what the options name. core: its process on a computer
+    that it shares with others in modelled time; None: one of its own.
     """
 
     def __init__(
         self, options: AgentOptions, source: FrameSource, channel: RecordChannel, whole_process: bool,
-        config: AgentConfig | None = None,
+        config: AgentConfig | None = None, core: CoreProcess | None = None,
     ) -> None:  # fmt: skip
         cv2.setNumThreads(1)
         self.options = options
@@ -114,7 +118,8 @@ class AgentRuntime:
         self._account = CpuAccount(time.process_time_ns, self.reader, whole_process)
         self._last_cpu_ns = 0  # of the last frame: modelled in lock-step, measured in a live flight
         self._live_clock = False
-        self._core = VirtualCpu(options.cpu_percent)
+        self._core: VirtualCpu | CoreProcess = VirtualCpu(options.cpu_percent) if core is None else core
+        self._tracking_ms: deque[float] = deque(maxlen=_SAMPLES)
         self.output: StepOutput | None = None  # of the last step
 
     def _open_record(self, config: AgentConfig) -> FlightRecord | None:
@@ -223,6 +228,7 @@ class AgentRuntime:
         publish: gets the output before it is logged, since a flight controller waits for its pose.
         """
         self._account.begin()
+        begin_ns = time.monotonic_ns()
         step_input = StepInput(frame, imu, tuple(packets), self._last_cpu_ns, odometry, predict_ns)
         self.output = output = self.agent.step(step_input, now_ns)
         if publish is not None:
@@ -237,8 +243,11 @@ class AgentRuntime:
                 ops = cost_ns(self.agent.work)
                 self._core.spend(ops, now_ns)
                 self._last_cpu_ns = ops
+            if output.estimate is not None:
+                self._tracking_ms.append(self._tracking_ns(begin_ns, now_ns) * 1e-6)
+        sent_ns = now_ns if self._live_clock else max(now_ns, self._core.free_ns)
         for packet in output.packets:
-            self._wire.send(packet, now_ns)
+            self._wire.send(packet, sent_ns)
         sent = self._wire.deliver(now_ns)
         self.counts.bytes_up += sum(map(len, output.packets)) + len(output.packets) * self._overhead_bytes
         self.counts.bytes_down += sum(map(len, packets)) + len(packets) * self._overhead_bytes
@@ -250,6 +259,12 @@ class AgentRuntime:
         if frame is not None and len(self._account.ms) % SAVE_FRAMES == 0:
             self._save_rig()  # a vehicle's power may be cut at any time
         return sent
+
+    def _tracking_ns(self, begin_ns: int, now_ns: int) -> int:
+        """Time that the frame of this step took until its pose: by the clock, in lock-step as modelled."""
+        if self._live_clock:
+            return time.monotonic_ns() - begin_ns
+        return max(self._core.free_ns - now_ns, self._last_cpu_ns)
 
     def report(self) -> dict[str, Any]:
         """The agent's part of report.json, with raw samples in place of statistics."""
@@ -271,6 +286,7 @@ class AgentRuntime:
             "drain": {key: total[key] - self.flight_counts[key] for key in ("bytes_up", "bytes_down")},
             "timing": {
                 "cpu_ms_per_frame": self._account.ms,
+                "tracking_ms": list(self._tracking_ms),
                 "decode_ms": self.reader.decode_ms,
                 "warm_up_s": round(self.warm_s, 3),
                 "rss_mib": round(self.rss_mib, 1),

@@ -21,6 +21,7 @@ from kiteline_basestation.runtime.options import LOG_STEM, BaseOptions, base_con
 from kiteline_basestation.runtime.warm import warm, warm_graphs
 from kiteline_basestation.runtime.worker import SAMPLES, LockstepJobs, Workers
 from kiteline_basestation.station import Import, Station, StationOutput
+from kiteline_basestation.step_cost import StepCost
 from kiteline_basestation.store.keeper import Keeper
 from kiteline_basestation.store.restore import Restored, restore
 from kiteline_basestation.store.saved_map import SavedMap, pack
@@ -30,6 +31,7 @@ from kiteline_core.ids import AgentId
 from kiteline_core.places.place_index import Vocabulary
 from kiteline_hw.links.kinds import link_traits
 from kiteline_hw.lockstep.messages import Down, Phase, Up
+from kiteline_hw.lockstep.shared_core import SharedCore
 from kiteline_hw.logs.log_budget import LogBudget
 from kiteline_hw.logs.mcap_log import LogWriter
 from kiteline_hw.ports import SourceError
@@ -65,8 +67,12 @@ class BaseRuntime:
         open_channel: Callable[[AgentId], RecordChannel],
         jobs: Workers | None = None,
         plain: bool = False,
+        core: SharedCore | None = None,
     ) -> None:
-        """open_channel: makes the base's end of a channel. plain: no codec, so no packets are logged."""
+        """open_channel: makes the base's end of a channel. plain: no codec, so no packets are logged.
+
+        core: computer that the base shares with others in modelled time; None: one of its own, as the options say.
+        """
         cv2.setNumThreads(1)
         self.options = options
         self.config = base_config(options.config)
@@ -77,7 +83,13 @@ class BaseRuntime:
             warm_graphs()
         self.station = Station(self.config, open_channel, vocabulary)
         self.station.mapper.cpu_ns = time.process_time_ns
-        self.jobs: LockstepJobs | Workers = LockstepJobs() if jobs is None else jobs
+        if core is None and options.cpu_percent > 0.0 and jobs is None:
+            core = SharedCore(options.cpu_percent)
+        self._process = None if core is None else core.process()
+        self._held: dict[int, list[bytes]] = {}  # packets that wait until the step before is done
+        lockstep = LockstepJobs(None if core is None else core.process())
+        self.jobs: LockstepJobs | Workers = lockstep if jobs is None else jobs
+        self._cost = StepCost(self.station)
         self.phase = Phase.FLY
         self.now_ns: int | None = None  # flight time of the next tick in lock-step
         self.rss_mib = 0.0
@@ -156,8 +168,11 @@ class BaseRuntime:
         The first call only sets the time of the first tick.
         """
         if self.now_ns is not None:
-            packets = {agent: up.packets for agent, up in ups.items()}
-            self.step(packets, self.jobs.done(self.now_ns), self.now_ns)
+            for agent, up in ups.items():
+                self._held.setdefault(agent, []).extend(up.packets)
+            if self._process is None or not self._process.busy(self.now_ns):
+                packets, self._held = self._held, {}
+                self.step(packets, self.jobs.done(self.now_ns), self.now_ns)
         frames = [up.next_ns for up in ups.values() if up.next_ns is not None]
         self.now_ns = min(frames) if frames else self._drain(ups, self.now_ns or 0)
         sent = self.outgoing(self.now_ns)
@@ -195,8 +210,14 @@ class BaseRuntime:
             write_step(self._log, arrived, done, output, now_ns, now_ns + self.options.start_ns, orders)
         if self.keeper is not None:
             self.keeper.write_changes(self.station, now_ns)
+        sent_ns = now_ns
+        if self._process is not None:
+            sent = [packet for _, out in output.packets for packet in out]
+            cost_ns = self._cost.take_ns([p for several in arrived.values() for p in several], done, sent)
+            self._process.spend(cost_ns, now_ns)
+            sent_ns = self._process.free_ns
         for agent, out in output.packets:
-            self._links.send(agent, out, now_ns)
+            self._links.send(agent, out, sent_ns)
         self._step_ms.append((time.process_time_ns() - begin_ns) / 1e6)
         self.jobs.add(output.jobs, now_ns)
         self._steps += 1

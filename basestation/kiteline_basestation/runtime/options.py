@@ -48,6 +48,7 @@ class BaseOptions:
     web: str = ""
     quiet: bool = False  # no status messages
     workers: int = 0  # processes for jobs; 0: as the machine has cores
+    cpu_percent: float = 0.0  # of one core, for its steps and jobs in modelled time; 0: each its own, steps take none
     maps: str = ""  # a Zenoh endpoint for `kiteline maps`; "": the agents' link
 
 

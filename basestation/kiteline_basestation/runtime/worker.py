@@ -18,6 +18,7 @@ import cv2
 from kiteline_basestation.job_kinds import KINDS, run_job
 from kiteline_basestation.jobs import Job, JobDone, set_aside
 from kiteline_basestation.runtime.warm import warm, warm_graphs
+from kiteline_hw.lockstep.shared_core import CoreProcess
 from kiteline_hw.system.memory import return_large_arrays
 from kiteline_hw.system.process import is_stopped
 
@@ -269,9 +270,11 @@ class Workers:
 class LockstepJobs:
     """A worker in modelled time: a job starts when the worker is free and is done after its modelled cost."""
 
-    def __init__(self) -> None:
+    def __init__(self, process: CoreProcess | None = None) -> None:
+        """process: of the worker on a shared core; None: it has a core of its own."""
         self.cpu_ms = cpu_times()
-        self._waiting: list[tuple[int, JobDone]] = []
+        self._process = process
+        self._waiting: list[tuple[int, JobDone]] = []  # with the time at which it is done, or the number of its task
         self._free_ns = 0
 
     def add(self, jobs: Sequence[Job], now_ns: int) -> None:
@@ -283,12 +286,16 @@ class LockstepJobs:
             except Exception as error:
                 done = set_aside(job, f"{type(error).__name__}: {error}"[:_MOST_CHARS])
             self.cpu_ms[job.kind].append((time.process_time_ns() - begin_ns) / 1e6)
+            if self._process is not None:
+                self._waiting.append((self._process.spend(done.cost_ops, now_ns), done))
+                continue
             self._free_ns = max(now_ns, self._free_ns) + done.cost_ops
             self._waiting.append((self._free_ns, done))
 
     def done(self, now_ns: int) -> tuple[JobDone, ...]:
         """Jobs done by now, in order."""
-        done = tuple(result for end_ns, result in self._waiting if end_ns <= now_ns)
+        limit = now_ns if self._process is None else self._process.done(now_ns)
+        done = tuple(result for end, result in self._waiting if end <= limit)
         self._waiting = self._waiting[len(done) :]
         return done
 

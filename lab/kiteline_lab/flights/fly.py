@@ -45,7 +45,13 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--profile", choices=tuple(PROFILES), default="",
                    help="cost of a keyframe; radio: 1000 B/s up, 500 B/s down; default: by the link")  # fmt: skip
     p.add_argument("--link-delay", metavar="S", type=float, default=0.0, help="s that a packet is under way")
-    p.add_argument("--cpu", metavar="PERCENT", type=float, default=0.0, help="of one core, for each agent")
+    p.add_argument(
+        "--cpu",
+        metavar="PERCENT",
+        type=float,
+        default=0.0,
+        help="of one core: for each agent, or for all together with --mode local or monolith",
+    )
     p.add_argument("--mono", action="store_true", help="the left camera alone")
     p.add_argument("--no-imu", action="store_true", help="without inertial samples")
     p.add_argument("--realtime", action="store_true", help="real clocks, frames paced by their stamps")

@@ -14,6 +14,7 @@ from kiteline_codec.channel import RecordChannel, coded_channel, plain_pair
 from kiteline_codec.sync.resumption import agent_session
 from kiteline_hw.links.kinds import link_traits
 from kiteline_hw.lockstep.messages import Down, Phase
+from kiteline_hw.lockstep.shared_core import SharedCore
 from kiteline_hw.logs.spill_file import SpillFile
 from kiteline_lab.flights.outcome import FlightOutcome, poses_from_json
 from kiteline_lab.flights.plan import FlightPlan
@@ -21,7 +22,10 @@ from kiteline_lab.flights.progress import Progress
 
 
 def fly_in_process(plan: FlightPlan, mode: str) -> FlightOutcome:
-    """Fly in lock-step in this process. mode: tracker, local or monolith."""
+    """Fly in lock-step in this process. mode: tracker, local or monolith.
+
+    A limit on the CPU covers all of it: agents, and the base's steps and jobs, share one modelled core.
+    """
     ours: dict[int, RecordChannel] = {}
     theirs: dict[int, RecordChannel] = {}
     for spec in plan.agents:
@@ -37,10 +41,13 @@ def fly_in_process(plan: FlightPlan, mode: str) -> FlightOutcome:
             )
         else:
             ours[spec.agent] = NoBaseChannel()
+    percent = plan.agents[0].cpu_percent
+    core = SharedCore(percent) if percent > 0.0 and plan.base is not None else None
     with contextlib.ExitStack() as stack:
         agents = {}
         for spec, source in zip(plan.agents, plan.sources, strict=True):
-            agents[spec.agent] = AgentRuntime(spec, source, ours[spec.agent], whole_process=False)
+            process = None if core is None else core.process()
+            agents[spec.agent] = AgentRuntime(spec, source, ours[spec.agent], whole_process=False, core=process)
             stack.callback(agents[spec.agent].close)
         progress = stack.enter_context(Progress("flying", plan.frames, "frames")) if not plan.quiet else None
         outcome = FlightOutcome([None] * len(plan.agents))
@@ -48,7 +55,7 @@ def fly_in_process(plan: FlightPlan, mode: str) -> FlightOutcome:
             _fly_alone(agents, progress)
         else:
             open_channel = theirs.__getitem__ if theirs else coded_channels(plan.base, link_traits(plan.base.link))
-            base = BaseRuntime(plan.base, open_channel, plain=bool(theirs))
+            base = BaseRuntime(plan.base, open_channel, plain=bool(theirs), core=core)
             stack.callback(base.close)
             _fly_joined(agents, base, progress)
             outcome.base = base.report()

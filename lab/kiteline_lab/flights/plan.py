@@ -14,6 +14,8 @@ from kiteline_hw.ports import FrameSource, SourceError, is_live
 from kiteline_hw.sources.open import open_source
 from kiteline_hw.system import process
 
+_BASE_PERCENT = 200.0  # of a core: the computer of a base beside agents with a limit, one core for steps, one for jobs
+
 
 @dataclass(frozen=True, slots=True)
 class Options:
@@ -99,6 +101,7 @@ def plan(o: Options, quiet: bool = False) -> FlightPlan:
             folder=str(o.out / "base"), agents=tuple(range(len(o.sources))), config=o.config, start_ns=starts[0],
             down_bytes_s=o.down_bytes_s, profile=o.profile, delay_s=o.delay_s, loss=o.loss, disorder=o.loss,
             seed=o.seed, session=max(1, number), store=o.store, kill_at_s=o.kill_base_at_s,
+            cpu_percent=_BASE_PERCENT if o.cpu_percent > 0.0 else 0.0,
         )  # fmt: skip
     return made
 
