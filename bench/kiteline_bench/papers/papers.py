@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from kiteline_bench.harness.bars import Run
-from kiteline_bench.papers import ekf
+from kiteline_bench.papers import ekf, governor
 
-PARTS: dict[str, tuple[str, Run]] = {"ekf": (ekf.TITLE, ekf.run)}
+PARTS: dict[str, tuple[str, Run]] = {
+    "ekf": (ekf.TITLE, ekf.run),
+    "governor": (governor.TITLE, governor.run),
+}
