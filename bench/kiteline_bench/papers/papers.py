@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from kiteline_bench.harness.bars import Run
-from kiteline_bench.papers import ekf, governor
+from kiteline_bench.papers import ds_ptam, ekf, governor
 
 PARTS: dict[str, tuple[str, Run]] = {
     "ekf": (ekf.TITLE, ekf.run),
+    "ds-ptam": (ds_ptam.TITLE, ds_ptam.run),
     "governor": (governor.TITLE, governor.run),
 }

@@ -1,4 +1,4 @@
-"""CPU time of this process, and a limit on processes by the kernel (cgroup v1)."""
+"""CPU time of this process, and a limit on processes by the kernel (cgroup v1 or v2)."""
 
 from __future__ import annotations
 
@@ -6,11 +6,12 @@ import contextlib
 import math
 import os
 import time
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 from kiteline_hw.system.closing import Closing
 
-_CGROUP = Path("/sys/fs/cgroup/cpu")
 _PERIOD_US = 50_000  # us; a twentieth of the one-second window over which the limit must hold
 _MAX_PERIOD_US = 500_000  # us; for small limits, whose quota would fall below the minimum in a shorter period
 _MIN_QUOTA_US = 1_000  # us; the kernel accepts no less
@@ -25,13 +26,36 @@ class QuotaError(OSError):
     """A CPU limit that cannot be set on this machine. The text says why."""
 
 
+@dataclass(frozen=True, slots=True)
+class _Controller:
+    """How one version of cgroups limits CPU time. marks: files of the root that tell it; limit: what is written."""
+
+    version: str
+    root: Path
+    marks: tuple[str, ...]
+    limit: Callable[[int, int], tuple[tuple[str, str], ...]]  # (quota us, period us) -> files and their texts
+
+
+_CONTROLLERS = (
+    _Controller(
+        "v1", Path("/sys/fs/cgroup/cpu"), ("cpu.cfs_quota_us", "cgroup.procs"),
+        lambda quota, period: (("cpu.cfs_period_us", str(period)), ("cpu.cfs_quota_us", str(quota))),
+    ),
+    _Controller(
+        "v2", Path("/sys/fs/cgroup"), ("cgroup.controllers", "cgroup.subtree_control", "cgroup.procs"),
+        lambda quota, period: (("cpu.max", f"{quota} {period}"),),
+    ),
+)  # fmt: skip
+
+
 class CpuQuota(Closing):
     """Limits a group of processes to `percent` of one core with the kernel's CFS bandwidth control.
 
     Raises QuotaError if the limit cannot be set, ValueError if the percentage is out of range.
     """
 
-    def __init__(self, percent: float, *, root: Path = _CGROUP) -> None:
+    def __init__(self, percent: float, *, root: Path | None = None) -> None:
+        """root: of the cgroups, v1's cpu controller or v2's; None: where Linux has them."""
         min_percent = 100.0 * _MIN_QUOTA_US / _MAX_PERIOD_US
         if not min_percent <= percent <= 100.0 * (os.cpu_count() or 1):
             raise ValueError(
@@ -39,26 +63,29 @@ class CpuQuota(Closing):
             )
         period_us = max(_PERIOD_US, math.ceil(100.0 * _MIN_QUOTA_US / percent))
         quota_us = max(round(percent / 100.0 * period_us), _MIN_QUOTA_US)
+        controller, self._root = _controller(root)
         reason = self.unavailable(root)
-        if reason is not None:
+        if controller is None or reason is not None:
             raise QuotaError(reason)
-        self._root = root
-        self._group = root / f"kiteline-{os.getpid()}-{time.monotonic_ns()}"
+        self._group = self._root / f"kiteline-{os.getpid()}-{time.monotonic_ns()}"
         try:
+            if controller.version == "v2":
+                _enable_cpu(self._root)
             self._group.mkdir()
-            (self._group / "cpu.cfs_period_us").write_text(str(period_us))
-            (self._group / "cpu.cfs_quota_us").write_text(str(quota_us))
+            for file, text in controller.limit(quota_us, period_us):
+                (self._group / file).write_text(text)
         except OSError as error:
             self.close()
             raise QuotaError(f"the kernel refused a CPU limit in {self._group}: {error}") from error
 
     @staticmethod
-    def unavailable(root: Path = _CGROUP) -> str | None:
+    def unavailable(root: Path | None = None) -> str | None:
         """The reason why no limit can be set on this machine, or None."""
-        if not (root / "cpu.cfs_quota_us").exists() and not (root / "cgroup.procs").exists():
-            return f"no cgroup v1 cpu controller at {root}: use the virtual CPU (replay --cpu) or systemd's CPUQuota="
-        if not os.access(root, os.W_OK):
-            return f"{root} is not writable for this user: run as root, or use systemd's CPUQuota="
+        controller, found = _controller(root)
+        if controller is None:
+            return f"no cgroup v1 or v2 cpu controller at {found}: use the virtual CPU (--cpu) or systemd's CPUQuota="
+        if not os.access(found, os.W_OK):
+            return f"{found} is not writable for this user: run as root, or use systemd's CPUQuota="
         return None
 
     def add(self, pid: int) -> None:
@@ -70,9 +97,29 @@ class CpuQuota(Closing):
 
     def close(self) -> None:
         """Remove the limit: all processes return to the root group. May be called twice."""
+        with contextlib.suppress(OSError):  # processes that the root group does not take stay, without a limit
+            if (self._group / "cpu.max").exists():
+                (self._group / "cpu.max").write_text("max")
         with contextlib.suppress(OSError):
             for pid in (self._group / "cgroup.procs").read_text().split():
                 with contextlib.suppress(OSError):
                     (self._root / "cgroup.procs").write_text(pid)
         with contextlib.suppress(OSError):
             self._group.rmdir()
+
+
+def _controller(root: Path | None) -> tuple[_Controller | None, Path]:
+    """The first version of cgroups whose files are at the root, or where Linux has them; and that root."""
+    for controller in _CONTROLLERS:
+        at = root or controller.root
+        if all((at / mark).exists() for mark in controller.marks):
+            if controller.version == "v1" or "cpu" in (at / "cgroup.controllers").read_text().split():
+                return controller, at
+    return None, root or _CONTROLLERS[0].root
+
+
+def _enable_cpu(root: Path) -> None:
+    """Let groups below a v2 root limit CPU time. Raises OSError."""
+    enabled = root / "cgroup.subtree_control"
+    if "cpu" not in enabled.read_text().split():
+        enabled.write_text("+cpu")

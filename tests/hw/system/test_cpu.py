@@ -57,11 +57,26 @@ def test_the_kernel_limits_a_process() -> None:
 
 
 def test_limits_that_cannot_be_set(tmp_path: Path) -> None:
-    with pytest.raises(QuotaError, match="no cgroup v1"):
+    with pytest.raises(QuotaError, match="no cgroup v1 or v2"):
         CpuQuota(50.0, root=tmp_path)
     for percent in (0.0, -1.0, float("nan"), 0.1, 1e9):
         with pytest.raises(ValueError, match=r"expected 0\.2 to 100 per core"):
             CpuQuota(percent)
+
+
+def test_the_second_version_of_cgroups(tmp_path: Path) -> None:
+    for file, text in (("cgroup.controllers", "memory io"), ("cgroup.subtree_control", "io"), ("cgroup.procs", "")):
+        (tmp_path / file).write_text(text)
+    assert "no cgroup" in str(CpuQuota.unavailable(tmp_path))
+    (tmp_path / "cgroup.controllers").write_text("cpuset cpu io")
+    assert CpuQuota.unavailable(tmp_path) is None
+    with CpuQuota(25.0, root=tmp_path) as quota:
+        assert (tmp_path / "cgroup.subtree_control").read_text() == "+cpu"
+        assert (quota._group / "cpu.max").read_text() == "12500 50000"
+        quota.add(4711)
+        assert (quota._group / "cgroup.procs").read_text() == "4711"
+    assert (quota._group / "cpu.max").read_text() == "max"  # files stay here, as this folder is no kernel's
+    assert (tmp_path / "cgroup.procs").read_text() == "4711"
 
 
 @pytest.mark.parametrize(("percent", "period_us", "quota_us"), [(25.0, 50_000, 12_500), (1.0, 100_000, 1_000)])
