@@ -1,6 +1,6 @@
 """Ids that carry their origin: (agent, boot, submap, sequence[, keypoint]) packed into one non-negative int64.
 
-Bit layout of a landmark id, most significant first: agent 6 | boot 19 | submap 10 | sequence 17 | keypoint 11.
+Bit layout of a landmark id, most significant first: agent 8 | boot 18 | submap 10 | sequence 16 | keypoint 11.
 A keyframe id is a landmark id without the keypoint bits; a submap id is a keyframe id without the sequence bits. A
 landmark is named by the keyframe and keypoint at which it was new, so its id costs no bytes beyond its keypoint. The
 first boot of an agent is drawn at random: numbers of a lost or a cloned card are most likely others.
@@ -15,12 +15,12 @@ SubmapId = NewType("SubmapId", int)
 KeyframeId = NewType("KeyframeId", int)
 LandmarkId = NewType("LandmarkId", int)
 
-BOOT_BITS = 19
+BOOT_BITS = 18
 SUBMAP_BITS = 10
-SEQUENCE_BITS = 17
+SEQUENCE_BITS = 16
 KEYPOINT_BITS = 11
 
-MAX_AGENTS = 1 << 6
+MAX_AGENTS = 1 << 8
 MAX_BOOTS = 1 << BOOT_BITS
 MAX_SUBMAPS = 1 << SUBMAP_BITS
 MAX_KEYFRAMES = 1 << SEQUENCE_BITS

@@ -7,13 +7,13 @@ import pytest
 from kiteline_agent.__main__ import main
 
 
-@pytest.mark.parametrize("agent", ["64", "-1"])
+@pytest.mark.parametrize("agent", ["256", "-1"])
 def test_a_number_that_no_agent_can_have_is_refused_before_anything_else(
     agent: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit, match="2"):
         main(["nothing", f"--agent={agent}", "--link", "zenoh:tcp/10.0.0.1:7447"])
-    assert "expected 0 to 63" in capsys.readouterr().err
+    assert "expected 0 to 255" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("given", [["--obstacles"], ["--imu", "controller"], ["--grid", "base"]], ids=" ".join)

@@ -28,7 +28,7 @@ keys = st.builds(Key, st.integers(0, 255), st.integers(0, 2**62), st.integers(0,
 values = st.dictionaries(keys, st.binary(max_size=30), max_size=4)
 codes = st.builds(SavedValues, values, values)
 memory = st.dictionaries(st.text("abc/01", min_size=1, max_size=5), st.text(max_size=20), max_size=3)
-maps = st.builds(SavedMap, st.dictionaries(st.integers(0, 63).map(AgentId), codes, max_size=3), memory)
+maps = st.builds(SavedMap, st.dictionaries(st.integers(0, 255).map(AgentId), codes, max_size=3), memory)
 
 
 def without_nothing(kept: SavedMap) -> SavedMap:

@@ -444,7 +444,7 @@ def test_packets() -> None:
     for name, packet in wire:
         assert zlib.crc32(packet[:-4]) == int.from_bytes(packet[-4:], "little")
         s = Source(packet[:-4])
-        assert s.u8() == PROTOCOL_VERSION == 6
+        assert s.u8() == PROTOCOL_VERSION == 7
         flags = s.u8()
         assert s.varint() == {"agent": 5, "base": 700}[name]
         assert s.varint() in (0, {"agent": 700, "base": 5}[name])

@@ -15,6 +15,7 @@ from kiteline_codec.sync.resumption import agent_session
 from kiteline_codec.transport.link_traits import LinkTraits
 from kiteline_codec.transport.seal import seal_bytes, suite_for
 from kiteline_core import config as configuration
+from kiteline_core.ids import MAX_AGENTS
 
 GRIDS = ("agent", "base", "off")  # who makes scans of ground and obstacles
 LOG_STEM = "boot"  # of the names of logs of `kiteline agent --log`
@@ -128,7 +129,7 @@ def channel_for(options: AgentOptions, link: LinkTraits, spill: Spill | None = N
 
 def coded_channel_for(options: AgentOptions, link: LinkTraits, spill: Spill | None) -> CodedChannel:
     """The agent's end of the codec."""
-    sealed = seal_bytes(suite_for(link)) if options.key else 0
+    sealed = seal_bytes(suite_for(link), options.agent) if options.key else 0
     session = agent_session(options.order, options.boot)
     return coded_channel(session, options.up_bytes_s, options.profile, sealed, link, spill, bounded=True)
 
@@ -143,7 +144,7 @@ def parser(forms: str = "") -> argparse.ArgumentParser:
     p.add_argument("source", metavar="SOURCE", nargs="?")
     p.add_argument("--link", metavar="LINK", default="none", help="the way to the base (default: none)")
     p.add_argument(
-        "--agent", metavar="N", type=int, default=0, help="number of this agent, 0 to 63, its own in a group"
+        "--agent", metavar="N", type=int, default=0, help=f"number of this agent in its group, 0 to {MAX_AGENTS - 1}"
     )
     p.add_argument("--config", metavar="F", default="", help="a TOML file with an [agent] section")
     p.add_argument(

@@ -17,10 +17,10 @@ from typing import Any
 from kiteline_basestation.store.saved_map import SavedMap, SavedValues, value_name
 from kiteline_codec.schema import Key
 from kiteline_core.errors import KitelineError
-from kiteline_core.ids import AgentId
+from kiteline_core.ids import MAX_AGENTS, AgentId
 
 _APPLICATION = 0x6B6C6D70  # "klmp"
-VERSION = 4  # of the tables; a store of another version is refused
+VERSION = 5  # of the tables; a store of another version is refused
 _SUM_BYTES = 8
 _TABLES = """
 CREATE TABLE code (
@@ -33,7 +33,7 @@ INSERT INTO total VALUES ('code', 0, 0), ('state', 0, 0);
 """
 
 Row = tuple[int, int, int, int, int, bytes]
-_LIMITS = (63, 1, 255, (1 << 63) - 1, 0xFFFF)  # agent, own, kind, id, part
+_LIMITS = (MAX_AGENTS - 1, 1, 255, (1 << 63) - 1, 0xFFFF)  # agent, own, kind, id, part
 
 
 class StoreError(KitelineError):

@@ -13,8 +13,8 @@ from typing import Any, ClassVar, NamedTuple, Protocol, Self, TypeVar
 
 from kiteline_codec.coding.packing import Reader, WireError, Writer
 
-MAX_AGENT_ID = 63
-MAX_SUBMAP_ID = (1 << 35) - 1
+MAX_AGENT_ID = (1 << 8) - 1
+MAX_SUBMAP_ID = (1 << 36) - 1
 MAX_KEYFRAME_ID = (1 << 52) - 1  # as laid out in kiteline_core.ids
 MAX_TILE_ID = (1 << 48) - 1
 MAX_PARTS = 1 << 8

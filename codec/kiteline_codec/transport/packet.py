@@ -8,7 +8,7 @@ from zlib import crc32
 from kiteline_codec.coding.packing import Reader, Writer
 from kiteline_codec.schema import Key, WireError
 
-PROTOCOL_VERSION = 6
+PROTOCOL_VERSION = 7
 CRC_BYTES = 4
 DIGEST_BYTES = 16
 MASK_BITS = 64  # packets before the last one that an acknowledgement covers

@@ -26,11 +26,12 @@ if TYPE_CHECKING:
 KEY_BYTES = 32
 EARLIER_BOOT = "earlier boot"
 WINDOW_PACKETS = 1024  # a packet further behind the newest one is refused; no link reorders so much
-_MAX_AGENT = 63
+_MAX_AGENT = (1 << 8) - 1
+_SHORT_AGENTS = 63  # agents below fit the first byte of a packet; in others' it is 63, and a byte follows
 _MAX_BOOT = (1 << 48) - 1
 _MAX_COUNTER = (1 << 40) - 1
 SALT_BYTES = {0: 8, 1: 0}  # by suite: a tag needs none
-_MOST_HEAD_BYTES = 1 + 7 + 6 + 8  # of a packet before its content
+_MOST_HEAD_BYTES = 2 + 7 + 6 + 8  # of a packet before its content
 
 
 class Suite(IntEnum):
@@ -50,9 +51,35 @@ class Direction(IntEnum):
 _TAG_BYTES = {Suite.ENCRYPTED: 16, Suite.TAGGED: 8}
 
 
-def seal_bytes(suite: Suite) -> int:
-    """Bytes that sealing adds to a packet at most, below 2^42 as a boot and 2^28 packets."""
-    return 1 + 6 + 4 + SALT_BYTES[suite] + _TAG_BYTES[suite]
+def seal_bytes(suite: Suite, agent: int = 0) -> int:
+    """Bytes that sealing adds to an agent's packets at most, below 2^42 as a boot and 2^28 packets."""
+    return 1 + (agent >= _SHORT_AGENTS) + 6 + 4 + SALT_BYTES[suite] + _TAG_BYTES[suite]
+
+
+def _head(suite: Suite, direction: Direction, agent: int) -> bytes:
+    """What a packet begins with."""
+    short = min(agent, _SHORT_AGENTS)
+    return bytes((suite << 7 | direction << 6 | short,)) + (b"" if agent < _SHORT_AGENTS else bytes((agent,)))
+
+
+def _read_head(source: Reader) -> tuple[Suite, Direction, int]:
+    """The reverse of `_head`. Raises WireError."""
+    first = source.u8()
+    agent = first & _SHORT_AGENTS
+    if agent == _SHORT_AGENTS:
+        agent = source.u8()
+        if agent < _SHORT_AGENTS:
+            raise WireError(f"agent {agent} in two bytes, expected one")
+    return Suite(first >> 7), Direction(first >> 6 & 1), agent
+
+
+def named_agent(sealed: bytes) -> int | None:
+    """The agent that a tagged packet names; None for anything else."""
+    try:
+        suite, _, agent = _read_head(Reader(sealed))
+    except WireError:
+        return None
+    return agent if suite is Suite.TAGGED else None
 
 
 def suite_for(link: LinkTraits) -> Suite:
@@ -103,7 +130,7 @@ class Sealer:
         """boot: number of this start of the writer, never used again. draw: random bytes. Raises ValueError."""
         if not (0 <= agent <= _MAX_AGENT and 0 <= boot <= _MAX_BOOT):
             raise ValueError(f"agent {agent} is 0..{_MAX_AGENT} and boot {boot} is 0..{_MAX_BOOT}")
-        self._first = suite << 7 | direction << 6 | agent
+        self._first = _head(suite, direction, agent)
         self._boot = boot
         self._suite = suite
         self._key = _derived(key, suite, direction)
@@ -123,13 +150,13 @@ class Sealer:
         if self._counter > _MAX_COUNTER:
             raise OverflowError("no nonces left in this boot")
         head = Writer()
-        head.u8(self._first)
+        head.raw(self._first)
         head.varint(self._boot)
         head.varint(self._counter)
         data = head.bytes() + self._salt
         if self._suite == Suite.TAGGED:
             return data + packet + _tag(self._key, data + packet)
-        nonce = _nonce(self._first, self._boot, self._counter)
+        nonce = _nonce(self._first[0], self._boot, self._counter)
         return data + _cipher(self._key).encrypt(nonce, packet, data)
 
 
@@ -200,12 +227,12 @@ class Opener:
         """The agent and the packet, or None. Never raises."""
         source = Reader(sealed)
         try:
-            first, boot, counter = source.u8(), source.varint(_MAX_BOOT), source.varint(_MAX_COUNTER)
-            salt = source.raw(SALT_BYTES[first >> 7])
+            suite, direction, agent = _read_head(source)
+            boot, counter = source.varint(_MAX_BOOT), source.varint(_MAX_COUNTER)
+            salt = source.raw(SALT_BYTES[suite])
         except WireError:
             self.counters.truncated += 1
             return None
-        suite, direction, agent = Suite(first >> 7), first >> 6 & 1, first & _MAX_AGENT
         body_at = len(sealed) - source.left
         if source.left < _TAG_BYTES[suite]:
             self._refuse("truncated", agent)
@@ -223,7 +250,7 @@ class Opener:
         heard = self._salted.get(agent)
         if salt:
             key = heard[1] if heard is not None and heard[0] == salt else _salted(key, salt)
-        packet = self._opened(key, suite, sealed[:body_at], sealed[body_at:], _nonce(first, boot, counter))
+        packet = self._opened(key, suite, sealed[:body_at], sealed[body_at:], _nonce(sealed[0], boot, counter))
         if packet is None:
             self._refuse("forged", agent)
             return None

@@ -9,12 +9,12 @@ from __future__ import annotations
 from enum import IntEnum
 from zlib import crc32
 
+from kiteline_codec.transport import seal
 from kiteline_codec.transport.packet import CRC_BYTES
-from kiteline_codec.transport.seal import EARLIER_BOOT, Direction, Opener, Suite
+from kiteline_codec.transport.seal import EARLIER_BOOT, Direction, Opener
 
 _MAGIC = b"\0kiteline"
 _REPLY_EVERY = 32  # refused packets for one notice
-_AGENT_BITS = 63
 _SURE = 3  # refused packets in a row before it is said: one may be damaged
 _WELL = 500  # sound packets in a row after which a trouble is over, and is said anew if it comes again
 
@@ -81,7 +81,7 @@ def is_plain(packet: bytes) -> bool:
 
 def named_agent(packet: bytes) -> int:
     """The agent that a packet of a thin link names; 0 where it names none."""
-    return packet[0] & _AGENT_BITS if packet and packet[0] >> 7 == Suite.TAGGED else 0
+    return seal.named_agent(packet) or 0
 
 
 class SealWatch:

@@ -17,6 +17,7 @@ from typing import Any
 
 import zenoh
 
+from kiteline_core.ids import MAX_AGENTS
 from kiteline_hw.links.ends import LinkOptions
 from kiteline_hw.links.queued_link import INBOX_BYTES, MOST_PACKET_BYTES, LinkCounters, QueuedLink
 from kiteline_hw.links.zenoh_access import Instances, access_of_base
@@ -24,13 +25,13 @@ from kiteline_hw.links.zenoh_session import close_session, direct, no_stop_at_ex
 from kiteline_hw.ports import ByteLink, LinkError
 from kiteline_hw.system.closing import Closing
 
-_MAX_AGENT = 63  # agent numbers have six bits
+_MAX_AGENT = MAX_AGENTS - 1
 _NEW_AGENT_S = 0.05  # s until the hub's sender thread notices a new agent
 # s within which a live base must have answered. Over UDP, Zenoh's own declarations may be lost for good: then the
 # session is opened anew. The limit doubles each time, because the link may just be slow.
 _SILENCE_S = 3.0
 _LONGEST_SILENCE_S = 24.0
-_INBOXES_BYTES = 8 << 20  # memory for the packets of all agents: strangers may fill the inboxes of 64
+_INBOXES_BYTES = 8 << 20  # memory for the packets of all agents: strangers may fill the inboxes of 256
 _JOIN_S = 0.3  # s for the sender thread to notice the end; it is a daemon and never keeps the process alive
 
 

@@ -20,7 +20,8 @@ import zenoh
 
 from kiteline_hw.ports import LinkError
 
-_MAX_SESSIONS = 96  # with one process: 64 agents, and programs that ask for maps
+_MAX_SESSIONS = 96  # where anyone may connect: each takes memory. Agents, and programs that ask for maps
+_MAX_PAIRED_SESSIONS = 288  # where only the paired may: 256 agents, and those programs
 _MOST_MESSAGE_BYTES = 1 << 18  # that a base takes in: four of the longest packets
 CLOSE_TIMEOUT_S = 1.5  # s; a frozen peer can stall a close for much longer: then the session is abandoned
 CONNECT_TIMEOUT_MS = 4000  # ms of one attempt to connect: two round trips with 900 ms of delay each way
@@ -65,7 +66,7 @@ def session_config(
         options["transport/auth/usrpwd/dictionary_file"] = list_of_logins
     if access is not None and role == "base":
         options["transport/link/rx/max_message_size"] = _MOST_MESSAGE_BYTES
-        options["transport/unicast/max_sessions"] = _MAX_SESSIONS
+        options["transport/unicast/max_sessions"] = _MAX_PAIRED_SESSIONS if list_of_logins else _MAX_SESSIONS
         if config.get_json("access_control/enabled") == "false":  # a ZENOH_CONFIG that has its own is kept
             options["access_control"] = access
     try:

@@ -14,11 +14,12 @@ import stat
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from kiteline_core.ids import MAX_AGENTS
 from kiteline_hw.ports import LinkError
 
 KEY_BYTES = 32
 MAPS = "maps"
-_MAX_AGENT = 63
+_MAX_AGENT = MAX_AGENTS - 1
 _HEAD = (
     "# kiteline keys: agent, secret. Give an agent its own line, the base station all lines; show them to nobody.\n"
     "# maps: the right to change maps.\n"

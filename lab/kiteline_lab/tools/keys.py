@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from kiteline_codec.transport.seal import fingerprint
+from kiteline_core.ids import MAX_AGENTS
 from kiteline_hw.system.key_store import MAPS, default_path, new_code, new_key, new_maps_key, pair, read_file
 
 
@@ -19,10 +20,10 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--file", metavar="F", type=Path, default=None, help=f"default: {default_path()}")
     commands = p.add_subparsers(dest="command", required=True)
     paired = commands.add_parser("pair", help="pair an agent with a base: without CODE at the base, with it there")
-    paired.add_argument("agent", metavar="AGENT", type=int, help="number of the agent, 0 to 63")
+    paired.add_argument("agent", metavar="AGENT", type=int, help=f"number of the agent, 0 to {MAX_AGENTS - 1}")
     paired.add_argument("code", metavar="CODE", nargs="?", default="", help="as the base shows it")
     new = commands.add_parser("new", help="make a key for an agent, or for the right to change maps")
-    new.add_argument("agent", metavar="AGENT", help=f"number of the agent, 0 to 63, or {MAPS}")
+    new.add_argument("agent", metavar="AGENT", help=f"number of the agent, 0 to {MAX_AGENTS - 1}, or {MAPS}")
     new.add_argument("--replace", action="store_true", help="replace the key it has; the old one is void then")
     show = commands.add_parser("show", help="list agents with the fingerprints of their keys")
     show.add_argument("--secret", metavar="AGENT", default=None, help="print this agent's line of the file")
@@ -70,7 +71,7 @@ def _pair(path: Path, agent: int, code: str, file: str) -> None:
 
 def _agent(p: argparse.ArgumentParser, text: str) -> int:
     if not text.isdecimal():
-        p.error(f"{text!r} is no agent's number, 0 to 63, and not {MAPS}")
+        p.error(f"{text!r} is no agent's number, 0 to {MAX_AGENTS - 1}, and not {MAPS}")
     return int(text)
 
 

@@ -50,6 +50,7 @@ from kiteline_core.geometry import se3, sim3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ground.column_scan import ColumnScan, level_rotation
 from kiteline_core.ids import (
+    MAX_BOOTS,
     MAX_KEYFRAMES,
     MAX_SUBMAPS,
     NO_KEYFRAME,
@@ -86,9 +87,11 @@ def a_scan(seed: int, n: int) -> ColumnScan:
 def some_records(seed: int, n: int) -> list[Record]:
     """One record of each kind, two scans, with n rows."""
     rng, steps = np.random.default_rng(seed), np.random.default_rng(seed + 1)
-    agent, high, middle, low = (int(rng.integers(*r)) for r in ((64,), (1 << 14,), (1 << 12,), (50, 1 << 20)))
+    agent, high, middle, low = (int(rng.integers(*r)) for r in ((256,), (1 << 14,), (1 << 12,), (50, 1 << 20)))
     number = high << 32 | middle << 20 | low  # of boot, submap and sequence
-    submap = submap_id(agent, number >> SUBMAP_BITS + SEQUENCE_BITS, number >> SEQUENCE_BITS & MAX_SUBMAPS - 1)
+    submap = submap_id(
+        agent, number >> SUBMAP_BITS + SEQUENCE_BITS & MAX_BOOTS - 1, number >> SEQUENCE_BITS & MAX_SUBMAPS - 1
+    )
     keyframe = keyframe_id(submap, max(50, number & MAX_KEYFRAMES - 1))
     pose = se3.exp(np.concatenate([rng.normal(0, 3, 3), rng.normal(0, 0.5, 3)]))
     index = np.sort(rng.permutation(2048)[:n]).astype(np.uint16)
@@ -100,7 +103,7 @@ def some_records(seed: int, n: int) -> list[Record]:
     camera = RectifiedCamera(752, 480, 458.5, 457.25, 367.0, 248.5, 0.11, bool(rng.integers(2)), T_b_c)
     return [
         CameraIntrinsics(AgentId(3), camera),
-        LivePose(AgentId(63), int(rng.integers(1 << 62)), keyframe, pose, int(rng.integers(-1, 101))),
+        LivePose(AgentId(255), int(rng.integers(1 << 62)), keyframe, pose, int(rng.integers(-1, 101))),
         LivePose(AgentId(0), 0, NO_KEYFRAME, np.eye(4), -1),
         KeyframeHeader(keyframe, int(rng.integers(1 << 62)), KeyframeId(keyframe - 3), pose, n),
         KeyframeHeader(keyframe, 5, NO_KEYFRAME, pose, 0),
@@ -249,7 +252,7 @@ def test_errors_say_what_was_expected() -> None:
     with pytest.raises(WireError, match="kind 15 is unknown"):
         messages.decode(Key(15, 0), b"")
     with pytest.raises(WireError, match="out of range"):
-        messages.decode(Key(LivePose.KIND, 64), b"")
+        messages.decode(Key(LivePose.KIND, 256), b"")
     pose = messages.encode(KeyframePose(KeyframeId(1), np.eye(4)))
     with pytest.raises(WireError, match="1 bytes too many"):
         messages.decode(Key(KeyframePose.KIND, 1), pose + b"\1\1")

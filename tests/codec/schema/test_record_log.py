@@ -13,7 +13,7 @@ from kiteline_core.ids import AgentId
 keys = st.builds(Key, st.integers(0, 255), st.integers(0, 2**62), st.integers(0, 65535))
 
 
-@given(st.integers(0, 63).map(AgentId), keys, st.binary(max_size=40))
+@given(st.integers(0, 255).map(AgentId), keys, st.binary(max_size=40))
 def test_what_was_written_is_read(agent: AgentId, key: Key, code: bytes) -> None:
     assert read_record(write_record(agent, key, code)) == (agent, key, code)
 

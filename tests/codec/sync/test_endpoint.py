@@ -311,7 +311,7 @@ def test_another_protocol_version_is_refused_by_name() -> None:
     assert packet is not None
     other = bytes([9]) + packet[1:-4]
     assert b.receive(other + zlib.crc32(other).to_bytes(4, "little"), 0) == []
-    assert b.stats.reasons == (("the other side speaks protocol version 9, this one 6", 1),)
+    assert b.stats.reasons == (("the other side speaks protocol version 9, this one 7", 1),)
     assert b.receive(packet[:-1] + b"?", 0) == []
     assert b.stats.rejected == 2
     assert b.peer_session is None

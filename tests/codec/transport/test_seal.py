@@ -39,9 +39,25 @@ def test_a_packet_goes_through_once(suite: Suite) -> None:
         assert theirs.open(sealed[i]) is None
     assert theirs.counters.opened == theirs.counters.replayed == 20
     assert max(map(len, sealed)) - 19 <= seal_bytes(suite)
-    most = Sealer(KEY, 63, (1 << 42) - 1, Direction.UP, suite)
-    most._counter = (1 << 28) - 2
-    assert len(most.seal(b"")) == seal_bytes(suite)
+    for agent in (62, 63, 255):
+        most = Sealer(KEY, agent, (1 << 42) - 1, Direction.UP, suite)
+        most._counter = (1 << 28) - 2
+        assert len(most.seal(b"")) == seal_bytes(suite, agent)
+    assert seal_bytes(suite, 62) == seal_bytes(suite) == seal_bytes(suite, 63) - 1
+
+
+@SUITES
+def test_agents_of_one_and_of_two_bytes_are_told_apart(suite: Suite) -> None:
+    keys = {agent: bytes([agent]) * 32 for agent in (0, 62, 63, 64, 127, 255)}
+    theirs = Opener(keys, Direction.UP)
+    for agent, key in keys.items():
+        sealed = Sealer(key, agent, 5, Direction.UP, suite).seal(b"kite")
+        assert theirs.open(sealed) == (agent, b"kite")
+        assert seal.named_agent(sealed) == (agent if suite is Suite.TAGGED else None)
+        if agent >= 63:
+            assert theirs.open(sealed[:1] + bytes([62]) + sealed[2:]) is None
+            assert theirs.counters.truncated == 1
+            theirs.counters.truncated = 0
 
 
 @SUITES

@@ -157,7 +157,7 @@ def test_a_question_is_not_taken_by_another_start_of_the_base() -> None:
         QuestionGuard(lambda: OURS, "second").open("delete", moved, 1020)
 
 
-@pytest.mark.parametrize("agent", [0, 5, 63])
+@pytest.mark.parametrize("agent", [0, 5, 63, 255])
 def test_a_packet_of_a_line_names_its_agent(agent: int) -> None:
     base = SealWatch(Direction.DOWN, Opener({agent: OURS}, Direction.UP))
     opened, _ = base.take(None, Sealer(OURS, agent, 4, Direction.UP, Suite.TAGGED).seal(packet()))

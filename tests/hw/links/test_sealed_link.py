@@ -164,4 +164,4 @@ def test_a_missing_key_file_names_the_command(tmp_path: Path) -> None:
     with pytest.raises(LinkError, match=r"kiteline keys --file \S+ pair N"):
         read_keys(tmp_path / "none")
     with pytest.raises(LinkError, match="0 to 63"):
-        new_key(tmp_path / "keys", 64)
+        new_key(tmp_path / "keys", 256)

@@ -45,7 +45,7 @@ def test_a_base_on_a_network_makes_keys_at_its_first_start_and_says_how_to_pair(
     assert "new keys" in first.lines[0] and "kiteline keys pair" in first.lines[0]
     assert stat.S_IMODE(default_path().stat().st_mode) == 0o600
     keys = read_file(default_path())
-    assert len(keys.agents) == 64 and len(set(keys.agents.values())) == 64 and keys.maps is not None
+    assert len(keys.agents) == 256 and len(set(keys.agents.values())) == 256 and keys.maps is not None
     assert "new keys" not in sealing_of(NETWORK, "base", 0, "", insecure=False).lines[0]
     assert read_file(default_path()) == keys
     # an agent of the same user on the same machine needs no pairing
