@@ -264,6 +264,7 @@ def settled(channel: RecordChannel) -> tuple[bool, bool]:
 UNUSED_BYTES = 32 << 20  # memory of a base for an agent of whose keyframes none was of use: some 300 of them
 _SPILLED_BYTES = 2 << 20  # memory for own values: some 140 keyframes, three times a local map
 _SPILLED_INBOX_BYTES = 1 << 20  # memory for the peer's values: some 400 keyframes
+_PEER_BYTES = 2 << 20  # memory of a base for an agent's values at hand: some 170 keyframes; older ones are packed
 _UNSPILLED_BYTES = 7 << 20  # memory for own values if old ones are lost: five minutes without a link
 
 
@@ -296,7 +297,7 @@ def coded_channel(
         overhead_bytes=seal_bytes + (shape.overhead_bytes if overhead_bytes is None else overhead_bytes),
         budget_bytes=limit,
         heartbeat_ns=shape.heartbeat_ns,
-        resident_inbox_bytes=_SPILLED_INBOX_BYTES if bounded else None,
+        resident_inbox_bytes=_PEER_BYTES if peer is not None else _SPILLED_INBOX_BYTES if bounded else None,
         resident_bytes=None if not bounded else _UNSPILLED_BYTES if spill is None else _SPILLED_BYTES,
         unused_inbox_bytes=None if peer is None else UNUSED_BYTES,
     )

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from kiteline_basestation.map.map_tables import CULLED, OBSERVATION, REMOVED
+from kiteline_basestation.map.map_tables import CULLED, OBSERVATION, REMOVED, LandmarkDescriptors
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
@@ -237,3 +237,25 @@ def test_memory_stays_within_its_budget() -> None:
             np.zeros(200, np.uint8), np.zeros(200, np.uint8), rng.integers(0, 256, (200, 32), dtype=np.uint8),
         )  # fmt: skip
     assert sparse_map.nbytes() / 300 < 100_000
+
+
+def test_descriptors_are_held_for_landmarks_alone() -> None:
+    table, rng = LandmarkDescriptors(), np.random.default_rng(3)
+    table.grow(50_000)
+    plain = np.zeros((50_000, 32), np.uint8)
+    for _ in range(60):
+        slots = np.sort(rng.choice(50_000, 400, replace=False)).astype(np.int32)
+        if rng.random() < 0.4:
+            table.clear(slots)
+            plain[slots] = 0
+        else:
+            plain[slots] = rng.integers(1, 256, (400, 32))
+            table.put(slots, plain[slots])
+    every = np.arange(50_000, dtype=np.int32)
+    assert np.array_equal(table[every], plain)
+    assert table._top - 1 - len(table._free) == np.count_nonzero(plain.any(axis=1))
+    assert table.nbytes < plain.nbytes
+    table.clear(every)
+    top = table._top
+    table.put(every[: top - 1], plain[: top - 1])
+    assert table._top == top  # freed rows serve again

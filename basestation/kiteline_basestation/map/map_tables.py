@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from array import array
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -38,6 +39,52 @@ class KeyframeTable:
     scale: F64  # (n,) length in w of one unit of the submap; 1 unless the submap is monocular
 
 
+class LandmarkDescriptors:
+    """Descriptors (n,32) by slot; zero, and not held, where none was set: most keypoints are observations."""
+
+    def __init__(self) -> None:
+        self._row = np.zeros(0, np.int32)  # of each slot in `_held`; 0: none
+        self._held = np.zeros((1, 32), np.uint8)
+        self._top = 1  # rows in use, or free for the next ones
+        self._free = array("i")
+
+    def __getitem__(self, slots: I32) -> U8:
+        """Descriptors (n,32) at slots (n,); a copy."""
+        return self._held[self._row[slots]]
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all arrays."""
+        return self._row.nbytes + self._held.nbytes
+
+    def put(self, slots: I32, descriptors: U8) -> None:
+        """Set the descriptors (n,32) of different slots (n,)."""
+        fresh = slots[self._row[slots] == 0]
+        reused = min(len(self._free), len(fresh))
+        for slot in fresh[:reused].tolist():
+            self._row[slot] = self._free.pop()
+        new = len(fresh) - reused
+        if self._top + new > len(self._held):
+            held = np.zeros((self._top + new + max(4096, self._top // 4), 32), np.uint8)
+            held[: self._top] = self._held[: self._top]
+            self._held = held
+        self._row[fresh[reused:]] = np.arange(self._top, self._top + new, dtype=np.int32)
+        self._top += new
+        self._held[self._row[slots]] = descriptors
+
+    def grow(self, capacity: int) -> None:
+        """Make room for `capacity` slots."""
+        row = np.zeros(capacity, np.int32)
+        row[: len(self._row)] = self._row
+        self._row = row
+
+    def clear(self, slots: I32) -> None:
+        """Drop the descriptors of different slots (n,)."""
+        rows = self._row[slots]
+        self._free.extend(rows[rows > 0].tolist())
+        self._row[slots] = 0
+
+
 @dataclass(slots=True)
 class KeypointTable:
     """One row (slot) per keypoint; only the first `slots` rows are used."""
@@ -57,13 +104,16 @@ class KeypointTable:
     next: I32  # slot of the next observation of the same landmark, -1 none
     refined: F32  # of a landmark with flag REFINED: inverse depth in 1/m
     offset: F32  # (n,2) of a landmark: px from the keypoint to its refined projection
-    descriptor: U8  # (n,32) of a landmark
+    descriptor: LandmarkDescriptors  # (n,32) of a landmark
 
 
 def grow(table: KeyframeTable | KeypointTable, capacity: int) -> None:
     """Enlarge a table to `capacity` rows; new rows are zero."""
     for field in fields(table):
         old = getattr(table, field.name)
+        if isinstance(old, LandmarkDescriptors):
+            old.grow(capacity)
+            continue
         new = np.zeros((capacity, *old.shape[1:]), old.dtype)
         new[: len(old)] = old
         setattr(table, field.name, new)
@@ -72,7 +122,11 @@ def grow(table: KeyframeTable | KeypointTable, capacity: int) -> None:
 def clear(table: KeyframeTable | KeypointTable, rows: I32) -> None:
     """Set rows (n,) to zero, as new ones are."""
     for field in fields(table):
-        getattr(table, field.name)[rows] = 0
+        held = getattr(table, field.name)
+        if isinstance(held, LandmarkDescriptors):
+            held.clear(rows)
+        else:
+            held[rows] = 0
 
 
 def empty_keyframes() -> KeyframeTable:
@@ -88,5 +142,5 @@ def empty_keypoints() -> KeypointTable:
     f32x2 = np.zeros((0, 2), np.float32)
     return KeypointTable(
         f32x2, f32, u8, u8, u8, u8, u8, u8, np.zeros(0, np.int64), i32, i32, i32, i32, f32, f32x2,
-        np.zeros((0, 32), np.uint8),
+        LandmarkDescriptors(),
     )  # fmt: skip

@@ -131,7 +131,7 @@ class SparseMap(RigValues):
         table.inv_depth[slots] = inv_depth[keep]
         table.octave[slots] = octave[keep]
         table.angle[slots] = angle[keep]
-        table.descriptor[slots] = descriptor[keep]
+        table.descriptor.put(slots, descriptor[keep])
         fresh = slots[table.kind[slots] != LANDMARK]
         table.kind[slots] = LANDMARK
         table.part[slots] = part

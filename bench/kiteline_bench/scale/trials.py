@@ -41,6 +41,7 @@ _STEP_NS = 50_000_000
 _KEYFRAME_NS = 1_000_000_000
 _PLACE_M = 40.0  # between two places of a large map
 _ERROR = np.array([0.06, 0.0, 0.0, 0.0, 0.0, 0.0004])  # of an agent between two places: 0.15 %, and a slow turn
+_WORKER_S = 0.5  # that the worker may still take for the last keyframe's jobs
 _LAST = 1000  # keyframes over which steps are judged
 
 
@@ -141,13 +142,11 @@ def large_map(flight: RecordedFlight, keyframes: int) -> LargeMap:
             records = [*about, *group]
             flown.step_ms.clear()
             flown.step(records)
-            for _ in range(3):
-                flown.step(())
-            deadline_s = time.monotonic() + (0.5 if loop_begin_s is None else 0.1)
-            while not worker.idle and time.monotonic() < deadline_s:  # the worker keeps up, as at one keyframe a second
+            deadline_s = time.monotonic() + _WORKER_S
+            while not worker.idle and time.monotonic() < deadline_s:  # it keeps up, as at one keyframe a second
                 time.sleep(0.002)
-                if worker.idle or loop_begin_s is not None:
-                    flown.step(())
+            for _ in range(3):  # takes the result of the last keyframe's bundle, and begins this one's
+                flown.step(())
             count += 1
             found.step_ms.append(float(np.mean(flown.step_ms)))
             found.most_ms.append(max(flown.step_ms))

@@ -1,4 +1,4 @@
-"""Values moved out of memory: a few bytes a value stay here, the codes go to a spill file.
+"""Values set aside: a few bytes a value stay here, the codes go to a spill file, or stay here packed.
 
 A page holds all values of one id. It is written and read back as a whole. Pure: the spill file is handed in.
 """
@@ -48,7 +48,8 @@ class Row:
 @dataclass(slots=True)
 class _Page:
     rows: bytes
-    where: int | None  # in the spill; None: the codes are not kept
+    where: int | None  # in the spill
+    packed: bytes | None  # the codes, if they are kept here
     n_bytes: int  # of all codes
     hashes: int  # sum of the rows' hashes modulo 2^128
     least_version: int
@@ -59,8 +60,9 @@ class _Page:
 class Archive:
     """Pages by id. Without a spill, or when it fails, only pages that the peer holds are accepted, without codes."""
 
-    def __init__(self, spill: Spill | None) -> None:
-        self._spill = spill
+    def __init__(self, spill: Spill | None, *, packed: bool = False) -> None:
+        """packed: keep the codes of a page here, in one piece: a value then takes little more than its code."""
+        self._spill, self._packed = spill, packed
         self._pages: dict[int, _Page] = {}
         self._session = 0
         self._unsent: list[int] = []  # heap of -id of pages with anything to send
@@ -86,15 +88,16 @@ class Archive:
     def readable(self, id_: int) -> bool:
         """True if there is a page of this id whose codes are kept."""
         page = self._pages.get(id_)
-        return page is not None and page.where is not None
+        return page is not None and (page.where is not None or page.packed is not None)
 
     def put(self, id_: int, rows: Iterable[Row], hashes: int) -> bool:
         """Store the values of an id. Returns False if the peer may lack some and their codes cannot be kept."""
         rows = sorted(rows, key=lambda r: (r.kind, r.part))
         unacknowledged = [r.version for r in rows if not r.acknowledged]
-        where = None if self._spill is None else self._write(self._spill, id_, rows)
-        if where is None and unacknowledged:
+        where = None if self._spill is None or self._packed else self._write(self._spill, id_, rows)
+        if where is None and unacknowledged and not self._packed:
             return False
+        codes = b"".join(r.code or b"" for r in rows) if self._packed else None
         packed = b"".join(
             _ROW.pack(
                 r.kind, r.part, r.version, r.size,
@@ -105,7 +108,7 @@ class Archive:
         least = min(r.version for r in rows)
         n_bytes = sum(r.size for r in rows)
         from_version = min(unacknowledged, default=None)
-        self._pages[id_] = _Page(packed, where, n_bytes, hashes, least, from_version, self._session)
+        self._pages[id_] = _Page(packed, where, codes, n_bytes, hashes, least, from_version, self._session)
         self.values += len(rows)
         self.value_bytes += _size_of(rows)
         if from_version is not None:
@@ -124,7 +127,7 @@ class Archive:
     def take(self, id_: int) -> list[Row]:
         """Remove a page and return its values. Codes are None if they are not kept or cannot be read."""
         page = self._pages.pop(id_)
-        codes = None
+        codes = page.packed
         if page.where is not None and self._spill is not None:
             codes = self._spill.get(page.where, page.n_bytes)
         same_session = page.session == self._session

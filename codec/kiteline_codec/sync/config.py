@@ -55,7 +55,7 @@ class SyncConfig:
     # Of that, what the peer may claim before anything that it sent was of use (`Claims.earned`).
     unused_inbox_bytes: int | None = None  # None: all
     resident_bytes: int | None = None  # memory for own values of keyframes, archived pages apart; None: unlimited
-    resident_inbox_bytes: int | None = None  # the same for the peer's values of keyframes; needs a spill
+    resident_inbox_bytes: int | None = None  # the same for the peer's values; without a spill, older ones are packed
     order: Callable[[Key], Order] = default_order
 
     def __post_init__(self) -> None:

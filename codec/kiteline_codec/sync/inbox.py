@@ -1,6 +1,7 @@
 """What one session of the peer wrote, as far as it has arrived.
 
-With a limit and a spill, values of keyframes that were not used for long are archived until they are needed.
+With a limit, values of keyframes that were not used for long are archived until they are needed: in a spill, else
+packed.
 """
 
 from __future__ import annotations
@@ -117,11 +118,11 @@ class Inbox:
     """Packet numbers, values, removals and unfinished values of one session of the peer."""
 
     def __init__(self, resident_bytes: int | None = None, spill: Spill | None = None) -> None:
-        """resident_bytes: memory for values of keyframes, roughly; without it, or without a spill, unlimited."""
+        """resident_bytes: memory for values of keyframes that are at hand, roughly; None: all are."""
         self._values: dict[Key, tuple[int, bytes]] = {}
         self._hashed: dict[Key, int] = {}  # parts of the digest, of values that were not archived since they came
-        self._archive = Archive(spill)
-        self._resident = ResidentValues(None if spill is None else resident_bytes, VALUE_BYTES)
+        self._archive = Archive(spill, packed=spill is None)
+        self._resident = ResidentValues(resident_bytes, VALUE_BYTES)
         self.digest = Digest()
         self.value_bytes = 0  # of codes
         self.assembly_bytes = 0  # of values that have arrived in part, with what they take beside their bytes

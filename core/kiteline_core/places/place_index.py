@@ -93,9 +93,8 @@ class _Entry:
     signature: U64
     norm: float
 
-    @classmethod
-    def none(cls) -> _Entry:
-        return cls(np.empty(0, np.int32), np.empty(0, np.uint64), 0.0)
+
+_NO_WORDS = np.empty(0, np.uint8)
 
 
 class PlaceIndex:
@@ -111,7 +110,8 @@ class PlaceIndex:
         self._row: dict[int, int] = {}
         self._key = np.empty(0, np.int64)  # of each row; -1 unused
         self._norm = np.empty(0)  # of each row
-        self._entries: list[_Entry] = []
+        self._words: list[NDArray[np.unsignedinteger]] = []  # (n,) of each row; the postings hold their signatures
+        self._narrow = np.min_scalar_type(n)
         self._unused: list[int] = []
 
     def __len__(self) -> int:
@@ -129,13 +129,13 @@ class PlaceIndex:
         """Add or replace a place with its descriptors (n,32)."""
         self.remove(key)
         entry = self._entry(descriptors)
-        row = self._unused.pop() if self._unused else len(self._entries)
-        if row == len(self._entries):
-            self._entries.append(entry)
+        row = self._unused.pop() if self._unused else len(self._words)
+        if row == len(self._words):
+            self._words.append(_NO_WORDS)
             if row == len(self._key):
                 self._key = np.concatenate([self._key, np.full(max(64, row), -1, np.int64)])
                 self._norm = np.concatenate([self._norm, np.zeros(max(64, row))])
-        self._entries[row] = entry
+        self._words[row] = entry.word.astype(self._narrow)
         self._key[row], self._norm[row], self._row[key] = key, entry.norm, row
         done = 0
         while True:
@@ -152,8 +152,9 @@ class PlaceIndex:
         row = self._row.pop(key, None)
         if row is None:
             return
-        kernels.remove(self._entries[row].word, row, self._start, self._size, self._owner, self._signature)
-        self._entries[row] = _Entry.none()
+        word = self._words[row].astype(np.int32)
+        kernels.remove(word, row, self._start, self._size, self._owner, self._signature)
+        self._words[row] = _NO_WORDS
         self._key[row] = -1
         self._unused.append(row)
 
@@ -174,11 +175,15 @@ class PlaceIndex:
 
     def similarity(self, key: int, others: Collection[int]) -> F64:
         """Similarity (n,) of a known place to others, 0 for unknown ones."""
-        total = self._scores(self._entries[self._row[key]])
+        row = self._row[key]
+        word = self._words[row].astype(np.int32)
+        signature = np.empty(len(word), np.uint64)
+        kernels.signatures(word, row, self._start, self._size, self._owner, self._signature, signature)
+        total = self._scores(_Entry(word, signature, float(self._norm[row])))
         return np.array([total[self._row[k]] if k in self._row else 0.0 for k in others])
 
     def _scores(self, asked: _Entry) -> F64:
-        total = np.zeros(len(self._entries))
+        total = np.zeros(len(self._words))
         kernels.score(
             asked.word, asked.signature, self._vocabulary.weight, _LIKENESS, self._start, self._size,
             self._owner, self._signature, total,

@@ -91,6 +91,25 @@ def remove(word: I32, place: int, start: I32, size: I32, owner: I32, signature_o
 
 
 @njit
+def signatures(
+    word: I32, place: int, start: I32, size: I32, owner: I32, signature_of: U64, signature: U64
+) -> None:  # fmt: skip
+    """Signatures (n,) of a place's features, out: its postings of a word are in the order of its features."""
+    for i in range(word.shape[0]):
+        w = word[i]
+        before = 0
+        for j in range(i):
+            if word[j] == w:
+                before += 1
+        for k in range(start[w], start[w] + size[w]):
+            if owner[k] == place:
+                if before == 0:
+                    signature[i] = signature_of[k]
+                    break
+                before -= 1
+
+
+@njit
 def score(
     word: I32, signature: U64, weight: F32, likeness: F64, start: I32, size: I32, owner: I32, signature_of: U64,
     total: F64,

@@ -100,3 +100,20 @@ def test_what_a_disk_has_lost_is_sent_again() -> None:
     spill.forgets = 0
     line.settle()
     assert line.b.peer_values() == line.a.own_values()
+
+
+def test_without_a_spill_old_values_are_packed() -> None:
+    line = Line(None)
+    for keyframe in range(300):
+        line.say(keyframe)
+    packed = line.b._in
+    assert len(packed._values) < 200 and len(packed) == 1500
+    assert packed._resident.bytes <= LIMIT
+    held = sum(len(page.packed or b"") for page in packed._archive._pages.values())
+    assert held + sum(len(code) for _, code in packed._values.values()) == packed.value_bytes
+    line.say(3)
+    assert line.b.peer_value(Key(RefinedLandmarks.KIND, 3)) == line.a.own_value(Key(RefinedLandmarks.KIND, 3))
+    line.a.remove(Key(FusedLandmarks.KIND, 7))
+    line.settle()
+    assert line.b.peer_values() == line.a.own_values()
+    assert line.b.stats.mismatches == line.a.stats.mismatches == 0
