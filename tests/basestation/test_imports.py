@@ -62,3 +62,18 @@ def test_other_keyframes_under_the_same_ids_are_refused_before_anything_is_taken
         read_imports([str(path)], stored, no_station)
     with pytest.raises(SourceError):
         read_imports([str(path), str(tmp_path / "missing")], SavedMap(), no_station)
+
+
+def test_the_later_parts_of_a_log_are_read_too(make_flight: MakeFlight, tmp_path: Path) -> None:
+    flight = make_flight(keyframes=4, turns=0.1)
+    _, whole = read_imports([str(log_of(tmp_path / "whole.mcap", flight))], SavedMap(), no_station)
+    records = [record for step in flight.records for record in step]
+    for part, name in enumerate(("log.mcap", "log_1.mcap")):
+        about = {"role": "agent"} | ({"part": str(part)} if part else {})
+        with LogWriter(tmp_path / name, about) as log:
+            for n, record in enumerate(records[part::2]):
+                code = record_log.write_record(flight.agent, messages.key(record), messages.encode(record))
+                log.blob(record_log.TOPIC, n, code)
+    _, found = read_imports([str(tmp_path / "log.mcap")], SavedMap(), no_station)
+    assert found.faults == ()
+    assert found.pieces == whole.pieces

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections import Counter, deque
 from collections.abc import Callable
@@ -26,7 +27,8 @@ from kiteline_basestation.mapper import Mapper, MapperInput
 from kiteline_basestation.merging.correction import full_bundle_window, keyframes_of, move_keyframes, part_spans
 from kiteline_basestation.merging.correction_jobs import FullBundle
 from kiteline_basestation.merging.loop_detector import LoopDetector
-from kiteline_basestation.refinement.bundle_window import bundle_window
+from kiteline_basestation.refinement.bundle_window import bundle_window, local_keyframes
+from kiteline_basestation.refinement.local_bundles import LocalBundles
 from kiteline_basestation.station import Station
 from kiteline_basestation.store.integrity import contradictions
 from kiteline_codec.channel import coded_channel
@@ -89,6 +91,30 @@ def test_rows_nearby_are_those_of_the_map_within_a_cube(mapped: tuple[Any, Mappe
     inside = np.abs(sparse_map.keyframes.T_w_k[rows, :3, 3] - at).max(axis=1) <= 0.6
     assert np.array_equal(sparse_map.rows_near(submap, at, 0.6), rows[inside])
     assert 1 < np.count_nonzero(inside) < len(rows)
+
+
+def test_two_bundles_never_adjust_one_landmark(mapped: tuple[Any, Mapper]) -> None:
+    """A window fixes only so many keyframes: others that see its landmarks may be free in another one."""
+    flight, mapper = mapped
+    config = BaseConfig(bundle_window=replace(BaseConfig().bundle_window, max_free=3, max_fixed=1))
+    bundles = LocalBundles(config, mapper.map, Publisher(mapper.map), itertools.count(1))
+    bundles.add(flight.keyframes[8])
+    (job,) = bundles.jobs()
+    _, pending = bundles._pending[job.id]
+
+    def shares_landmarks_alone(keyframe: KeyframeId) -> bool:
+        free = local_keyframes(mapper.map, keyframe, config.bundle_window)
+        window = bundle_window(mapper.map, free, config.bundle_window, config.measurement)
+        assert window is not None
+        met = set(window.rows[window.problem.free].tolist()) & set(pending.rows.tolist())
+        met |= set(window.rows.tolist()) & set(pending.rows[pending.problem.free].tolist())
+        return not met and bool(np.isin(window.points, pending.points).any())
+
+    other = next(k for k in flight.keyframes if shares_landmarks_alone(k))
+    bundles.add(other)
+    assert bundles.jobs() == []
+    bundles.forget(job.id)
+    assert len(bundles.jobs()) == 1
 
 
 def test_rows_and_numbers_follow_keyframes_that_come_in_any_order(make_flight: MakeFlight) -> None:

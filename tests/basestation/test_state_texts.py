@@ -15,6 +15,7 @@ from kiteline_basestation.merging.loop_detector import DetectorState
 from kiteline_basestation.merging.loop_edges import LoopEdge, LoopMatch
 from kiteline_basestation.merging.map_merger import MergerState
 from kiteline_basestation.merging.merges import MapMerge
+from kiteline_basestation.store import state_texts
 from kiteline_basestation.store.state_texts import StateWriter, state_of, texts_of
 from kiteline_codec.schema import LivePose
 from kiteline_core.geometry import se3, sim3
@@ -81,6 +82,21 @@ def test_only_changed_parts_are_written() -> None:
     expected = {"mapper.merger.merges/000000", "mapper.merger.edges/000001"}
     assert set(writer.changes(replace(state, merger=changed))) == expected
     assert writer.changes(replace(state, merger=changed)) == {}
+
+
+def test_parts_that_stay_are_not_named_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Names of all scans and edges at each write took as long as the map was large."""
+    writer, state = StateWriter(), full_state()
+    writer.changes(state)
+    named: list[object] = []
+    monkeypatch.setattr(state_texts, "_key_text", lambda key: named.append(key) or f"/{key}")
+    pose = LivePose(AgentId(0), 6, KeyframeId(2), T, 80)
+    moved = replace(state, intake=replace(state.intake, last_pose={A: pose}))
+    assert list(writer.changes(moved)) == [f"mapper.intake.last_pose/{A}"]
+    assert named == [A]
+    assert writer.changes(replace(moved, intake=replace(state.intake, last_pose={}))) == {
+        f"mapper.intake.last_pose/{A}": None
+    }
 
 
 @pytest.mark.parametrize(

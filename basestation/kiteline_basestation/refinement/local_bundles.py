@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
 
+import numpy as np
+
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.exchange.publisher import Publisher
 from kiteline_basestation.jobs import Job, JobDone
@@ -95,7 +97,9 @@ class LocalBundles:
                 self._blocked.add(submap)
                 continue
             window = bundle_window(self._map, free, config, self._config.measurement)
-            if window is not None and self._meets(set(window.rows.tolist()), free_only=True):
+            if window is not None and (
+                self._meets(set(window.rows.tolist()), free_only=True) or self._adjusts_too(window)
+            ):
                 self._blocked.add(submap)
                 continue
             del self._waiting[submap]
@@ -117,6 +121,10 @@ class LocalBundles:
         return any(
             not set(rows).isdisjoint((w.rows[w.problem.free] if free_only else w.rows).tolist()) for w in pending
         )  # fmt: skip
+
+    def _adjusts_too(self, window: BundleWindow) -> bool:
+        """True if a pending bundle adjusts landmarks of a window: they may be seen by more keyframes than it fixes."""
+        return any(bool(np.isin(window.points, other.points).any()) for _, other in self._pending.values())
 
     def forget(self, job: int) -> None:
         """Forget a job without a result, if it is one of these."""

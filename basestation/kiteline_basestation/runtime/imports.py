@@ -18,6 +18,7 @@ from kiteline_basestation.store.store import FILE, read
 from kiteline_codec.schema import Key, WireError, messages, record_log
 from kiteline_core.errors import INPUT_FAULTS
 from kiteline_core.ids import AgentId
+from kiteline_hw.logs.log_parts import WholeLog
 from kiteline_hw.logs.mcap_log import LogMessage, LogReader
 
 _STEP_VALUES = 200  # values of an agent's log that one step takes in, so that the loop goes on
@@ -47,7 +48,7 @@ def import_map(path: Path, make_station: Callable[[Mapping[str, str]], Station])
 
 
 def _of_log(path: Path, make_station: Callable[[Mapping[str, str]], Station]) -> SavedMap | FromLog:
-    with LogReader(path) as log:
+    with WholeLog(path) as log:
         role = log.metadata.get("role")
         if role == "agent":
             return _of_agent(log, path)

@@ -70,7 +70,7 @@ def fly_live(options: BaseOptions, parent: process.Parent | None, stop: process.
         except StoppedError:
             return True
         report_restored(restored, parent)
-        questions = Questions(options, link, stack, lambda: seals.maps_key)
+        questions = Questions(options, link, stack, lambda: seals.maps_key, logins)
         if parent is not None:
             parent.send_event("ready")
         terminal = TerminalReporter(base.station) if parent is None and not options.quiet else None

@@ -17,6 +17,7 @@ from kiteline_core.ids import AgentId
 DEFAULT_LINK = "zenoh:tcp/127.0.0.1:7447"
 LOG_STEM = "session"  # of the names of logs of `kiteline base --log`
 LOG_MIB = 4000  # MiB of logs by default: days of flights, as they hold no images
+MOST_WORKERS = 16
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,11 +89,18 @@ def parser(link_forms: str = "") -> argparse.ArgumentParser:
                    help="take no connection of anyone without a key in the file (IP links): strangers take up none of "
                    "the 96; new keys count from the next start")  # fmt: skip
     p.add_argument("--profile", choices=("wifi", "radio"), default="", help="default: as the link allows")
-    p.add_argument("--workers", metavar="N", type=int, default=0,
-                   help="processes for long work, 150 MiB each (default: a core each, 2 to 4)")  # fmt: skip
+    p.add_argument("--workers", metavar="N", type=_workers, default=0,
+                   help=f"processes for long work, 1 to {MOST_WORKERS} (default: by cores, 2 to 4)")  # fmt: skip
     p.add_argument("--quiet", action="store_true", help="print no status messages")
     p.add_argument("--spec", metavar="JSON", default="", help=argparse.SUPPRESS)
     return p
+
+
+def _workers(text: str) -> int:
+    """A number of workers; 0 is the default's."""
+    if not (text.isascii() and text.isdecimal() and len(text) < 5 and int(text) <= MOST_WORKERS):
+        raise argparse.ArgumentTypeError(f"{text[:20]!r}: expected 0 to {MOST_WORKERS}; more do not help one loop")
+    return int(text)
 
 
 def options_of(a: argparse.Namespace, session: int) -> BaseOptions:
@@ -103,11 +111,15 @@ def options_of(a: argparse.Namespace, session: int) -> BaseOptions:
         link=a.link, config=a.config, down_bytes_s=a.down_bytes, profile=a.profile, key=a.key, told=a.told,
         paired_only=a.paired_only,
         store=a.store, web=a.web,
-        imports=tuple(a.imports), maps=a.maps, quiet=a.quiet, workers=max(0, a.workers),
+        imports=tuple(a.imports), maps=a.maps, quiet=a.quiet, workers=a.workers,
     )  # fmt: skip
 
 
 def coded_channels(spec: BaseOptions, link: LinkTraits) -> Callable[[AgentId], RecordChannel]:
     """A function that opens the base's end of the channel to an agent."""
-    sealed = seal_bytes(suite_for(link)) if spec.key else 0
-    return lambda agent: coded_channel(spec.session, spec.down_bytes_s, spec.profile, sealed, link, peer=agent)
+
+    def opened(agent: AgentId) -> RecordChannel:
+        sealed = seal_bytes(suite_for(link), agent) if spec.key else 0
+        return coded_channel(spec.session, spec.down_bytes_s, spec.profile, sealed, link, peer=agent)
+
+    return opened

@@ -6,7 +6,7 @@ import contextlib
 import json
 import secrets
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from kiteline_basestation.management import READING, Answer, Command
 from kiteline_basestation.runtime.options import BaseOptions
@@ -29,18 +29,22 @@ class Questions:
     """
 
     def __init__(
-        self, options: BaseOptions, hub: LinkHub, stack: contextlib.ExitStack, maps_key: Callable[[], bytes | None]
-    ) -> None:
-        """maps_key: that of the right to change maps, now. Raises LinkError."""
+        self, options: BaseOptions, hub: LinkHub, stack: contextlib.ExitStack, maps_key: Callable[[], bytes | None],
+        logins: Mapping[str, str] | None = None,
+    ) -> None:  # fmt: skip
+        """maps_key: that of the right to change maps, now. logins: users and passwords without which nobody connects.
+        Raises LinkError.
+        """
         self._server: QueryServer | None = None
+        self._reading_free = bool(options.maps) and is_loopback(f"zenoh:{options.maps.removeprefix('zenoh:')}")
         if options.maps:
-            self._server = QueryServer("maps", endpoint=options.maps.removeprefix("zenoh:"))
+            endpoint = options.maps.removeprefix("zenoh:")
+            self._server = QueryServer("maps", endpoint=endpoint, logins=None if self._reading_free else logins)
         elif isinstance(hub, ZenohHub):
             self._server = QueryServer("maps", session=hub.session)
         if self._server is not None:
             stack.callback(self._server.close)
         self._guard = QuestionGuard(maps_key, secrets.token_hex(16)) if options.key else None
-        self._reading_free = bool(options.maps) and is_loopback(f"zenoh:{options.maps.removeprefix('zenoh:')}")
 
     def commands(self) -> list[Command]:
         """The questions that may be asked, since the last call; others are answered here."""

@@ -31,16 +31,19 @@ class StateWriter:
     """Turns states into texts, and only those parts that changed since the last state."""
 
     def __init__(self) -> None:
-        self._parts: dict[str, object] = {}
+        self._folders: dict[str, Mapping[object, object]] = {}  # parts by the name of what holds them, and their keys
 
     def changes(self, state: MapperState) -> dict[str, str | None]:
-        """Texts of new and changed parts; None for those that are gone."""
-        parts = dict(_parts(state, ROOT))
-        out: dict[str, str | None] = dict.fromkeys(self._parts.keys() - parts.keys())
-        for name, part in parts.items():
-            if name not in self._parts or not _unchanged(part, self._parts[name]):
-                out[name] = json.dumps(_encode(part), separators=(",", ":"))
-        self._parts = parts
+        """Texts of new and changed parts; None for those that are gone. Only these are named: most stay for long."""
+        out: dict[str, str | None] = {}
+        for folder, parts, name in _folders(state, ROOT):
+            before = self._folders.get(folder, {})
+            for key, part in parts.items():
+                old = before.get(key, _NONE)
+                if part is not old and (old is _NONE or not _unchanged(part, old)):
+                    out[folder + name(key)] = json.dumps(_encode(part), separators=(",", ":"))
+            out.update((folder + name(key), None) for key in before if key not in parts)
+            self._folders[folder] = parts
         return out
 
 
@@ -60,20 +63,25 @@ def state_of(texts: Mapping[str, str]) -> MapperState:
 # -- parts -------------------------------------------------------------------------------------------------------------
 
 
-def _parts(value: Any, name: str) -> Iterator[tuple[str, object]]:
-    """The parts of a dataclass by name; the first one holds all fields that are no parts."""
+_NONE = object()  # no part; not even a None
+
+
+def _folders(value: Any, name: str) -> Iterator[tuple[str, Mapping[Any, object], Callable[[Any], str]]]:
+    """The parts of a dataclass: for each field with many of them its name, the parts by key, and what makes the end of
+    a part's name of its key; at last the fields that are no parts, as one.
+    """
     inline: dict[str, object] = {}
     for field, hint in _hints(type(value)).items():
         content = getattr(value, field)
         if is_dataclass(hint):
-            yield from _parts(content, f"{name}.{field}")
+            yield from _folders(content, f"{name}.{field}")
         elif _entry_type(hint) is None:
             inline[field] = content
         elif isinstance(content, Mapping):
-            yield from ((f"{name}.{field}/{_key_text(key)}", entry) for key, entry in content.items())
+            yield f"{name}.{field}", content, _key_text
         else:
-            yield from ((f"{name}.{field}/{i:06d}", entry) for i, entry in enumerate(content))
-    yield name, inline
+            yield f"{name}.{field}", dict(enumerate(content)), "/{:06d}".format
+    yield name, {None: inline}, lambda key: ""
 
 
 def _assemble(cls: type[T], texts: Mapping[str, str], name: str) -> T:
@@ -109,7 +117,7 @@ def _entry_type(hint: Any) -> Any:
 
 
 def _key_text(key: object) -> str:
-    return "-".join(map(str, key)) if isinstance(key, tuple) else str(key)
+    return "/" + ("-".join(map(str, key)) if isinstance(key, tuple) else str(key))
 
 
 def _key_reader(hint: Any) -> Callable[[str], object]:

@@ -44,10 +44,13 @@ def prefix(service: str, group: str = "default") -> str:
 class QueryServer:
     """Receives requests on a session, or on one of its own that listens on an endpoint. Raises LinkError."""
 
-    def __init__(self, service: str, session: zenoh.Session | None = None, endpoint: str = "") -> None:
-        self._own_session = (
-            open_session(endpoint, "base", access=access_of_base(_GROUP.format("default"))) if session is None else None
-        )
+    def __init__(
+        self, service: str, session: zenoh.Session | None = None, endpoint: str = "",
+        logins: Mapping[str, str] | None = None,
+    ) -> None:  # fmt: skip
+        """logins: users and passwords without which nobody connects to the endpoint; None: anyone may."""
+        access = access_of_base(_GROUP.format("default"))
+        self._own_session = open_session(endpoint, "base", access=access, logins=logins) if session is None else None
         self._arrived: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._open: dict[int, Any] = {}
         self._number = 0

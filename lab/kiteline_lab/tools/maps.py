@@ -16,6 +16,7 @@ from typing import Any
 
 from kiteline_codec.transport.signed_question import sign
 from kiteline_hw.links.zenoh_queries import ask
+from kiteline_hw.ports import LinkError
 from kiteline_hw.system.key_store import MAPS, default_path, login_of, read_file
 
 _DEFAULT = "tcp/127.0.0.1:7447"
@@ -118,8 +119,21 @@ def asked(endpoint: str, verb: str, question: str, key: bytes | None) -> tuple[b
         return ask(endpoint, "maps", verb, signed, logins=login_of(MAPS, key))
 
     ok, text = ask_signed("")  # nothing comes of it: its refusal names the base's start
-    start = None if ok else json.loads(text).get("start")
+    start = None if ok else _read(endpoint, text).get("start")
     return ask_signed(start) if isinstance(start, str) else (ok, text)
+
+
+def _read(endpoint: str, text: str) -> dict[str, Any]:
+    """An answer as a base gives it. Raises LinkError for anything else."""
+    try:
+        answer = json.loads(text)
+    except (ValueError, RecursionError):
+        answer = None
+    if not isinstance(answer, dict):
+        raise LinkError(
+            f"{endpoint} answers {text[:60]!r}, expected JSON of a base: what listens there is another program"
+        )
+    return answer
 
 
 def main(argv: list[str]) -> int:
@@ -129,11 +143,15 @@ def main(argv: list[str]) -> int:
         return _of_store(a)
     path: Path = a.key or default_path()
     key = read_file(path).maps if a.key is not None or path.exists() else None
-    ok, text = asked(a.base.removeprefix("zenoh:"), a.verb, json.dumps(query(a)), key)
+    endpoint = a.base.removeprefix("zenoh:")
+    ok, text = asked(endpoint, a.verb, json.dumps(query(a)), key)
+    answer = _read(endpoint, text)
+    try:
+        shown = table(answer) if ok else f"kiteline maps: {answer['error']}"
+    except (KeyError, TypeError, ValueError, AttributeError):
+        raise LinkError(f"{endpoint} answers {text[:60]!r}, which is no answer of a base to {a.verb}") from None
     if a.json:
         print(text)
-    elif ok:
-        print(table(json.loads(text)))
     else:
-        print(f"kiteline maps: {json.loads(text)['error']}", file=sys.stderr)
+        print(shown, file=sys.stdout if ok else sys.stderr)
     return 0 if ok else 1
