@@ -37,10 +37,12 @@ BENCHMARKS = {
 }  # name -> module
 
 
-def data_folder() -> Path:
-    """KITELINE_DATA, else ../shared/data where it exists. Raises SourceError when there is neither."""
+def data_folder(sequences: Path | None = None) -> Path:
+    """KITELINE_DATA, else ../shared/data, else the user's sequences. Raises SourceError when there is none of them."""
     named = os.environ.get("KITELINE_DATA")
     folder = Path(named) if named else Path("../shared/data")
+    if not folder.is_dir() and sequences is not None:
+        return sequences
     if not folder.is_dir():
         raise SourceError(f"{folder}: no recordings there; set KITELINE_DATA to the folder that holds them")
     return folder
@@ -78,6 +80,8 @@ def main(argv: list[str]) -> int:
     p.add_argument(
         "--seconds", metavar="S", type=float, default=0.0, help="of the flood of `trust/stranger` (default: 30)"
     )
+    p.add_argument("--data", metavar="DIR", type=Path, help="of `papers/sequences` and `papers/multi-map`: fly "
+                   "the sequences of KITTI, EuRoC, TUM and TUM-VI that are in this folder")  # fmt: skip
     p.add_argument("--full", action="store_true", help="of `scale`: the whole size, which takes half an hour")
     a = p.parse_args(argv)
     chosen: list[tuple[str, str, Run]] = []
@@ -86,14 +90,15 @@ def main(argv: list[str]) -> int:
         if not found:
             p.error(f"no benchmark {name!r}; there are: {', '.join(BENCHMARKS)}")
         chosen += found
-    data = data_folder()
+    data = data_folder(a.data)
     if a.keep is not None:
         a.keep.mkdir(parents=True, exist_ok=True)
     all_met = True
     for name, title, run in chosen:
         with tempfile.TemporaryDirectory(prefix="kiteline-bench-") as scratch:
             bench = Bench(
-                data, a.keep or Path(scratch), _say, starts=a.starts, inputs=a.inputs, seconds=a.seconds, full=a.full
+                data, a.keep or Path(scratch), _say, starts=a.starts, inputs=a.inputs, seconds=a.seconds, full=a.full,
+                sequences=a.data,
             )  # fmt: skip
             bars = run(bench)
         text = section(name, title, bars, bench.more)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from kiteline_bench.grid.sparse import SparsePoints
 from kiteline_bench.harness.bars import Bench
 from kiteline_bench.harness.recording import Recording
 from kiteline_bench.harness.run import RecordingRun, fly_recording
+from kiteline_codec.channel import RecordChannel
 from kiteline_core.geometry.cameras import Rectifier
 from kiteline_lab.evaluation import metrics
 from kiteline_lab.grids.files import GridFile, planar, read_grid
@@ -49,11 +51,14 @@ class FlownGrid:
 
 def fly_grid(
     bench: Bench, name: str, recording: Recording, agent: AgentConfig | None = None, base: BaseConfig | None = None,
-    bytes_s: tuple[int, int] = (0, 0),
+    bytes_s: tuple[int, int] = (0, 0), channels: Callable[[RecordChannel], RecordChannel] | None = None,
 ) -> FlownGrid:  # fmt: skip
-    """Fly a recording, in lock-step in this process, and write the base's grid into the bench's folder."""
+    """Fly a recording, in lock-step in this process, and write the base's grid into the bench's folder.
+
+    channels: wraps the two ends of the link.
+    """
     bench.say(f"flying {name}")
-    run = fly_recording(recording, agent, base, bytes_s)
+    run = fly_recording(recording, agent, base, bytes_s, channels=channels)
     mapper = run.station.mapper
     folder = bench.folder / "grids" / name.replace(", ", "_").replace(" ", "_")
     folder.mkdir(parents=True, exist_ok=True)

@@ -49,7 +49,7 @@ class Bench:
 
     starts: most starts of a flight, or seeds, for a quick look; 0: all. inputs: of the fuzzer, seconds: of a flood; 0:
     as the benchmark chooses.
-    full: at the whole size, which takes long.
+    full: at the whole size, which takes long. sequences: a folder of data sets that the user has; None without one.
     """
 
     data: Path
@@ -60,6 +60,7 @@ class Bench:
     inputs: int = 0
     seconds: float = 0.0
     full: bool = False
+    sequences: Path | None = None
 
     def chosen(self, starts: Sequence[T]) -> list[T]:
         """All starts, or as many as wanted, spread evenly."""
@@ -74,15 +75,17 @@ class Bench:
             raise SourceError(f"{path}: not there; set KITELINE_DATA to the folder that holds the recordings")
         return str(path)
 
-    def fly(self, sources: str | Path | Sequence[str | Path], folder: str, **options: Any) -> FlownProcesses:
+    def fly(
+        self, sources: str | Path | Sequence[str | Path], folder: str, *, shown: bool = False, **options: Any
+    ) -> FlownProcesses:
         """Fly as `kiteline fly` does, into a folder of the bench; options: fields of its Options.
 
-        Raises FlightFailed when a process ended on its own.
+        shown: progress by frames. Raises FlightFailed when a process ended on its own.
         """
         several = [sources] if isinstance(sources, str | Path) else sources
         self.say(f"flying {', '.join(Path(source).name for source in several)} ({folder})")
         out = self.folder / folder
-        report, outcome = fly(Options(tuple(str(source) for source in several), out, **options), quiet=True)
+        report, outcome = fly(Options(tuple(str(source) for source in several), out, **options), quiet=not shown)
         if outcome.failed:
             raise FlightFailed(f"{folder}: {outcome.notes}")
         return FlownProcesses(out, dict(report), outcome)

@@ -151,6 +151,7 @@ class Scenario:
     """One start of one agent. parts: what it sees, in order; with more than one it has no IMU.
 
     outages: times of the whole flight, in s, between which its link is down. mono: left camera alone, no IMU.
+    imu: False leaves out the inertial samples.
     """
 
     source: str
@@ -160,11 +161,12 @@ class Scenario:
     parts: tuple[Part, ...] = (Part(0.0, 1e9),)
     outages: tuple[tuple[float, float], ...] = ()
     mono: bool = False
+    imu: bool = True
 
     @property
     def has_imu(self) -> bool:
         """True if the agent gets the recording's inertial samples."""
-        return len(self.parts) == 1 and not self.mono
+        return self.imu and len(self.parts) == 1 and not self.mono
 
     def items(self) -> Iterator[Item]:
         """The items of all parts, decoded one by one; several parts get stamps in steps of a tick."""

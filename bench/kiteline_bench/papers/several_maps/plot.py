@@ -1,0 +1,38 @@
+"""Figure: the keyframes of all robots in one world, beside the true paths."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from kiteline_bench.papers.several_maps.several_maps import Outcome
+
+_COLUMNS = 4
+_COLOURS = ("#1f77b4", "#2ca02c", "#d62728", "#9467bd")
+
+
+def plot_experiments(path: Path, outcomes: Sequence[Outcome]) -> None:
+    """Draw each experiment from above, in the plane in which its path is widest."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    drawn = [o for o in outcomes if o.found]
+    rows = max(1, -(-len(drawn) // _COLUMNS))
+    figure = Figure(figsize=(3.4 * _COLUMNS, 3.3 * rows), layout="constrained")
+    FigureCanvasAgg(figure)
+    for k, o in enumerate(drawn):
+        axes = figure.add_subplot(rows, _COLUMNS, k + 1)
+        widest = np.sort(np.argsort(np.ptp(np.concatenate(o.true), axis=0))[1:])
+        for i, (found, true) in enumerate(zip(o.found, o.true, strict=True)):
+            axes.plot(*true[:, widest].T, "--", color="0.6", linewidth=1.0, label="truth" if i == 0 else None)
+            axes.plot(*found[:, widest].T, "-", color=_COLOURS[i % len(_COLOURS)], linewidth=1.6, label=f"robot {i}")
+        axes.set_aspect("equal", adjustable="datalim")
+        axes.set_title(f"{o.experiment.name}\n{o.merges} merges, joint ATE {o.ate_m:.3f} m", fontsize=8)
+        axes.tick_params(labelsize=7)
+        axes.grid(True, alpha=0.3)
+        axes.legend(fontsize=6)
+    figure.savefig(path, dpi=100)
