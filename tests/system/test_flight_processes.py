@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from kiteline_hw.ports import LinkError, SourceError
+from kiteline_lab.flights.children import ChildProcesses, Event
 from kiteline_lab.flights.contract import check_contract
 from kiteline_lab.flights.flight_report import without_timing
 from kiteline_lab.flights.fly import fly
@@ -22,22 +23,37 @@ from kiteline_lab.replay.replay import main as replay
 
 
 def children_of(folder: Path) -> list[int]:
-    """Processes whose command line names a folder."""
+    """Processes of a flight: their stderr is in its folder."""
     found = []
     for entry in Path("/proc").iterdir():
         if entry.name.isdecimal() and int(entry.name) != os.getpid():
             try:
-                line = (entry / "cmdline").read_bytes()
+                stderr = (entry / "fd" / "2").readlink()
             except OSError:
                 continue
-            if str(folder).encode() in line and b"--spec" in line:
+            if stderr.is_relative_to(folder):
                 found.append(int(entry.name))
     return found
 
 
-def test_two_flights_over_a_lossy_link_are_identical_and_agree(recording: Path, tmp_path: Path) -> None:
+def test_two_flights_over_a_lossy_link_are_identical_and_agree(
+    recording: Path, tmp_path: Path, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The processes of the first are started as users start them; those of the second are forked, as in tests below."""
+    running: list[int] = []
+    next_event = ChildProcesses.next_event
+
+    def watched(children: ChildProcesses, timeout_s: float) -> Event | None:
+        running.append(len(children_of(tmp_path)))
+        return next_event(children, timeout_s)
+
+    monkeypatch.setattr(ChildProcesses, "next_event", watched)
     for run in "ab":
+        if run == "b":
+            request.getfixturevalue("forked")
         report, outcome = fly(Options((str(recording),), tmp_path / run, loss=0.2, seed=1), quiet=True)
+        assert max(running) == 2
+        running.clear()
         assert not outcome.failed
         assert report["base"]["digest_equal"] is True
         assert check_contract(tmp_path / run) == []
@@ -49,6 +65,7 @@ def test_two_flights_over_a_lossy_link_are_identical_and_agree(recording: Path, 
     assert replay([str(tmp_path / "a" / "base" / "log.mcap"), "--verify"]) == 0
 
 
+@pytest.mark.usefixtures("forked")
 def test_the_flight_survives_a_killed_base_and_the_next_one_catches_up(recording: Path, tmp_path: Path) -> None:
     o = Options((str(recording),), tmp_path, kill_base_at_s=0.5, restart_base_at_s=0.9)
     report, outcome = fly(o, quiet=True)
@@ -61,6 +78,7 @@ def test_the_flight_survives_a_killed_base_and_the_next_one_catches_up(recording
     assert not outcome.failed
 
 
+@pytest.mark.usefixtures("forked")
 def test_without_a_new_base_the_agent_flies_to_the_end(recording: Path, tmp_path: Path) -> None:
     report, _ = fly(Options((str(recording),), tmp_path, kill_base_at_s=0.5), quiet=True)
     assert report["agents"][0]["tracked"] == 30
@@ -68,6 +86,7 @@ def test_without_a_new_base_the_agent_flies_to_the_end(recording: Path, tmp_path
     assert check_contract(tmp_path) == []
 
 
+@pytest.mark.usefixtures("forked")
 def test_the_base_keeps_the_map_of_a_killed_agent(recording: Path, tmp_path: Path) -> None:
     o = Options((str(recording), str(recording)), tmp_path, kill_agent_at_s=0.8)
     report, outcome = fly(o, quiet=True)
@@ -79,6 +98,7 @@ def test_the_base_keeps_the_map_of_a_killed_agent(recording: Path, tmp_path: Pat
     assert not outcome.failed
 
 
+@pytest.mark.usefixtures("forked")
 def test_a_base_that_cannot_listen_is_reported_at_once(recording: Path, tmp_path: Path) -> None:
     endpoint = free_endpoint()
     from kiteline_hw.lockstep.zenoh_lockstep import LockstepServer
