@@ -9,7 +9,7 @@ import numpy as np
 from kiteline_bench.harness.bars import Bar, Bench, at_most, is_true
 from kiteline_bench.scale import trials
 
-_KEYFRAMES, _FULL_KEYFRAMES = 3000, 20_000
+_KEYFRAMES, _FULL_KEYFRAMES = 2500, 20_000  # some minutes, and most of an hour
 _HOURS = 24
 _FLIGHTS, _FULL_FLIGHTS = 24, 96
 _SOURCE = "room_flight.mcap"

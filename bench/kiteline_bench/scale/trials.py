@@ -228,8 +228,7 @@ def day(flight: RecordedFlight, hours: float, flights: int) -> Day:
         found.flights += 1
         found.keyframes += len(groups)
         if number:
-            old = Name(AgentId((number - 1) % 4), number - 1, 0, mask_of(0)).submap
-            text = json.dumps({"map": ".".join(map(str, (int(old) >> 29, number - 1, 0)))})
+            text = json.dumps({"map": f"{(number - 1) % 4}.{number - 1}.0"})
             orders.append(Command(number, "delete", text))
         while now_ns < begin_ns + gap_ns:  # silence: the base steps on
             output = station.step({}, jobs.done(now_ns), now_ns, orders)

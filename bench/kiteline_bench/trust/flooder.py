@@ -18,6 +18,7 @@ import zenoh
 
 from kiteline_bench.trust.keyed_sender import forged_packets
 from kiteline_codec.transport.seal_watch import is_plain
+from kiteline_core.ids import MAX_AGENTS
 from kiteline_hw.links.zenoh_session import close_session, direct, open_session
 
 _PREFIX = "kiteline/1/default"
@@ -82,7 +83,7 @@ def _announce(session: Any, over: threading.Event, heard: _Heard, kept: list[Any
     number = 0
     while not over.wait(_NAMES_S):
         number += 1
-        kept.append(session.liveliness().declare_token(f"{_PREFIX}/{number % 64}/alive/stranger{number}"))
+        kept.append(session.liveliness().declare_token(f"{_PREFIX}/{number % MAX_AGENTS}/alive/stranger{number}"))
         verb = ("list", "delete", "merge")[number % 3]
         session.get(f"{_PREFIX}/maps/{verb}", direct(heard.on_reply), payload=_QUESTION, timeout=5.0)
 

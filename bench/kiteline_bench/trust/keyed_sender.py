@@ -13,7 +13,7 @@ from kiteline_codec.coding.packing import Writer
 from kiteline_codec.schema import RECORD_TYPES, IdOf, Key
 from kiteline_codec.transport.packet import Header, Item, add_checksum, write_header, write_item
 from kiteline_codec.transport.seal import Direction, Sealer, Suite
-from kiteline_core.ids import MAX_BOOTS, MAX_KEYFRAMES, MAX_SUBMAPS, AgentId, keyframe_id, submap_id
+from kiteline_core.ids import MAX_AGENTS, MAX_BOOTS, MAX_KEYFRAMES, MAX_SUBMAPS, AgentId, keyframe_id, submap_id
 
 _AGENT, _OTHER = AgentId(3), AgentId(4)
 _HUGE = (1 << 31, 1 << 32, (1 << 62) - 1, (1 << 63) - 1, 1 << 63, 1 << 64)
@@ -26,7 +26,7 @@ def forged_packets(draw: random.Random, number: int) -> list[tuple[int, bytes]]:
     """
     out = []
     for _ in range(number):
-        agent = draw.choice((0, 0, 3, draw.randrange(64)))
+        agent = draw.choice((0, 0, 3, draw.randrange(MAX_AGENTS)))
         size = draw.choice((20, 200, 1200, 1200, 1200, 1200, 60_000 if draw.random() < 0.1 else 1200))
         if draw.random() < 0.2:
             data = Writer()

@@ -151,7 +151,7 @@ def test_the_key_file_is_readable_by_its_owner_only(tmp_path: Path) -> None:
         read_keys(path)
 
 
-@pytest.mark.parametrize("line", ["5", "5 xyz", "64 " + "00" * 32, "5 " + "00" * 31, "5 " + "00" * 32 + " more"])
+@pytest.mark.parametrize("line", ["5", "5 xyz", "256 " + "00" * 32, "5 " + "00" * 31, "5 " + "00" * 32 + " more"])
 def test_a_malformed_line_is_named(tmp_path: Path, line: str) -> None:
     path = tmp_path / "keys"
     path.write_text(f"# keys\n{line}\n")
@@ -163,5 +163,5 @@ def test_a_malformed_line_is_named(tmp_path: Path, line: str) -> None:
 def test_a_missing_key_file_names_the_command(tmp_path: Path) -> None:
     with pytest.raises(LinkError, match=r"kiteline keys --file \S+ pair N"):
         read_keys(tmp_path / "none")
-    with pytest.raises(LinkError, match="0 to 63"):
+    with pytest.raises(LinkError, match="0 to 255"):
         new_key(tmp_path / "keys", 256)
