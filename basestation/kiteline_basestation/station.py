@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.exchange.correction_batches import CorrectionBatches
+from kiteline_basestation.exchange.deleted_values import DeletedValues
 from kiteline_basestation.exchange.map_cache_planner import MapCachePlanner
 from kiteline_basestation.exchange.tile_planner import TilePlanner
 from kiteline_basestation.jobs import Job, JobDone
@@ -49,6 +50,7 @@ class Station:
         )  # fmt: skip
         self.channels: dict[AgentId, RecordChannel] = {}
         self._batches: dict[AgentId, CorrectionBatches] = {}  # of corrections, by agent
+        self._deleted_values: dict[AgentId, DeletedValues] = {}
         self._publish = config.publish
         self.changed: dict[tuple[AgentId, bool, Key], bytes | None] | None = None  # see `track_changes`
         self.received = 0  # records of agents in the last step
@@ -63,6 +65,7 @@ class Station:
             if isinstance(channel, CodedChannel):
                 channel.endpoint.earlier.is_gone = lambda key: submap_of(key) in self.mapper.deleted
             self._batches[agent] = CorrectionBatches(agent, self._publish)
+            self._deleted_values[agent] = DeletedValues()
         return self.channels[agent]
 
     def track_changes(self) -> None:
@@ -110,6 +113,8 @@ class Station:
         for agent, channel in sorted(self.channels.items()):
             self.map_cache_planner.update(agent, self.mapper.live(agent), channel, now_ns)
             self.tile_planner.update(agent, self.mapper.live(agent), channel, now_ns)
+            if self.mapper.deleted and isinstance(channel, CodedChannel):
+                self._deleted_values[agent].remove_some(channel, self.mapper.deleted)
         sent = tuple((agent, tuple(channel.poll(now_ns))) for agent, channel in sorted(self.channels.items()))
         return StationOutput(sent, output.jobs, output.answers)
 

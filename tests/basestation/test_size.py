@@ -31,8 +31,8 @@ from kiteline_basestation.refinement.bundle_window import bundle_window, local_k
 from kiteline_basestation.refinement.local_bundles import LocalBundles
 from kiteline_basestation.station import Station
 from kiteline_basestation.store.integrity import contradictions
-from kiteline_codec.channel import coded_channel
-from kiteline_codec.schema import CameraIntrinsics, Key, KeyframePose
+from kiteline_codec.channel import CodedChannel, coded_channel
+from kiteline_codec.schema import KEYFRAME_KINDS, CameraIntrinsics, CulledLandmarks, Key, KeyframePose
 from kiteline_codec.sync.resumption import agent_session
 from kiteline_core.geometry import se3
 from kiteline_core.ids import NO_KEYFRAME, KeyframeId, keyframe_id, submap_id, submap_of_keyframe
@@ -214,6 +214,33 @@ def test_flights_that_come_and_are_deleted_leave_nothing_behind(
     before, after = counts[2], counts[6]  # one flight in two is placed: it comes when there is no other map
     grown = {name: after[name] - before[name] for name in after if after[name] > before[name]}
     assert {name for name in grown if not name.endswith(_MAY_GROW)} == set()
+
+
+def test_what_was_written_of_a_deleted_map_is_removed_once_the_agent_has_it(
+    make_flight: MakeFlight, words: Any, lively_room: Any
+) -> None:  # fmt: skip
+    station = Station(BaseConfig(), lambda agent: coded_channel(1, 0, "wifi", peer=agent), words)
+    flight = make_flight(keyframes=8, boot=1, submap=1, turns=0.2, scene=lively_room)
+    end, down, done = coded_channel(agent_session(1, 1), 0, "wifi"), list[bytes](), tuple[JobDone, ...]()
+    end.put(CameraIntrinsics(flight.agent, flight.camera))
+    held, culled = list[int](), False
+    channel = station.join(flight.agent)
+    assert isinstance(channel, CodedChannel)
+    for n in range(60):
+        records = end.receive(down if n < 30 or n >= 40 else [], n * STEP_NS)  # the link is down for a while
+        culled |= any(isinstance(r, CulledLandmarks) and r.keyframe_too for r in records)
+        for record in flight.records[n] if n < len(flight.records) else ():
+            end.put(record)
+        orders = [Command(n, "delete", '{"map": "0.1.1"}')] if n == 30 else []
+        up = end.poll(n * STEP_NS) if n < 30 or n >= 40 else []
+        output = station.step({flight.agent: up}, done, n * STEP_NS, orders)
+        done = tuple(run_job(job) for job in output.jobs)
+        down = list(dict(output.packets).get(flight.agent, ()))
+        held.append(sum(key.kind in KEYFRAME_KINDS for key in channel.endpoint.own_values()))
+    assert held[29] > 10 and min(held[30:40]) >= held[29]  # the agent does not know yet
+    assert culled and held[-1] == 0
+    assert not any(key.kind in KEYFRAME_KINDS for key in end.endpoint.peer_values())
+    assert channel.endpoint.stats.mismatches == end.endpoint.stats.mismatches == 0
 
 
 # Ids of what was deleted, which are ignored for ever, and times, of which the newest are kept.
