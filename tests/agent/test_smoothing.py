@@ -106,3 +106,17 @@ def test_where_lengths_are_uncertain_no_window_is_stretched_by_more_than_a_share
     assert longer.min() >= -1e-9
     assert longer.max() <= size_m * (1.0 - np.exp(-5.0 / limits.time_s)) * 1.01
     assert said[-1] - flown[-1] >= 0.95 * size_m
+
+
+def test_a_relocalisation_is_not_smoothed_but_what_is_left_of_a_correction_is() -> None:
+    smoothing = Smoothing(SmoothingConfig(max_m_s=0.1, time_s=10.0, snap_m=1.0))
+    here = np.array([3.0, 1.0, 0.5])
+    smoothing.follow(np.eye(4), here, 0)
+    correction = se3.from_rt(np.eye(3), np.array([0.0, 0.2, 0.0]))
+    left = correction @ se3.inverse(smoothing.follow(correction, here, TICK_NS))
+    # Dead reckoning was off by 0.6 m: the vehicle lies elsewhere in the map, and the map where it lay in w.
+    T_o_n = se3.from_rt(np.eye(3), np.array([0.6, 0.0, 0.0]))
+    smoothing.move_odometry(T_o_n)
+    told = smoothing.follow(correction @ T_o_n, here, 2 * TICK_NS)
+    assert np.linalg.norm((told - correction @ T_o_n)[:3, 3]) < np.linalg.norm(left[:3, 3])
+    assert np.linalg.norm(told[:3, 3] - correction[:3, 3]) > 0.55

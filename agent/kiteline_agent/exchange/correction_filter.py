@@ -31,6 +31,11 @@ class CorrectionFilter:
         """Take over the next correction as it is."""
         self._T_w_o = None
 
+    def move_odometry(self, T_o_n: F64) -> None:
+        """The odometry frame o lies at n (4,4) in the map, which no correction moved."""
+        if self._T_w_o is not None:
+            self._T_w_o = self._T_w_o @ T_o_n
+
     def weigh(self, T_w_o: F64, here_o: F64, scale_sigma: float) -> F64:
         """The pose (4,4) of o to report for the base's T_w_o. here_o: (3,) m, vehicle in o.
 

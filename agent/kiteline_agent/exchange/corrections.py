@@ -213,6 +213,14 @@ class Corrections:
         # Where lengths are uncertain, a faster correction would stretch the path while it lasts by more than they are.
         return self._body_in_world(self._smoothing.follow(T_w_o, here, t_ns, by_share=scale_sigma > 0.0), T_o_b)
 
+    def relocalise(self, T_o_n: F64) -> None:
+        """A relocalisation found that o lies elsewhere in the map, at n: live poses follow at once, as without a base.
+
+        T_o_n: (4,4). What dead reckoning was off by is no correction of the base, which would be smoothed.
+        """
+        self._smoothing.move_odometry(T_o_n)
+        self._filter.move_odometry(T_o_n)
+
     def in_base_map(self, submap: SubmapId, T_m_b: F64) -> F64 | None:
         """T_w_b (4,4) as corrected last, for what the base tells of w, such as tiles; None if it is not placed."""
         S_w_m = self._S_w_m.get(submap)

@@ -38,6 +38,13 @@ class Smoothing:
         """The held pose is reported once more: nothing moved until this time."""
         self._t_ns = t_ns
 
+    def move_odometry(self, T_o_n: F64) -> None:
+        """The odometry frame o lies at n in the map: the pose of the map in the world stays as reported. (4,4)."""
+        if self._T_w_o is not None:
+            self._T_w_o = self._T_w_o @ T_o_n
+        if self._goal is not None:
+            self._goal = self._goal @ T_o_n
+
     def follow(self, T_w_o: F64, here_o: F64, t_ns: int, *, by_share: bool = False) -> F64:
         """The pose (4,4) to report for the corrected T_w_o (4,4). here_o: (3,) m, vehicle in o.
 

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from numpy import float64
+from numpy.typing import NDArray
+
 from kiteline_agent.governor.governor import Extra, Governor
 from kiteline_agent.mapping.camera_state import CameraState
 from kiteline_agent.mapping.keyframe_stage import KeyframeStage
@@ -11,16 +14,24 @@ from kiteline_agent.mapping.submap_stage import SubmapStage
 from kiteline_agent.relocalisation.relocaliser import Relocaliser
 from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_agent.tracking.track import Track
+from kiteline_core.geometry import se3
+
+F64 = NDArray[float64]
 
 
 @dataclass(frozen=True, slots=True)
 class FrameOutcome:
-    """How a frame was placed. tracked: it has a pose. bridged: by dead reckoning alone. inliers: of the images."""
+    """How a frame was placed. tracked: it has a pose. bridged: by dead reckoning alone. inliers: of the images.
+
+    T_o_n: (4,4) odometry frame as it lies in the map after a relocalisation, n, seen from where it lay before, o: what
+    dead reckoning was off by. None without a relocalisation, or in another submap.
+    """
 
     tracked: bool
     bridged: bool
     inliers: int
     events: list[str]
+    T_o_n: F64 | None = None
 
 
 class LossStage:
@@ -54,9 +65,13 @@ class LossStage:
             if extended:
                 return FrameOutcome(True, True, 0, events)
         # b. Relocalise in the stored submaps.
+        submap, T_o_m = self._camera.submaps.active, self._camera.pose.T_o_m
         track, more = self._relocalise(ctx)
         events += more
         placed = track is not None
+        T_o_n = None
+        if placed and self._camera.submaps.active == submap:
+            T_o_n = T_o_m @ se3.inverse(self._camera.pose.T_o_m)
         # c. Open a new submap.
         if not placed and self._submaps.may_open(ctx, self.failed_searches):
             opened = self._submaps.open(ctx)
@@ -67,7 +82,7 @@ class LossStage:
         if placed:
             self._camera.motion.restart(ctx.t_ns)
             bridged = False
-        return FrameOutcome(placed or bridged, bridged, 0 if track is None else track.inliers, events)
+        return FrameOutcome(placed or bridged, bridged, 0 if track is None else track.inliers, events, T_o_n)
 
     def _relocalise(self, ctx: FrameContext) -> tuple[Track | None, list[str]]:
         """Search the stored submaps; if the frame is found, continue there, with a keyframe. And events."""

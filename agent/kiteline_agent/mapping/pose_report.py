@@ -48,6 +48,8 @@ class PoseReport:
         keyframe, T_k_c = camera.reference.keyframe, camera.reference.T_k_c
         if keyframe != NO_KEYFRAME:
             self._channel.put(LivePose(self._agent, ctx.t_ns, keyframe, T_k_c, quality))
+        if outcome.T_o_n is not None:
+            self._corrections.relocalise(outcome.T_o_n)
         T_w_b = self._corrections.in_world(submap, T_m_b, T_o_m, ctx.t_ns, metric=camera.motion.metric)
         self._T_w_b = None
         if tracked and T_w_b is not None:
