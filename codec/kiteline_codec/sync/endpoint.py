@@ -332,9 +332,7 @@ class Endpoint:
         c = self.config
         self._throughput.busy(self._out.urgency() is not None, now_ns)
         self.throughput_bytes_s = self._throughput.bytes_s(now_ns)
-        self._out.give_up(now_ns - self._round_trip.overdue_ns, self._overtaken_below)
-        if self._out.give_up(now_ns - self._round_trip.timeout_ns):
-            self._round_trip.timed_out()
+        self._out.give_up(now_ns, self._round_trip, self._overtaken_below)
         left = self._budget.left(now_ns) - c.overhead_bytes
         unheard = self._own_values.state is OwnState.UNHEARD
         waited_ns = now_ns - self._unanswered_since_ns

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from kiteline_codec.schema import Key
+from kiteline_codec.sync.round_trip import RoundTrip
 from kiteline_codec.transport.packet import MASK_BITS
 
 Carried = tuple[Key, int, int, int]  # key, version, first byte, last byte + 1
@@ -40,6 +41,7 @@ class PacketsInFlight:
         self.lost = 0  # over all sessions
         self.acked_bytes = 0  # of packets with values, over all sessions
         self._packets: dict[int, SentPacket] = {}  # in order of numbers; lost ones too
+        self._probe = 0  # the last packet that repeats what was last of all; it is no reason for another
 
     @property
     def next_number(self) -> int:
@@ -57,7 +59,7 @@ class PacketsInFlight:
     def restart(self) -> None:
         """Begin a session: numbers begin again."""
         self.clear()
-        self.number = 0
+        self.number = self._probe = 0
 
     def add(self, now_ns: int, n_bytes: int, carried: list[Carried]) -> None:
         """Note the packet of the last number as sent."""
@@ -96,7 +98,24 @@ class PacketsInFlight:
                 arrived(*carried)
         return result
 
-    def give_up(self, sent_before_ns: int, number_below: int | None = None) -> list[SentPacket]:
+    def give_up_late(self, now_ns: int, round_trip: RoundTrip, overtaken_below: int, *, last: bool) -> list[SentPacket]:
+        """Mark as lost what was overtaken, what is the last of all (RFC 8985: a tail loss probe) and what timed out.
+
+        overtaken_below: packets with lower numbers have been overtaken. last: nothing waits to be sent, so that nothing
+        would overtake the last packet; it is sent again, once. Returns the packets that were not marked before.
+        """
+        lost = self._give_up(now_ns - round_trip.overdue_ns, overtaken_below)
+        newest, probe_ns = self._packets.get(self.number), round_trip.probe_ns
+        if last and newest is not None and not newest.lost and probe_ns is not None and self.number > self._probe:
+            if now_ns - newest.sent_ns >= probe_ns:
+                self._probe = self.next_number
+                return lost + self._give_up(now_ns)
+        timed_out = self._give_up(now_ns - round_trip.timeout_ns)
+        if timed_out:
+            round_trip.timed_out()
+        return lost + timed_out
+
+    def _give_up(self, sent_before_ns: int, number_below: int | None = None) -> list[SentPacket]:
         """Mark packets sent before a time as lost. Returns those that were not marked before."""
         lost = []
         for number, packet in self._packets.items():

@@ -15,6 +15,7 @@ from kiteline_codec.sync.archive import Archive, Row, Spill
 from kiteline_codec.sync.digest import MODULUS, Digest, hash_value
 from kiteline_codec.sync.in_flight import Acknowledged, Carried, PacketsInFlight, SentPacket
 from kiteline_codec.sync.resident import ResidentValues
+from kiteline_codec.sync.round_trip import RoundTrip
 from kiteline_codec.sync.send_queue import Entry, Order, SendQueue, item_of
 from kiteline_codec.transport.packet import write_item
 
@@ -378,12 +379,10 @@ class Outbox:
             if entry.code is None:
                 del self._entries[key]
 
-    def give_up(self, sent_before_ns: int, number_below: int | None = None) -> bool:
-        """Take packets sent before a time, and numbered below another, as lost. Returns True if there were any."""
-        lost = self.packets.give_up(sent_before_ns, number_below)
-        for packet in lost:
+    def give_up(self, now_ns: int, round_trip: RoundTrip, overtaken_below: int) -> None:
+        """Queue again what packets carried that count as lost (`PacketsInFlight.give_up_late`)."""
+        for packet in self.packets.give_up_late(now_ns, round_trip, overtaken_below, last=self.urgency() is None):
             self._lose(packet)
-        return bool(lost)
 
     def _lose(self, packet: SentPacket) -> None:
         """Queue again what a packet carried."""

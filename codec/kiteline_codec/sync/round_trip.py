@@ -36,6 +36,11 @@ class RoundTrip:
         return mean_ns + max(mean_ns // 4, 2 * self._deviation_ns)
 
     @property
+    def probe_ns(self) -> int | None:
+        """Time after which the last packet of all is sent again, once (RFC 8985); None before the first measurement."""
+        return None if self.mean_ns is None else self.overdue_ns + self._config.ack_delay_ns
+
+    @property
     def timeout_ns(self) -> int:
         """Time after which an unacknowledged packet is lost."""
         c = self._config

@@ -191,15 +191,15 @@ class ZenohLink(_PeerLink):
         ]
         return _publisher(session, f"{key}/up")
 
-    def _stop_sending(self) -> None:
+    def _stop_sending(self, within_s: float | None = None) -> None:
         self._closed.set()
         with self._wake:
             self._wake.notify_all()
-        self._thread.join(_JOIN_S)
+        self._thread.join(within_s)
 
     def close(self) -> None:
         """Leave, within 2 s whatever the base does. May be called twice."""
-        self._stop_sending()
+        self._stop_sending(_JOIN_S)
         no_stop_at_exit(self)
         with self._session_lock:
             session = self._session
@@ -303,15 +303,15 @@ class ZenohHub(Closing):
         with self._lock:
             return frozenset(agent for agent, link in self._links.items() if link.alive)
 
-    def _stop_sending(self) -> None:
+    def _stop_sending(self, within_s: float | None = None) -> None:
         self._closed.set()
         with self._wake:
             self._wake.notify_all()
-        self._thread.join(_JOIN_S)
+        self._thread.join(within_s)
 
     def close(self) -> None:
         """Stop listening, within 2 s whatever the agents do. May be called twice."""
-        self._stop_sending()
+        self._stop_sending(_JOIN_S)
         no_stop_at_exit(self)
         close_session(self.session)
 

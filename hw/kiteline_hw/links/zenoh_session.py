@@ -24,6 +24,7 @@ _MAX_SESSIONS = 96  # where anyone may connect: each takes memory. Agents, and p
 _MAX_PAIRED_SESSIONS = 288  # where only the paired may: 256 agents, and those programs
 _MOST_MESSAGE_BYTES = 1 << 18  # that a base takes in: four of the longest packets
 CLOSE_TIMEOUT_S = 1.5  # s; a frozen peer can stall a close for much longer: then the session is abandoned
+_EXIT_TIMEOUT_S = 6.0  # s for sessions that are closed at the end of the process; a busy machine needs seconds
 CONNECT_TIMEOUT_MS = 4000  # ms of one attempt to connect: two round trips with 900 ms of delay each way
 _RETRY_S = 0.1  # s between two attempts to connect
 _ROUTER = "router/"  # before a locator: a Zenoh router listens there, and both sides connect
@@ -180,7 +181,7 @@ def _close_after_main(closed: threading.Event) -> None:
 def _wait_after_main(closed: threading.Event) -> None:
     """Keep Python from ending until the sessions are closed, or have taken too long."""
     threading.main_thread().join()
-    closed.wait(CLOSE_TIMEOUT_S)
+    closed.wait(_EXIT_TIMEOUT_S)
 
 
 def _close(session: zenoh.Session) -> None:
@@ -196,11 +197,9 @@ def close_session(session: zenoh.Session) -> bool:
     except RuntimeError:  # Python 3.12 starts no thread once the main one has ended: the thread for the end closes it
         return False
     thread.join(CLOSE_TIMEOUT_S)
-    closed = not thread.is_alive()
-    if closed:
-        with _open_lock:
-            _open.pop(id(session), None)
-    return closed
+    with _open_lock:
+        _open.pop(id(session), None)
+    return not thread.is_alive()
 
 
 def direct(callback: Callable[[Any], None], drop: Callable[[], None] | None = None) -> Any:

@@ -382,6 +382,24 @@ def test_a_peer_that_sends_too_much_is_refused() -> None:
     assert dict(pair.b.stats.reasons)["no memory left for it"] > 0
 
 
+def test_a_lost_packet_that_nothing_follows_is_sent_again_once_before_the_time_out() -> None:
+    pair = Pair(delay_ms=(100, 400))
+    for i in range(30):
+        pair.a.put(Key(KeyframePose.KIND, i), b"%d" % i)
+        pair.run(500)
+    pair.settle()
+    timeout_ns = pair.a._round_trip.timeout_ns
+    pair.a.put(Key(KeyframePose.KIND, 99), b"the last")
+    pair.loss = 1.0
+    pair.step()
+    before = len(pair.sent[0])
+    pair.run(timeout_ns // MS - 20)
+    again = [sent_ns for sent_ns, packet in pair.sent[0][before:] if parse(packet, 1 << 20)[1]]
+    assert len(again) == 1
+    pair.loss = 0.0
+    pair.settle()
+
+
 @given(st.binary(max_size=200))
 def test_any_bytes_are_harmless(packet: bytes) -> None:
     b = Endpoint(PLAIN, 1)
