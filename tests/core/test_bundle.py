@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 
 from kiteline_core.geometry import se3
 from kiteline_core.optimisation import bundle_kernels as kernels
@@ -221,6 +220,8 @@ def test_sparse_cholesky_agrees_with_numpy_and_refuses_what_is_not_definite() ->
 
 @pytest.mark.parametrize("outliers", [0.0, 0.04])
 def test_reaches_the_cost_of_an_independent_solver(outliers: float) -> None:
+    from scipy.optimize import least_squares  # not above: all workers import this file
+
     problem, _, _ = scene(4, 25, 0.5, 7, outliers=outliers)
     config = BundleConfig(robust_trials=60, final_trials=0, stop=1e-13)
     bound = bounds(problem, config)

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 
 from kiteline_core.geometry import se3
 from kiteline_core.optimisation.bundle import Border, BundleConfig, BundleProblem, BundleResult, bundle
@@ -63,6 +62,8 @@ def residuals(problem: BundleProblem, poses: F64, points: F64, c: F64) -> F64:
 
 def solved(problem: BundleProblem) -> tuple[float, F64, F64]:
     """Cost, offsets and their covariance by an independent solver over all unknowns."""
+    from scipy.optimize import least_squares  # not above: all workers import this file
+
     f = int(problem.free.sum())
 
     def unpacked(x: F64) -> tuple[F64, F64, F64]:
