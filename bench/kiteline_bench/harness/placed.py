@@ -39,19 +39,25 @@ class KeyframesInWorld:
 
     def positions(self, agent: int) -> tuple[F64, F64]:
         """Camera positions (n,3) of an agent's keyframes: the base's in w, and true ones, in m."""
+        found = [pair for pair in self.positions_by_submap(agent).values() if len(pair[0])]
+        if not found:
+            return np.zeros((0, 3)), np.zeros((0, 3))
+        return np.concatenate([ours for ours, _ in found]), np.concatenate([theirs for _, theirs in found])
+
+    def positions_by_submap(self, agent: int) -> dict[int, tuple[F64, F64]]:
+        """The same for each of an agent's submaps that lie in the world."""
         source = open_source(self.flight.scenarios[agent].source)
         T_b_c = Rectifier(source.rig).camera.T_b_c
         source.close()
         run, mapper = self.agent(agent), self.flight.station.mapper
         truth = {t: T for t, T in zip(run.t_ns, run.truth, strict=True) if T is not None}
         boot = run.found[0].submap >> SUBMAP_BITS
-        ours, theirs = [], []
+        pairs: dict[int, list[tuple[F64, F64]]] = {}
         for keyframe, S_w_c in keyframe_poses(mapper).items():
             t_ns = int(mapper.map.keyframes.t_ns[mapper.map.rows[keyframe]])
             if keyframe >> SEQUENCE_BITS + SUBMAP_BITS == boot and t_ns in truth:
-                ours.append(S_w_c[:3, 3])
-                theirs.append((truth[t_ns] @ T_b_c)[:3, 3])
-        return np.array(ours).reshape(-1, 3), np.array(theirs).reshape(-1, 3)
+                pairs.setdefault(keyframe >> SEQUENCE_BITS, []).append((S_w_c[:3, 3], (truth[t_ns] @ T_b_c)[:3, 3]))
+        return {submap: (np.array([a for a, _ in p]), np.array([b for _, b in p])) for submap, p in pairs.items()}
 
     def length_error(self, agent: int) -> float:
         """Share by which lengths of an agent's path are off in the world."""

@@ -1,4 +1,4 @@
-"""Figure: memory of the grid and CPU of its updates, as figure 67 of the thesis."""
+"""Figures: the scenes from above; memory of the grid and CPU of its updates, as figure 67 of the thesis."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+
+from kiteline_hw.sim.truth.occupancy import TrueGrid
 
 F64 = NDArray[np.float64]
 
@@ -31,4 +33,22 @@ def plot_updates(path: Path, costs: Mapping[str, tuple[F64, F64]], their_mb: flo
     for axes in (memory, cpu):
         axes.grid(True, alpha=0.3)
         axes.legend(fontsize=7)
+    figure.savefig(path, dpi=100)
+
+
+def plot_scenes(path: Path, plans: Mapping[str, tuple[TrueGrid, F64]]) -> None:
+    """Draw true occupancy from above, and the way (n,2) through it, by title."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11.0, 3.2), layout="constrained")
+    FigureCanvasAgg(figure)
+    for axes, (title, (grid, way)) in zip(figure.subplots(1, len(plans), squeeze=False)[0], plans.items(), strict=True):
+        rows, columns = grid.image.shape
+        left, low = grid.corner
+        extent = (left, left + columns * grid.cell_m, low, low + rows * grid.cell_m)
+        axes.imshow(grid.image, cmap="gray", origin="lower", extent=extent, vmin=0, vmax=255)
+        axes.plot(*way.T, color="#d62728", linewidth=1.2)
+        axes.set_title(title, fontsize=9)
+        axes.tick_params(labelsize=7)
     figure.savefig(path, dpi=100)

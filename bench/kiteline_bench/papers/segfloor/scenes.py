@@ -27,7 +27,7 @@ F64 = NDArray[np.float64]
 Points = Sequence[tuple[float, float]]
 
 _TEXTURES = ("leaves", "leaves2", "clutter", "posters", "plaster", "concrete", "wood", "brick")
-_FLOOR = ("wood", 0.55, 0.75)
+_FLOOR = ("concrete", 0.6, 0.85)  # the thesis wants texture on the floor
 _PATTERNED, _UNIFORM = ("brick", 0.6, 0.9), ("plaster", 0.3, 1.1)  # walls; the thesis's corridors have plain ones
 _SHELF, _PILLAR = ("clutter", 0.8, 0.9), ("concrete", 0.54, 1.0)
 _HEIGHT_M = 2.5

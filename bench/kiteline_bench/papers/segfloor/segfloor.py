@@ -22,15 +22,15 @@ from kiteline_bench.grid.scans import Scanner, as_file
 from kiteline_bench.grid.sparse import binary_grid, labels_by_height
 from kiteline_bench.harness.bars import Bar, Bench, at_most, is_true
 from kiteline_bench.harness.recording import Recording
-from kiteline_bench.papers.segfloor.plot import plot_updates
-from kiteline_bench.papers.segfloor.scenes import Scene, corridor_1, corridor_2, rendered, synthetic
+from kiteline_bench.papers.segfloor.plot import plot_scenes, plot_updates
+from kiteline_bench.papers.segfloor.scenes import Scene, corridor_1, corridor_2, rendered, synthetic, trajectory
 from kiteline_bench.reality.flown import table
 from kiteline_codec.channel import RecordChannel
 from kiteline_codec.schema import KeyframeScan, Record
 from kiteline_hw.sim.source import SimSource
 from kiteline_hw.sim.truth.occupancy import OCCUPIED as BLACK
 from kiteline_hw.sim.truth.occupancy import UNKNOWN as GREY
-from kiteline_hw.sim.truth.occupancy import TrueGrid
+from kiteline_hw.sim.truth.occupancy import TrueGrid, occupancy
 from kiteline_hw.sim.truth.sight import HEIGHTS_M, look
 from kiteline_lab.grids.files import FREE, OCCUPIED, UNKNOWN, GridFile
 from kiteline_lab.grids.picture import draw_comparison
@@ -64,8 +64,8 @@ class Growth:
 
     @property
     def mb_an_update(self) -> float:
-        """Slope of the memory, least squares."""
-        return float(np.polyfit(np.arange(len(self.mb)), self.mb, 1)[0])
+        """Slope of the memory, least squares; 0 with fewer than two updates."""
+        return 0.0 if len(self.mb) < 2 else float(np.polyfit(np.arange(len(self.mb)), self.mb, 1)[0])
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,9 +100,11 @@ def run(bench: Bench) -> list[Bar]:
     bars: list[Bar] = []
     rows: list[Sequence[object]] = []
     growths: dict[str, Growth] = {}
+    plans: dict[str, tuple[TrueGrid, F64]] = {}
     for make in bench.chosen((corridor_1, corridor_2, synthetic)):
         scene = make()
         bench.say(f"rendering {scene.name}")
+        plans[scene.name] = plan(scene)
         recording, source = rendered(scene, bench.folder / "paths")
         flight, scans = fly_with_scans(bench, scene.name, recording)
         bench.say(f"  {len(scans)} scans, keyframes {1000 * flight.keyframe_m:.1f} mm off; drawing and judging")
@@ -120,11 +122,12 @@ def run(bench: Bench) -> list[Bar]:
         "free m2", "keyframes with a scan",
     )  # fmt: skip
     table(bench, "Road maps, 30 draws", columns, rows)
-    name = Path("images/papers-segfloor.png")
+    name, scenes_name = Path("images/papers-segfloor.png"), Path("images/papers-segfloor-scenes.png")
     folder = Path("docs") if Path("docs").is_dir() else bench.folder
     (folder / name.parent).mkdir(exist_ok=True)
+    plot_scenes(folder / scenes_name, plans)
     plot_updates(folder / name, {title: (g.put_ms, g.mb) for title, g in growths.items()}, _THEIR_MB)
-    bench.more.append(f"![Memory and CPU time by update]({name})")
+    bench.more.append(f"![The scenes from above]({scenes_name})\n\n![Memory and CPU time by update]({name})")
     return bars
 
 
@@ -133,6 +136,11 @@ def fly_with_scans(bench: Bench, name: str, recording: Recording) -> tuple[Flown
     scans: list[KeyframeScan] = []
     flight = fly_grid(bench, name, recording, channels=lambda channel: cast(RecordChannel, ScanTap(channel, scans)))
     return flight, scans
+
+
+def plan(scene: Scene) -> tuple[TrueGrid, F64]:
+    """True occupancy of a scene, and the way of its camera (n,2)."""
+    return occupancy(scene.world, HEIGHTS_M[0], HEIGHTS_M[-1], 0.02), trajectory(scene)[1][:, :2, 3]
 
 
 def truth(source: SimSource, cell_m: float) -> Truth:
@@ -190,8 +198,13 @@ def _cost_bars(bench: Bench, scene: Scene, recording: Recording, drawn: Sequence
         begin_ns = time.process_time_ns()
         scanner.scan(item.frame, item.T_w_b)
         scan_ms.append(1e-6 * (time.process_time_ns() - begin_ns))
-    bars = []
+    bars: list[Bar] = []
     for d in drawn:
+        if not len(d.growth.mb):
+            bars.append(
+                is_true(f"{scene.name}, cells of {d.cell_m:g} m: scans", "some", False, "the ground is not found")
+            )
+            continue
         total = 1e-3 * (float(np.mean(scan_ms)) + float(np.mean(d.growth.put_ms)))
         peak = 1e-3 * (float(np.max(scan_ms[1:])) + float(np.max(d.growth.put_ms)))
         name = f"{scene.name}, cells of {d.cell_m:g} m"
