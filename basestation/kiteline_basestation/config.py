@@ -326,6 +326,9 @@ class GridConfig:
     sure_sigmas: float = (
         2.0  # standard deviations beyond gap_sigmas from which on a far view is well before what it sees
     )
+    side_columns: int = (
+        2  # of a scan at either side of its view that count as far ones: what stands there is not seen whole
+    )
     occupied_from: int = 5  # 1/16; log-odds from which a band is occupied: one near view, two far ones
     free_from: int = 2  # 1/16; a cell is free if all bands lie at or below minus this: one near view, two far ones
     free_beside: int = (

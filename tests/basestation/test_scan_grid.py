@@ -145,6 +145,22 @@ def test_a_vehicle_that_hovers_says_what_it_sees_a_few_times() -> None:
     assert at(hovering, 2.0, 2.5) == 0
 
 
+def test_one_view_at_the_side_of_an_image_frees_nothing() -> None:
+    """What stands there is seen in part, and matched worst: a view from elsewhere has to agree."""
+    n = 70
+    near = ColumnScan(
+        np.array([0.0, -1.0, 0.0]), -0.69, 0.02, np.full(n, 0.5), np.full(n, 1.8), np.full(n, np.inf),
+        np.zeros(n, np.uint8), np.zeros(n), HEIGHT_M,
+    )  # fmt: skip
+    config = replace(CONFIG, side_columns=5, hole_neighbours=9)
+    grid = ScanGrid(config)
+    grid.put(0, kept(near, config), camera(0.0, 0.0, 0.0))
+    middle, left, right = (1.2 * np.array([np.cos(a), np.sin(a)]) for a in (0.0, 0.66, -0.66))
+    assert [int(at(grid, *place)) for place in (middle, left, right)] == [0, -1, -1]
+    grid.put(1, kept(near, config), camera(0.0, 0.0, 0.3))
+    assert [int(at(grid, *place)) for place in (middle, left, right)] == [0, 0, -1]
+
+
 def test_each_cell_of_a_scan_is_freed_once() -> None:
     """Sectors share no cell and leave none out, whatever the heading."""
     config = replace(CONFIG, storey_overlap_m=0.0, opening=False, bands_m=(0.0, 0.5, 1.2, 2.0))
@@ -215,7 +231,7 @@ def test_hits_are_marked_as_in_the_reference_and_leave_no_trace(seed: int) -> No
 
 def freed(
     x: float, y: float, first: float, step: float, columns: dict[str, NDArray[np.float64]], camera_band: int,
-    near: float, weights: tuple[int, int, int], hits: NDArray[np.uint16],
+    weights: tuple[int, int, int], hits: NDArray[np.uint16],
 ) -> NDArray[np.int64]:  # fmt: skip
     """What `draw_free` takes from the planes (4,rows,columns): each cell asked for its column and its range."""
     rows, cells = np.indices(hits.shape)
@@ -242,7 +258,7 @@ def freed(
     bands = np.where(place < n, bands & ~hits.astype(int), 0)
     seen = columns["start"][i] <= distance
     sure = distance <= np.maximum(columns["sure"][i], columns["start"][i])
-    value = np.where(seen & (distance <= near), weights[0], np.where(sure, weights[1], weights[2]))
+    value = np.where(seen & (distance <= columns["near"][i]), weights[0], np.where(sure, weights[1], weights[2]))
     out = np.zeros((4, *hits.shape), np.int64)
     out[0] = np.where(bands == 7, value, 0)
     for b in range(3):
@@ -254,31 +270,27 @@ def freed(
 def test_free_space_is_drawn_as_in_the_reference(seed: int) -> None:
     rng = np.random.default_rng(seed)
     n, step, first = 20, float(rng.uniform(0.02, 0.12)), float(rng.uniform(-7.0, 7.0))
-    x, y, near, camera_band = (
-        *rng.uniform(20.0, 170.0, 2).tolist(),
-        float(rng.uniform(10, 60)),
-        int(rng.integers(-1, 3)),
-    )
+    (x, y), camera_band = rng.uniform(20.0, 170.0, 2).tolist(), int(rng.integers(-1, 3))
     ends = rng.uniform(-10.0, 90.0, (n, 1)) * (1.0 + rng.uniform(-0.1, 0.1, (n, 3)))
     ends[rng.random(n) < 0.2] = 0.0
     start = rng.uniform(0.0, 40.0, n)
     columns = {
         "begin": start * rng.uniform(0.6, 1.0, n), "start": start, "end": ends, "low": rng.uniform(0.0, 90.0, n),
         "under": rng.integers(0, 2, n).astype(np.uint8), "clear": rng.uniform(-1.0, 100.0, n),
-        "sure": rng.uniform(0.0, 80.0, n),
+        "sure": rng.uniform(0.0, 80.0, n), "near": rng.uniform(10.0, 60.0, n) * (rng.random(n) < 0.9),
     }  # fmt: skip
     hits = np.where(rng.random((192, 192)) < 0.02, rng.integers(1, 8, (192, 192)), 0).astype(np.uint16)
     slots, pool = np.full((3, 3), -1, np.int32), np.zeros((9, 4, 64, 64), np.int16)
     touched, used = np.zeros((3, 3), np.uint8), np.zeros(1, np.int64)
     kernels.draw_free(
         x, y, first, step, columns["begin"], columns["start"], ends, columns["low"], columns["under"],
-        columns["clear"], camera_band, near, columns["sure"], (3, 2, 1), hits, 1, slots,
+        columns["clear"], camera_band, columns["near"], columns["sure"], (3, 2, 1), hits, 1, slots,
         np.arange(9, dtype=np.int32), used, pool, touched,
     )  # fmt: skip
     whole = np.zeros((4, 192, 192), np.int64)
     for r, c in np.argwhere(slots >= 0):
         whole[:, r * 64 : r * 64 + 64, c * 64 : c * 64 + 64] = pool[slots[r, c]]
-    wanted = freed(x, y, first, step, columns, camera_band, near, (3, 2, 1), hits)
+    wanted = freed(x, y, first, step, columns, camera_band, (3, 2, 1), hits)
     assert np.array_equal(-whole, wanted)
     assert np.array_equal(touched > 0, wanted.any(0).reshape(3, 64, 3, 64).any((1, 3)))
 

@@ -161,7 +161,7 @@ def _freed(
 @njit
 def draw_free(
     x: float, y: float, first_rad: float, step_rad: float, begins: F64, starts: F64, ends: F64, lows: F64, under: U8,
-    clears: F64, camera_band: int, near_cells: float, sures: F64, weights: tuple[int, int, int], hits: U16, sign: int,
+    clears: F64, camera_band: int, nears: F64, sures: F64, weights: tuple[int, int, int], hits: U16, sign: int,
     slots: I32, spare: I32, used: I64, pool: I16, touched: U8,
 ) -> None:  # fmt: skip
     """Take evidence of free space from the cells of each column's sector; each cell belongs to one column.
@@ -169,11 +169,10 @@ def draw_free(
     Ranges in cells: begins, starts: (n,) from where the rays to the nearest seen ground are low, and from where the
     ground was seen. ends: (n,3) up to where all bands are free, at a column's lower edge, in its middle and at its
     upper edge; lows: (n,) up to where the bands `under` (n,) are free too. clears: (n,) up to where the line of sight
-    is clear, which frees camera_band (-1: none). weights: of seen ground up to near_cells; beyond, up to sures (n,),
+    is clear, which frees camera_band (-1: none). weights: of seen ground up to nears (n,); beyond, up to sures (n,),
     and where rays are low; and beyond that. Marked cells keep the bands of their obstacles.
     """
     rows, columns = hits.shape
-    near2 = near_cells * near_cells
     for i in range(ends.shape[0]):
         end = ends[i, 0], ends[i, 1], ends[i, 2]
         low, clear = lows[i], clears[i] if camera_band >= 0 else 0.0
@@ -181,6 +180,7 @@ def draw_free(
         if reach <= 0.0:
             continue
         begin2, start2, low2, clear2, sure2 = begins[i] ** 2, starts[i] ** 2, low * low, clear * clear, sures[i] ** 2
+        near2 = nears[i] ** 2
         a0, a1 = first_rad + i * step_rad, first_rad + (i + 1) * step_rad
         edges = np.cos(a0), np.sin(a0), np.cos(a1), np.sin(a1)
         bottom = max(0, int(np.floor(y + min(0.0, reach * edges[1], reach * edges[3]) - 1.0)))
