@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from kiteline_bench.grid import costs, maps, obstacles, robust, scans, street
 from kiteline_bench.grid.accuracy import judged, objects_present
 from kiteline_bench.grid.flown import FlownGrid
+from kiteline_bench.grid.ideal import by_centres, by_whole_cells
 from kiteline_bench.grid.places import Place
 from kiteline_bench.grid.ray_kernels import cast_rays
 from kiteline_bench.grid.sparse import (
@@ -287,3 +288,19 @@ def test_what_is_free_beyond_the_range_is_no_error_if_it_was_in_sight_and_recall
         precision[free_m], recall[free_m] = found.precision, found.recall
     assert precision[5.0] == precision[6.0] == precision[6.5] == precision[8.0] == 100.0 > precision[10.0]
     assert recall[5.0] < 90.0 < recall[6.0] == recall[6.5] == recall[10.0] == 100.0
+
+
+def test_the_truth_on_turned_cells_frees_fewer_of_them_as_a_whole() -> None:
+    state = np.full((80, 80), FREE, np.int8)
+    state[:, 60:] = OCCUPIED
+    true = GridFile(0.05, (0.0, 0.0, 0.0), state)
+    cells = GridFile(0.05, (0.0, 0.0, 0.0), np.full((90, 90), UNKNOWN, np.int8))
+    turn = np.array([[np.cos(0.3), -np.sin(0.3), 0.4], [np.sin(0.3), np.cos(0.3), -0.3], [0.0, 0.0, 1.0]])
+    centres, whole = (draw(true, cells, turn).state for draw in (by_centres, by_whole_cells))
+    r, c = np.indices((90, 90))
+    x = 0.05 * (np.cos(0.3) * (c + 0.5) - np.sin(0.3) * (r + 0.5)) + 0.4
+    known = centres != UNKNOWN
+    assert np.array_equal(centres[known] == OCCUPIED, x[known] >= 3.0)
+    assert not (whole[(x > 3.0 - 0.02) & known] == FREE).any()  # a corner reaches 0.031 m from the centre
+    assert (whole[known & (x < 3.0 - 0.035) & (x > 0.2)] == FREE).mean() > 0.9
+    assert not ((whole == FREE) & (centres != FREE)).any()

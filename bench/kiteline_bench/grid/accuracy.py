@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_bench.grid.flown import FlownGrid, fly_grid, picture_path
+from kiteline_bench.grid.ideal import by_centres, by_whole_cells
 from kiteline_bench.grid.places import Place, all_places
 from kiteline_bench.grid.sparse import binary_grid, labels_by_height, log_odds_grid
 from kiteline_bench.harness.bars import Bar, Bench
@@ -41,10 +42,11 @@ def run(bench: Bench) -> list[Bar]:
             *objects_present(place, flight.grid, flight.T_plane),
         ]
         rows.append(_row(place, "kiteline", flight.grid, found, everything))
+        rows += limits(place, flight)
         rows += references(place, flight)
         bench.say(
             f"  keyframes {1000 * flight.keyframe_m:.1f} mm; "
-            + "; ".join(" ".join(map(str, r[1:5])) for r in rows[-5:])
+            + "; ".join(" ".join(map(str, r[1:5])) for r in rows[-7:])
         )
     columns = ("place", "method", "cell m", "precision %", "recall %", "precision, unseen cells free too", "free m2")
     table(bench, "Road maps of 100 nodes, 30 draws", columns, rows)
@@ -58,6 +60,18 @@ def judged(place: Place, grid: GridFile, T_true_est: F64) -> tuple[GridScore, Gr
     """
     found, in_sight, everything = (score(grid, true, T_true_est) for true in (place.seen, place.sight, place.true))
     return replace(found, precision=in_sight.precision), everything
+
+
+def limits(place: Place, flight: FlownGrid) -> list[Sequence[object]]:
+    """Rows of grids that are drawn from the truth, on the cells of the flown one: no method does better in both."""
+    rows = []
+    for name, draw in (
+        ("the truth at the cells' centres", by_centres),
+        ("the truth, cells free as a whole", by_whole_cells),
+    ):
+        grid = draw(place.sight, flight.grid, flight.T_plane)
+        rows.append(_row(place, name, grid, *judged(place, grid, flight.T_plane)))
+    return rows
 
 
 def references(place: Place, flight: FlownGrid) -> list[Sequence[object]]:
