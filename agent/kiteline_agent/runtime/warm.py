@@ -26,7 +26,7 @@ from kiteline_core.frame import Frame, ImuBatch, ImuCalibration
 from kiteline_core.geometry.cameras import CameraModel, CameraRig, Rectifier
 from kiteline_core.geometry.se3 import from_rt
 from kiteline_core.ground.config import GroundConfig
-from kiteline_core.ground.segmentation import ExpectedGround, GroundSegmenter
+from kiteline_core.ground.ground_warm import warm_ground
 from kiteline_core.ids import AgentId
 from kiteline_core.imaging.matching import MatchConfig, match, match_near
 from kiteline_core.places.place_index import PlaceIndex, Vocabulary, nodes
@@ -73,17 +73,10 @@ def _warm_disparities() -> None:
 
 def _warm_scans(rig: CameraRig) -> None:
     """A scan over level ground with a wall behind it, drawn and read."""
-    camera = Rectifier(rig).camera
-    segmenter, grid = GroundSegmenter(camera, GroundConfig()), LocalGrid(LocalGridConfig())
-    view = segmenter.camera
-    rows = (np.arange(view.height) - view.cy) / view.fy
-    disparity = np.broadcast_to(np.maximum(rows * view.bf, 2.6)[:, None], (view.height, view.width))
-    image = np.zeros((view.height, view.width), np.uint8)
-    up_c = np.array([0.0, -1.0, 0.0])
-    measured = np.ascontiguousarray(disparity, np.float32), (image, image), up_c
-    segmenter.segment(*measured, expected=ExpectedGround(1.0, 0.1))
-    scan = segmenter.segment(*measured).scan
-    grid.add(Scanned(scan, np.eye(4), 1.0, np.zeros(5)), RangeError.of_noise(view.bf, segmenter.surface_sigma_px))
+    segmenter, scan = warm_ground(Rectifier(rig).camera)
+    grid = LocalGrid(LocalGridConfig())
+    error = RangeError.of_noise(segmenter.camera.bf, segmenter.surface_sigma_px)
+    grid.add(Scanned(scan, np.eye(4), 1.0, np.zeros(5)), error)
     grid.around(np.eye(4), None, {}, GroundConfig().bands_m)
 
 

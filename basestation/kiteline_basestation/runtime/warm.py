@@ -16,6 +16,7 @@ from kiteline_codec.channel import plain_pair
 from kiteline_codec.schema import CameraIntrinsics, KeyframeHeader, KeyframeScan, NewLandmarks, Observations, Record
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ground.column_scan import ColumnScan
+from kiteline_core.ground.ground_warm import warm_ground
 from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, keyframe_id, point_id, submap_id
 from kiteline_core.places.place_index import Vocabulary, nodes
 
@@ -49,6 +50,7 @@ def warm(config: BaseConfig | None = None, vocabulary: Vocabulary | None = None)
     agent.put(_scan(_KEYFRAMES - 1))
     station.step({}, done, _KEYFRAMES * 1_000_000_000)
     station.mapper.views.take()
+    warm_ground(stereo)  # scans of images that agents send
     submap = submap_id(0, 0, 0)
     easy = replace(station.mapper.config.loops, min_inliers=4, min_inliers_all=4, min_matched_share=0.0)
     last, first = keyframe_id(submap, _KEYFRAMES - 1), keyframe_id(submap, 0)
