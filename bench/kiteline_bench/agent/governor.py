@@ -132,10 +132,18 @@ largest sum in any one-second window after the third second. How the rows of the
 
 def _write(bench: Bench, flights: Sequence[tuple[str, Sequence[tuple[float, LimitedFlight]]]]) -> None:
     out = Path("docs") if Path("docs").is_dir() else bench.folder
-    parts = [_INTRODUCTION]
+    page = out / "governor.md"
+    parts = [_INTRODUCTION, *_bought(page.read_text() if page.exists() else "")]
     for k, (title, rows) in enumerate(flights):
         figure = f"images/governor-{k}.png"
         (out / "images").mkdir(exist_ok=True)
         plot_governor(out / figure, [flight for _, flight in rows], title)
         parts.append(f"## {title}\n\n{governor_table(rows)}\n\n![CPU against error]({figure})\n")
-    (out / "governor.md").write_text("\n".join(parts))
+    page.write_text("\n".join(parts))
+
+
+def _bought(page: str) -> list[str]:
+    """The page's section on what the ladder buys, which people write."""
+    _, heading, rest = page.partition("## What the ladder buys\n")
+    section, _, _ = rest.partition("\n## ")
+    return [f"{heading}{section.rstrip()}\n"] if heading else []
