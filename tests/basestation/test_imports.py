@@ -77,3 +77,17 @@ def test_the_later_parts_of_a_log_are_read_too(make_flight: MakeFlight, tmp_path
     _, found = read_imports([str(tmp_path / "log.mcap")], SavedMap(), no_station)
     assert found.faults == ()
     assert found.pieces == whole.pieces
+
+
+def test_values_under_ids_of_another_agent_are_left_out(make_flight: MakeFlight, tmp_path: Path) -> None:
+    flight = make_flight(keyframes=4, turns=0.1)
+    records = [record for step in flight.records for record in step]
+    with LogWriter(tmp_path / "log.mcap", {"role": "agent"}) as log:
+        for n, record in enumerate(records):
+            key = messages.key(record)
+            if n == len(records) - 1:
+                key = key._replace(id=key.id + (1 << 44))  # of the next agent
+            log.blob(record_log.TOPIC, n, record_log.write_record(flight.agent, key, messages.encode(record)))
+    _, found = read_imports([str(tmp_path / "log.mcap")], SavedMap(), no_station)
+    assert len(found.faults) == 1 and "is not of agent" in found.faults[0]
+    assert all(key.id < 1 << 44 for piece in found.pieces for key, _ in piece.codes)

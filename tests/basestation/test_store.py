@@ -113,7 +113,7 @@ def test_other_version_is_refused(tmp_path: Path) -> None:
     with sqlite3.connect(tmp_path / FILE) as db:
         db.execute("PRAGMA user_version = 99")
     db.close()
-    with pytest.raises(StoreError, match="version 99, expected version 4"):
+    with pytest.raises(StoreError, match="version 99, expected version 5"):
         Store(tmp_path)
 
 

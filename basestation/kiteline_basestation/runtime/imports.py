@@ -15,7 +15,7 @@ from kiteline_basestation.store.keeper import snapshot
 from kiteline_basestation.store.restore import restore
 from kiteline_basestation.store.saved_map import SavedMap, SavedValues, unpack, value_name
 from kiteline_basestation.store.store import FILE, read
-from kiteline_codec.schema import Key, WireError, messages, record_log
+from kiteline_codec.schema import Key, WireError, messages, owners, record_log
 from kiteline_core.errors import INPUT_FAULTS
 from kiteline_core.ids import AgentId
 from kiteline_hw.logs.log_parts import WholeLog
@@ -70,6 +70,9 @@ def _of_agent(log: LogReader, path: Path) -> FromLog:
             messages.decode(key, code)
         except WireError as error:
             faults.append(f"{path}: {value_name(key)} of agent {agent} cannot be read ({error}): left out")
+            continue
+        if not owners.of_agent(agent, key):  # as in logs of versions with another layout of ids
+            faults.append(f"{path}: {value_name(key)} is not of agent {agent}, whose log this is: left out")
             continue
         values.setdefault(agent, {})[key] = code
     if not values:

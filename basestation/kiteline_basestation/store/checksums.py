@@ -72,7 +72,7 @@ def check_tables(db: sqlite3.Connection, path: Path) -> None:
     if (application, version) != (_APPLICATION, VERSION):
         what = f"version {version}" if application == _APPLICATION else "no store of a base"
         raise StoreError(
-            f"{path}: {what}, expected version {VERSION}; begin an empty store and import the agents' logs"
+            f"{path}: {what}, expected version {VERSION}; begin an empty store and import logs of this version"
         )
     made = sqlite3.connect(":memory:", isolation_level=None)
     make_tables(made)
