@@ -8,6 +8,9 @@ ROOMS := core codec hw agent basestation lab bench cli
 # Compiled kernels are kept with the environment, so that tests and demo compile once.
 export NUMBA_CACHE_DIR ?= $(CURDIR)/$(VENV)/numba-cache
 export OMP_NUM_THREADS ?= 1
+# Compiled modules are kept, also where the shell (of many containers) says not to: the processes of the tests would
+# compile them anew, 15 s of CPU in each of the four and 1 s at each start of an agent or a base.
+export PYTHONDONTWRITEBYTECODE :=
 export PYTHONUNBUFFERED := 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
