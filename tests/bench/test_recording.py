@@ -19,6 +19,7 @@ from kiteline_bench.harness.limited_cpu import LimitedFlight, fly_limited
 from kiteline_bench.harness.recording import Recording, load
 from kiteline_bench.harness.result import busiest_window
 from kiteline_bench.harness.run import fly_alone
+from kiteline_core.frame import ImuBatch, joined
 from kiteline_hw.system.cpu import CpuQuota
 
 
@@ -39,6 +40,26 @@ def test_clip_goes_to_and_fro_without_a_jump(flight: Recording) -> None:
     assert frames[n].left is flight.items[n - 2].frame.left and frames[2 * n - 2].left is flight.items[0].frame.left
     order = [next(k for k, item in enumerate(flight.items) if item.frame.left is frame.left) for frame in frames]
     assert (np.abs(np.diff(order)) == 1).all()
+
+
+def test_a_flight_played_backward_rotates_the_other_way(flight: Recording) -> None:
+    rng, step_ns = np.random.default_rng(5), flight.period_ns // 10
+    begin_ns, end_ns = flight.items[0].frame.t_ns, flight.items[-1].frame.t_ns
+
+    def samples(until_ns: int) -> ImuBatch:
+        return ImuBatch(until_ns - step_ns * np.arange(9, -1, -1), rng.normal(size=(10, 3)), rng.normal(size=(10, 3)))
+
+    flown = replace(flight, items=tuple(replace(item, imu=samples(item.frame.t_ns)) for item in flight.items))
+    back = flown.backward()
+    for item, same in zip(flown.items, reversed(back.items), strict=True):
+        assert same.frame.left is item.frame.left and same.frame.t_ns == begin_ns + end_ns - item.frame.t_ns
+    forth, reverse = (joined([i.imu for i in r.items if i.imu is not None]) for r in (flown, back))
+    assert forth is not None and reverse is not None
+    inside = forth.t_ns >= begin_ns  # what came before the first frame would be after the last one
+    np.testing.assert_array_equal(reverse.t_ns[::-1], begin_ns + end_ns - forth.t_ns[inside])
+    np.testing.assert_array_equal(reverse.gyro[::-1], -forth.gyro[inside])
+    np.testing.assert_array_equal(reverse.accel[::-1], forth.accel[inside])
+    assert all(i.imu is not None and (i.imu.t_ns <= i.frame.t_ns).all() for i in back.items)
 
 
 def test_busiest_window_is_that_of_a_plain_loop() -> None:

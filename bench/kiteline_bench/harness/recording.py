@@ -96,6 +96,29 @@ class Recording:
         begin, end = int(np.argmin(speed[: n // 4])), n - n // 4 + int(np.argmin(speed[n - n // 4 :]))
         return self.part(begin, end + 1)
 
+    def backward(self) -> Recording:
+        """The recording played backward: another flight with the same sensors, stamps from the same time on.
+
+        A vehicle that flies the same way back has the same specific force, and rotates the other way. A sensor that
+        lags, lags behind in the recording and is ahead in this one.
+        """
+        sum_ns = self.items[0].frame.t_ns + self.items[-1].frame.t_ns
+        samples = joined([item.imu for item in self.items if item.imu is not None])
+        items, first = list[Item](), 0
+        if samples is not None:
+            samples = ImuBatch(
+                np.ascontiguousarray(sum_ns - samples.t_ns[::-1]), np.ascontiguousarray(-samples.gyro[::-1]),
+                np.ascontiguousarray(samples.accel[::-1]),
+            )  # fmt: skip
+        for item in reversed(self.items):
+            stamp, imu = sum_ns - item.frame.t_ns, None
+            if samples is not None:
+                last = int(np.searchsorted(samples.t_ns, stamp, side="right"))
+                imu = _rows(samples, first, last) if last > first else None
+                first = last
+            items.append(Item(replace(item.frame, t_ns=stamp), imu, T_w_b=item.T_w_b))
+        return replace(self, items=tuple(items))
+
     def to_and_fro(self, frames: int) -> Iterator[Item]:
         """So many items, played forward and backward in turn, with stamps that go on.
 

@@ -2,7 +2,20 @@
 
 from __future__ import annotations
 
-from kiteline_bench.reality import base, cpu, difficult, euroc, metric, motion, nees, people, places, street, worn
+from kiteline_bench.reality import (
+    base,
+    cpu,
+    difficult,
+    euroc,
+    metric,
+    motion,
+    nees,
+    people,
+    places,
+    starts,
+    street,
+    worn,
+)
 
 PARTS = {
     "euroc": ("Reality: monocular with a real IMU", euroc.run),
@@ -12,6 +25,7 @@ PARTS = {
     "motion": ("Reality: starts in motion", motion.run),
     "base": ("Reality: the base beside the tracker alone", base.run),
     "metric": ("Reality: metric said from a hundred starts", metric.run),
+    "starts": ("Reality: random monocular starts, forward and backward", starts.run),
     "nees": ("Reality: consistent poses of worn rigs", nees.run),
     "people": ("Reality: people who walk through", people.run),
     "difficult": ("Reality: difficult images", difficult.run),
