@@ -265,9 +265,9 @@ class PoseCovariance:
 
         offset: (5,) px, the change, as in `disparity_offset`. Keyframes move with it.
         """
-        m = self._map
-        errors = np.zeros(SHAPES)
+        m, errors = self._map, np.zeros(SHAPES)
         errors[:DISPARITY_SHAPES] = self._at_edge * offset
+        m.held.note_motion(m.active, m.keyframe, m.parent, m.T_m_k)
         for slot in np.flatnonzero(m.keyframe >> SEQUENCE_BITS == m.active):
             m.T_m_k[slot] = se3.orthonormalise(se3.exp(-self._shift_k[slot] @ errors) @ m.T_m_k[slot])
         m.relate_to_parents()

@@ -112,7 +112,7 @@ class Corrections:
 
     def _apply_corrections(self, anchor: MapAnchor | None) -> bool:
         """Take over the corrections that wait, if they matter in the last frame. Returns whether the map moved."""
-        if not self._map.due:
+        if not (self._map.due and self._map.held.fit(self._map.keyframe, self._map.parent)):
             return False
         slots = self._slots_of_active()
         poses = self._map.T_m_k[slots]

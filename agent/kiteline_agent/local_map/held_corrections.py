@@ -1,4 +1,8 @@
-"""Corrections of the base that wait until they matter: those of one keyframe at their newest value."""
+"""Corrections of the base that wait until they matter: those of one keyframe at their newest value.
+
+Poses of the base fit each other. Where it has not set one, both sides compose what the agent told. A changed disparity
+offset moves keyframes here, and the base does not know: from then on a part of its poses would tear the map.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_codec.schema import CulledLandmarks, RemovedObservations
-from kiteline_core.ids import KeyframeId
+from kiteline_core.ids import NO_KEYFRAME, SEQUENCE_BITS, KeyframeId, SubmapId, keyframe_id
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -17,11 +21,61 @@ Removed = RemovedObservations | CulledLandmarks
 
 @dataclass(slots=True)
 class HeldCorrections:
-    """Of keyframes of the local map: poses (4,4), refined landmarks (index, rho, bearing), landmarks to remove."""
+    """Of keyframes of the local map: poses (4,4), refined landmarks (index, rho, bearing), landmarks to remove.
+
+    placed: keyframes whose pose the base has set, in the map or not. moved: those that it has not, and that the agent
+    moved since it told them; of submaps in `moved_submaps`.
+    """
 
     poses: dict[KeyframeId, F64] = field(default_factory=dict)
     landmarks: dict[KeyframeId, tuple[I64, F64, F64]] = field(default_factory=dict)
     removed: dict[tuple[KeyframeId, int], Removed] = field(default_factory=dict)  # by keyframe and kind of the record
+    placed: set[int] = field(default_factory=set)
+    moved: set[int] = field(default_factory=set)
+    moved_submaps: set[SubmapId] = field(default_factory=set)
+
+    def set_pose(self, keyframe: KeyframeId, T_m_k: F64, *, stored: bool) -> None:
+        """Take in a pose of the base. stored: the keyframe is in the local map."""
+        self.placed.add(keyframe)
+        self.moved.discard(keyframe)
+        if stored:
+            self.poses[keyframe] = T_m_k
+
+    def note_motion(self, submap: SubmapId, keyframe: I64, parent: I64, T_m_k: F64) -> None:
+        """The agent is about to move the keyframes of a submap. keyframe, parent (k,), T_m_k (k,4,4): of the local map.
+
+        What the base set is held once more, so that it returns with what the base sets next.
+        """
+        self.moved_submaps.add(submap)
+        self.placed.add(keyframe_id(submap, 0))  # it defines the submap
+        for slot in np.flatnonzero(keyframe >> SEQUENCE_BITS == submap).tolist():
+            k = KeyframeId(int(keyframe[slot]))
+            if parent[slot] == NO_KEYFRAME:
+                continue
+            if k in self.placed:
+                self.poses.setdefault(k, T_m_k[slot].copy())
+            else:
+                self.moved.add(k)
+
+    def fit(self, keyframe: I64, parent: I64) -> bool:
+        """True if the poses that wait fit what would stay of a local map of keyframes (k,) with parents (k,)."""
+        if not self.moved_submaps:
+            return True
+        parents = dict(zip(keyframe.tolist(), parent.tolist(), strict=True))
+        return all(self._fits(k, parents) for k in self.poses)
+
+    def _fits(self, keyframe: int, parents: dict[int, int]) -> bool:
+        """True if all from a keyframe up to the newest ancestor that the base has set lie as the base composes them."""
+        if keyframe >> SEQUENCE_BITS not in self.moved_submaps:
+            return True
+        while (above := parents.get(keyframe, NO_KEYFRAME)) != NO_KEYFRAME:
+            if above in self.placed:
+                if KeyframeId(above) not in self.poses:
+                    return True
+            elif above in self.moved or above not in parents:
+                return False
+            keyframe = above
+        return True
 
     def forget(self, keyframe: KeyframeId) -> None:
         """Drop those of a keyframe that leaves the local map."""

@@ -85,7 +85,7 @@ class LocalMap:
         self.hits = np.zeros(k * b, np.int32)
         self.misses = np.zeros(k * b, np.int32)  # of a seed: searches without a match
         self.last_hit = np.full(k * b, -1, np.int64)  # number of the frame that last tracked the landmark
-        self._held = HeldCorrections()
+        self.held = HeldCorrections()
         self._has_new_seeds = False  # some may not be initialised
         self.due = False  # some of these differ by more than both maps' errors
         # True: landmarks to refine, add or remove wait, as poses do, until they move the image: own depths are good.
@@ -129,7 +129,7 @@ class LocalMap:
         are candidates, if nothing else decides; None for their own.
         """
         slot = self._free_slot(head.parent)
-        self._held.forget(KeyframeId(int(self.keyframe[slot])))
+        self.held.forget(KeyframeId(int(self.keyframe[slot])))
         n = min(len(uv), self.slot_size)
         rows = slice(slot * self.slot_size, slot * self.slot_size + n)
         self.keyframe[slot], self.parent[slot] = head.keyframe, head.parent
@@ -245,7 +245,7 @@ class LocalMap:
         """Drop the keyframes of a submap."""
         slots = np.flatnonzero(self.keyframe >> SEQUENCE_BITS == submap)
         for keyframe in self.keyframe[slots].tolist():
-            self._held.forget(KeyframeId(keyframe))
+            self.held.forget(KeyframeId(keyframe))
         self.keyframe[slots] = NO_KEYFRAME
         self.counts[slots] = 0
 
@@ -254,8 +254,8 @@ class LocalMap:
     def set_pose(self, record: KeyframePose) -> bool:
         """Hold a keyframe's pose ready for `apply_corrections`. False: nothing moves yet."""
         slot = self.slot_of(record.keyframe)
+        self.held.set_pose(record.keyframe, record.T_m_k, stored=slot >= 0)
         if slot >= 0:
-            self._held.poses[record.keyframe] = record.T_m_k
             self.due |= self._shift_px(slot, record.T_m_k) >= self._config.moved_px
         return False
 
@@ -267,23 +267,23 @@ class LocalMap:
         """
         if not self.due:
             return False
-        self.try_corrections(self._held.landmarks.keys())
-        for keyframe, landmarks in self._held.landmarks.items():
+        self.try_corrections(self.held.landmarks.keys())
+        for keyframe, landmarks in self.held.landmarks.items():
             self._add_fresh(self.slot_of(keyframe), *landmarks)
-        for record in self._held.removed.values():
+        for record in self.held.removed.values():
             self._drop(record)
-        self._held.clear()
+        self.held.clear()
         self.due = False
         return True
 
     def try_corrections(self, keyframes: Collection[KeyframeId]) -> None:
         """Take over the poses that the base sent, and tracked landmarks of some keyframes; all of them still wait."""
         slots = self._slots()
-        for keyframe, T_m_k in self._held.poses.items():
+        for keyframe, T_m_k in self.held.poses.items():
             if keyframe in slots:
                 self.T_m_k[slots[keyframe]] = T_m_k
                 self.from_base[slots[keyframe]] = True
-        for keyframe, (index, rho, bearing) in self._held.landmarks.items():
+        for keyframe, (index, rho, bearing) in self.held.landmarks.items():
             if keyframe in keyframes and keyframe in slots:
                 known = ~self._is_fresh(slots[keyframe], index)
                 self._set_landmarks(slots[keyframe], index[known], rho[known], bearing[known])
@@ -316,7 +316,7 @@ class LocalMap:
         if not self.holds_landmarks:
             return self._drop(record)
         if self.slot_of(record.keyframe) >= 0:
-            self._held.removed[record.keyframe, record.KIND] = record
+            self.held.removed[record.keyframe, record.KIND] = record
         return False
 
     def _drop(self, record: Removed) -> bool:
@@ -337,14 +337,14 @@ class LocalMap:
         index = record.index[keep].astype(np.int64)
         rho = record.inv_depth[keep].astype(np.float64)
         bearing = self._bearings(self.uv[slot, index] + record.offset[keep])
-        self._held.landmarks.pop(record.keyframe, None)  # older ones, that waited
+        self.held.landmarks.pop(record.keyframe, None)  # older ones, that waited
         if not self.holds_landmarks:
             fresh = self._is_fresh(slot, index)
             self._set_landmarks(slot, index[~fresh], rho[~fresh], bearing[~fresh])
             self._add_fresh(slot, index, rho, bearing)
             return bool(len(index))
         if len(index):
-            self._held.landmarks[record.keyframe] = index, rho, bearing
+            self.held.landmarks[record.keyframe] = index, rho, bearing
             turned = np.hypot(*(bearing - self.bearing[slot, index]).T) * self.camera.fx
             nearer = np.abs(rho - self.rho[slot, index]) * self.camera.bf
             px = np.maximum(turned, nearer)[~self._is_fresh(slot, index)]

@@ -1,0 +1,104 @@
+"""A disparity offset that was found has moved the local map: a part of the base's poses would tear it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from kiteline_agent.config import AgentConfig
+from kiteline_agent.covariance.pose_covariance import PoseCovariance
+from kiteline_agent.exchange.corrections import Corrections
+from kiteline_agent.local_map.local_map import LocalMap
+from kiteline_agent.relocalisation.map_cache import MapCache
+from kiteline_codec.schema import KeyframeHeader, KeyframePose
+from kiteline_core.geometry import se3
+from kiteline_core.geometry.cameras import RectifiedCamera
+from kiteline_core.ids import NO_KEYFRAME, KeyframeId
+
+CAMERA = RectifiedCamera(752, 480, 400.0, 400.0, 370.0, 240.0, 0.11, True, np.eye(4))
+CONFIG = AgentConfig()
+STEP_M, SHARE = 1.0, 0.97  # between keyframes, as told; and what is left of it with the offset that was found
+OFFSET_PX = np.array([1.0, 0.0, 0.0, 0.0, 0.0])
+
+
+class _Flight:
+    """Keyframes 0, 1, 2, ... in a row along x, each at twice the fitting distance where the base says nothing else."""
+
+    def __init__(self, keyframes: int) -> None:
+        self.map = LocalMap(CAMERA, CONFIG.local_map, CONFIG.depth_filter)
+        cache = MapCache(CAMERA, CONFIG.map_cache, CONFIG.matching, CONFIG.ransac, None)
+        self.corrections = Corrections(self.map, cache, CONFIG.smoothing)
+        self.covariance = PoseCovariance(self.map, np.eye(4), CONFIG.covariance, has_body=False, has_depth=True)
+        for k in range(keyframes):
+            self.add(k, STEP_M)
+
+    def add(self, k: int, step_m: float) -> None:
+        n, parent = 30, KeyframeId(k - 1 if k else NO_KEYFRAME)
+        T_p_k = _at(step_m if k else 0.0)
+        T_m_k = self.map.T_m_k[self.map.slot_of(parent)] @ T_p_k if k else T_p_k
+        self.map.add(
+            KeyframeHeader(KeyframeId(k), k, parent, T_p_k, n), T_m_k, np.full((n, 2), 200.0), np.full(n, 0.25),
+            np.full(n, 1e-3), np.zeros(n, np.uint8), np.zeros(n, np.uint8), np.zeros((n, 32), np.uint8),
+            np.zeros((n, 3, 21, 21), np.uint8), k,
+        )  # fmt: skip
+
+    def find_offset(self) -> None:
+        """An offset is found on board: all steps were too long."""
+        for slot in range(len(self.map.keyframe)):
+            self.covariance._shift_k[slot] = 0.0
+            self.covariance._shift_k[slot, 0, 0] = (1.0 - SHARE) * self.map.T_m_k[slot, 0, 3]
+        self.covariance.correct_disparities(OFFSET_PX)
+
+    def told(self, **x_m: float) -> bool:
+        """The base sets keyframes (k0=x, k1=x, ...); whether the map moved."""
+        records = [KeyframePose(KeyframeId(int(name[1:])), _at(x)) for name, x in x_m.items()]
+        return self.corrections.take(records, [])[0]
+
+    @property
+    def x_m(self) -> list[float]:
+        """Of the keyframes."""
+        slots = np.flatnonzero(self.map.keyframe != NO_KEYFRAME)
+        return [round(float(x), 9) for x in self.map.T_m_k[slots, 0, 3]]
+
+
+def _at(x: float) -> np.ndarray:
+    return se3.from_rt(np.eye(3), np.array([x, 0.0, 0.0]))
+
+
+def test_poses_below_keyframes_that_moved_here_wait_for_those_between() -> None:
+    """The base knows of no offset yet: it bundles the newest keyframes where the agent told that they are."""
+    flight = _Flight(5)
+    flight.find_offset()
+    assert flight.x_m == [0.0, 0.97, 1.94, 2.91, 3.88]
+    assert not flight.told(k3=3.001, k4=4.002)
+    assert flight.x_m == [0.0, 0.97, 1.94, 2.91, 3.88]
+    assert not flight.told(k2=1.96)  # keyframe 1 may lie anywhere
+    assert flight.told(k1=0.98, k3=2.94, k4=3.92)
+    assert flight.x_m == [0.0, 0.98, 1.96, 2.94, 3.92]
+    assert flight.told(k4=4.02)  # both sides agree on all others
+
+
+def test_what_the_base_set_before_returns_with_what_it_sets_next() -> None:
+    flight = _Flight(4)
+    assert flight.told(k1=1.03, k2=2.06, k3=3.09)
+    flight.find_offset()
+    assert flight.x_m == pytest.approx([0.0, 0.9991, 1.9982, 2.9973])
+    assert flight.told(k3=3.13)
+    assert flight.x_m == [0.0, 1.03, 2.06, 3.13]
+
+
+def test_keyframes_made_since_are_where_the_base_composes_them_if_their_parents_are() -> None:
+    flight = _Flight(3)
+    flight.find_offset()
+    flight.add(3, SHARE)
+    flight.add(4, SHARE)
+    assert not flight.told(k4=4.0)
+    assert flight.told(k1=0.98, k2=1.96)
+    assert flight.x_m == pytest.approx([0.0, 0.98, 1.96, 2.93, 4.0])
+
+
+def test_without_an_offset_a_part_may_move() -> None:
+    """What the agent told is what both sides hold."""
+    flight = _Flight(4)
+    assert flight.told(k3=3.04)
+    assert flight.x_m == [0.0, 1.0, 2.0, 3.04]
