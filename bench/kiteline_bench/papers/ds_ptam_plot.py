@@ -22,7 +22,7 @@ def plot_throttled(
     """Draw a column for each recording. flown: by recording, then flights of all starts by mode and percent."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
-    from matplotlib.ticker import NullLocator
+    from matplotlib.ticker import FormatStrFormatter, NullLocator
 
     figure = Figure(figsize=(4.0 * len(flown), 8.6), layout="constrained")
     FigureCanvasAgg(figure)
@@ -48,14 +48,26 @@ def plot_throttled(
             panel.set_xlabel("% of a core")
             panel.grid(True, alpha=0.3)
         error.set_yscale("log")
-        error.set(ylabel="largest absolute error, m", title=what)
+        error.set(
+            ylabel="largest absolute error, m", title=what, ylim=_limits([f for k in flights.values() for f in k])
+        )
+        error.yaxis.set_major_formatter(FormatStrFormatter("%g"))
+        error.yaxis.set_minor_locator(NullLocator())
         posed.set(ylabel="frames with a pose, %", ylim=(0.0, 105.0))
-        top.set(title=f"live poses at {min(percents):g} % of a core, m", aspect="equal")
+        top.set(title=f"live poses at {min(percents):g} % of a core, m", aspect="equal", adjustable="datalim")
         top.title.set_fontsize(9)
         error.title.set_fontsize(9)
         top.grid(True, alpha=0.3)
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=len(MODES), fontsize=9)
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=9)
     figure.savefig(path, dpi=110)
+
+
+def _limits(flights: Sequence[Throttled]) -> tuple[float, float]:
+    """Limits of the errors' axis: at least two decades, so that chance does not look like much."""
+    errors = [flight.errors.max_abs_m for flight in flights if np.isfinite(flight.errors.max_abs_m)] or [1.0]
+    low, high = float(np.log10(min(errors))), float(np.log10(max(errors)))
+    more = max(0.2, 1.0 - (high - low) / 2.0)
+    return 10.0 ** (low - more), 10.0 ** (high + more)
 
 
 def _longest_truth(flights: Sequence[Throttled]) -> F64:
