@@ -13,6 +13,7 @@ from kiteline_agent.imaging.features import DetectorConfig, Pyramid
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 Bools = NDArray[np.bool_]
+U8 = NDArray[np.uint8]
 
 _BORDER_PX = 8.0  # a window of the flow and its gradients lie inside
 
@@ -30,29 +31,32 @@ class CornerFlow:
         self._next_id = 0
         self.ids: I64 = np.zeros(0, np.int64)  # (n,) increasing
         self.uv = np.zeros((0, 2))  # (n,2) px of the newest frame
+        self.octave: U8 = np.zeros(0, np.uint8)  # (n,) of the frame in which the corner was found
 
     def add(self, left: Pyramid) -> None:
         """Follow the corners into a frame, and find new ones where few are left."""
         if self._last is not None and len(self.ids):
             uv, good = self._followed(self._last, left, self.uv)
-            self.ids, self.uv = self.ids[good], uv[good]
+            self.ids, self.uv, self.octave = self.ids[good], uv[good], self.octave[good]
         self._last = left
         self._frame += 1
         is_anchor = self._frame % self._config.anchor_frames == 1
         if is_anchor:
             self._drop_sliding(left)
         if len(self.ids) < self._config.replenish * self._config.corners:
-            found = features.detect(left, self.uv, self._detector).uv[: self._config.corners - len(self.ids)]
-            self.uv = np.concatenate([self.uv, found])
-            self.ids = np.concatenate([self.ids, self._next_id + np.arange(len(found))])
-            self._next_id += len(found)
+            found = features.detect(left, self.uv, self._detector)
+            n = min(len(found.uv), self._config.corners - len(self.ids))
+            self.uv = np.concatenate([self.uv, found.uv[:n]])
+            self.octave = np.concatenate([self.octave, found.octave[:n]])
+            self.ids = np.concatenate([self.ids, self._next_id + np.arange(n)])
+            self._next_id += n
         if is_anchor:
             self._anchor, self._anchor_ids, self._anchor_uv = left, self.ids.copy(), self.uv.copy()
 
     def drop(self, ids: I64) -> None:
         """Forget corners."""
         keep = ~np.isin(self.ids, ids)
-        self.ids, self.uv = self.ids[keep], self.uv[keep]
+        self.ids, self.uv, self.octave = self.ids[keep], self.uv[keep], self.octave[keep]
 
     def _drop_sliding(self, left: Pyramid) -> None:
         """Drop corners that the anchor finds elsewhere: they slide along edges or before what lies behind them."""

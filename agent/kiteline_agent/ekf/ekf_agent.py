@@ -1,7 +1,4 @@
-"""The onboard half with the smallest tracker: one camera and odometry, no base. Sans-IO.
-
-It is stepped like Agent. Its keyframes and landmarks are not shared yet.
-"""
+"""The onboard half with the smallest tracker: one camera and odometry. Sans-IO; it is stepped like Agent."""
 
 from __future__ import annotations
 
@@ -15,7 +12,9 @@ from kiteline_agent.covariance.pose_covariance import probability_good
 from kiteline_agent.ekf.corner_flow import CornerFlow
 from kiteline_agent.ekf.ekf_slam import EkfSlam
 from kiteline_agent.ekf.odometer_motion import OdometerMotion
+from kiteline_agent.ekf.shared_keyframes import FilteredFrame, SharedKeyframes
 from kiteline_agent.governor.cost_model import Work
+from kiteline_agent.governor.governor import Governor
 from kiteline_agent.imaging.features import build_pyramid
 from kiteline_agent.inertial.gravity_alignment import AHEAD
 from kiteline_agent.known_rig import KnownRigConfig
@@ -27,7 +26,7 @@ from kiteline_codec.schema import GridTile
 from kiteline_core.frame import Frame
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraRig, Rectifier
-from kiteline_core.ids import NO_KEYFRAME, SubmapId
+from kiteline_core.ids import SubmapId
 
 F64 = NDArray[np.float64]
 
@@ -35,7 +34,10 @@ _SILENT_NS = 1_000_000_000  # of an odometer, before the user is told
 
 
 class EkfAgent:
-    """Tracks one camera by the Kalman filter. m is o: nothing but the filter corrects its map."""
+    """Tracks one camera by the Kalman filter, and shares keyframes of its path with the base.
+
+    The filter's frame is o: nothing but images and odometry corrects it. What the base corrects moves the submap m.
+    """
 
     metric = True  # lengths are those of the odometry
 
@@ -44,29 +46,36 @@ class EkfAgent:
         self._rectifier = Rectifier(rig)
         camera = self._rectifier.camera
         self.work = Work()
-        self.submap = SubmapId(identity.submap)
-        self.tiles: dict[tuple[int, int], GridTile] = {}
-        self._slam = EkfSlam(camera, config.ekf)
-        self._T_c_b = se3.inverse(camera.T_b_c)
         # The body starts level, as its odometer has it; where none is known, the camera does, and looks ahead.
-        self._R_l_o = np.eye(3) if rig.has_body else AHEAD
+        T_o_b = np.eye(4) if rig.has_body else se3.from_rt(AHEAD, np.zeros(3))
+        self._slam = EkfSlam(camera, config.ekf, T_o_b)
+        self._T_c_b = se3.inverse(camera.T_b_c)
+        self._R_l_o = np.eye(3)
         self._flow = CornerFlow(config.detector, config.ekf)
         self._motion = OdometerMotion(camera.T_b_c, config.ekf, config.odometer.keep_s, config.odometer.max_gap_s)
+        self._governor = Governor(config.governor, inertial=True)  # odometry bridges skipped frames as an IMU does
+        self._keyframes = SharedKeyframes(camera, config, identity, channel, self._governor, self.work)
         self._last: Estimate | None = None
+        self._frame_number = 0
         self._measured_ns: int | None = None  # the last frame whose motion the odometer measured, or the first one
         self._told = False  # that it has measured none since for a while
 
     def step(self, step_input: StepInput, now_ns: int) -> StepOutput:
-        """Take in what arrived, track the frame if there is one. Never waits."""
+        """Take in what arrived, track the frame if there is one and time for it. Never waits."""
         self.work.clear()
         self.work.steps = 1
-        self._channel.receive(step_input.packets, now_ns)
-        self._channel.take_removed()
+        records = self._channel.receive(step_input.packets, now_ns)
+        events = self._keyframes.take(records, self._channel.take_removed())
         self._motion.add(step_input.odometry)
         estimate = predicted = None
-        events: list[str] = []
         if step_input.frame is not None:
-            estimate, events = self._process(step_input.frame)
+            decision = self._governor.frame(step_input.frame.t_ns, step_input.cpu_ns, carried=True)
+            events += decision.events
+            if decision.track:
+                estimate, more = self._process(step_input.frame)
+                events += more
+            elif self._config.governor.cpu_percent >= self._config.prediction.least_cpu_percent:
+                predicted = self.predict(step_input.frame.t_ns)
         elif step_input.predict_ns is not None:
             predicted = self.predict(step_input.predict_ns)
         return StepOutput(estimate, tuple(self._channel.poll(now_ns)), tuple(events), predicted)
@@ -88,7 +97,9 @@ class EkfAgent:
         left = self._rectifier.left(frame.left)
         self.work.frames = 1
         self.work.pyramid_px = self.work.detected_px = left.size
-        self._flow.add(build_pyramid(left, self._config.detector.levels))
+        self._frame_number += 1
+        pyramid = build_pyramid(left, self._config.detector.levels)
+        self._flow.add(pyramid)
         if self._last is not None:
             self._slam.predict(self._motion.between(self._last.t_ns, frame.t_ns))
         found = self._slam.update(self._flow.ids, self._flow.uv)
@@ -96,8 +107,19 @@ class EkfAgent:
         self.work.posed_points = len(found.compatible)
         self._flow.drop(found.rejected)  # flow has slid off them
         events = [f"{len(found.entered)} landmarks entered"] if len(found.entered) else []
-        self._last = self._estimate(frame.t_ns, len(found.compatible))
-        return self._last, events + self._missing(frame.t_ns)
+        events += self._missing(frame.t_ns)
+        inliers, flow, T_o_c = len(found.compatible), self._flow, self._slam.state.T_o_c
+        depth_m = self._slam.depths(flow.ids)
+        filtered = FilteredFrame(
+            self._frame_number, frame.t_ns, pyramid, T_o_c, flow.ids, flow.uv, flow.octave, depth_m
+        )  # fmt: skip
+        events += self._keyframes.add(filtered, tracked=self._is_tracked(inliers))
+        self._last = self._estimate(frame.t_ns, inliers)
+        return self._last, events
+
+    def _is_tracked(self, inliers: int) -> bool:
+        """True if images or the odometer measured the last motion; at the first frame there is none."""
+        return inliers >= self._config.pose.min_inliers or self._motion.measured or self._last is None
 
     def _missing(self, t_ns: int) -> list[str]:
         """An event, once, when the odometer has been silent for a while."""
@@ -109,18 +131,31 @@ class EkfAgent:
         return []
 
     def _estimate(self, t_ns: int, inliers: int) -> Estimate:
+        """The estimate of a frame; shares the live pose with the base."""
         T_o_b = se3.orthonormalise(self._slam.state.T_o_c @ self._T_c_b)
         cov = self._slam.state.pose_covariance(self._T_c_b)
-        limits = self._config.covariance
-        by_images = inliers >= self._config.pose.min_inliers
-        tracked = by_images or self._motion.measured or self._last is None
+        limits, keyframes = self._config.covariance, self._keyframes
+        tracked = self._is_tracked(inliers)
+        bridged = tracked and inliers < self._config.pose.min_inliers
         quality = max(1, round(100.0 * probability_good(cov, limits.good_m, limits.good_rad))) if tracked else -1
+        keyframes.share_pose(t_ns, quality)
+        T_w_b = keyframes.in_world(T_o_b, t_ns)
         return Estimate(
-            t_ns, tracked, tracked and not by_images, T_o_b if tracked else None, T_o_b, NO_KEYFRAME, np.eye(4),
-            self.submap, inliers, quality, cov, cov, self._R_l_o, None,
+            t_ns, tracked, bridged, keyframes.T_m_o @ T_o_b if tracked else None, T_o_b, keyframes.keyframe,
+            keyframes.T_k_c.copy(), self.submap, inliers, quality, cov, cov, self._R_l_o, T_w_b if tracked else None,
         )  # fmt: skip
 
     # what is known
+
+    @property
+    def submap(self) -> SubmapId:
+        """The submap in which the camera is tracked: one for the whole flight."""
+        return self._keyframes.submap
+
+    @property
+    def tiles(self) -> dict[tuple[int, int], GridTile]:
+        """Tiles of the base's grid, by column and row."""
+        return self._keyframes.tiles
 
     def surroundings(self, _pose: Estimate | PredictedPose, _T_b_f: F64) -> Surroundings | None:
         """None: it makes no scans."""

@@ -32,13 +32,13 @@ class FrameUpdate:
 class EkfSlam:
     """Estimates pose, odometry scale and landmarks. Sans-IO, deterministic."""
 
-    def __init__(self, camera: RectifiedCamera, config: EkfConfig) -> None:
-        """The body starts at the origin of o."""
+    def __init__(self, camera: RectifiedCamera, config: EkfConfig, T_o_b: F64 | None = None) -> None:
+        """T_o_b: (4,4) of the body at the first frame; None: it is the origin of o."""
         self._config = config
         self._focal = np.array([camera.fx, camera.fy])
         self._centre = np.array([camera.cx, camera.cy])
         self._sigma = config.sigma_px / camera.fx
-        self.state = FilterState(camera.T_b_c, config)
+        self.state = FilterState(camera.T_b_c if T_o_b is None else T_o_b @ camera.T_b_c, config)
         self.slot_of: dict[int, int] = {}  # landmark's slot by the id of its track
         self._ids = np.full(config.landmarks, -1, np.int64)
         self._good = np.zeros(config.landmarks, np.int64)
@@ -74,6 +74,12 @@ class EkfSlam:
         """Position (3,) in o of the landmark of a track; None without one."""
         slot = self.slot_of.get(track)
         return None if slot is None else self.state.points[slot].copy()
+
+    def depths(self, tracks: I64) -> F64:
+        """Depths (n,) in m of the landmarks of tracks (n,) in the camera now; 0 without a landmark, or behind it."""
+        slots = np.array([self.slot_of.get(i, -1) for i in tracks.tolist()], np.int64)
+        ahead = (self.state.points[slots] - self.state.T_o_c[:3, 3]) @ self.state.T_o_c[:3, 2]
+        return np.where((slots >= 0) & (ahead > 0.0), ahead, 0.0)
 
     def forget(self, track: int) -> None:
         """Drop the landmark of a track."""

@@ -74,12 +74,6 @@ def situation(
 ) -> Situation:
     """Measure what the rules read. T_m_k: (4,4) of the reference keyframe."""
     uv = track.observed[track.inlier, :2]
-    side_px = round(math.sqrt(camera.width * camera.height / _COVER_CELLS))
-    columns = -(-camera.width // side_px)
-    rows = -(-camera.height // side_px)
-    column, row = (uv / side_px).astype(np.int64).T
-    covered = np.zeros((rows, columns), np.bool_)
-    covered[row, column] = True
     T_c_k = track.T_c_m @ T_m_k
     depth = median(track.depth_m[track.inlier]) if len(uv) else 1.0
     return Situation(
@@ -87,7 +81,18 @@ def situation(
         seconds_since,
         track.inliers,
         reference_inliers,
-        np.count_nonzero(covered) / covered.size,
+        coverage(uv, camera),
         math.hypot(*T_c_k[:3, 3].tolist()) / max(depth, 0.1),
         math.hypot(*se3.so3_log(T_c_k[:3, :3]).tolist()),
     )
+
+
+def coverage(uv: F64, camera: RectifiedCamera) -> float:
+    """Share of the coarse cells of an image that hold one of the pixels uv (n,2)."""
+    side_px = round(math.sqrt(camera.width * camera.height / _COVER_CELLS))
+    columns = -(-camera.width // side_px)
+    rows = -(-camera.height // side_px)
+    column, row = (uv / side_px).astype(np.int64).T
+    covered = np.zeros((rows, columns), np.bool_)
+    covered[row, column] = True
+    return float(np.count_nonzero(covered) / covered.size)

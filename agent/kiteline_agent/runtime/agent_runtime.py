@@ -27,6 +27,7 @@ from kiteline_agent.runtime.options import (
     AgentOptions,
     agent_config,
     channel_for,
+    is_filter,
 )
 from kiteline_agent.runtime.rig_file import RigFile
 from kiteline_agent.runtime.warm import WARMING, warm
@@ -324,8 +325,8 @@ class AgentRuntime:
 
 
 def opened(options: AgentOptions) -> FrameSource:
-    """The source of a flight. Raises SourceError."""
-    mono = options.mono or options.tracker == "ekf"
+    """The source of a flight. Raises SourceError, ConfigError."""
+    mono = options.mono or is_filter(options.config, options.tracker)
     return open_source(options.source, mono=mono, imu=options.imu, calibration=options.calibration)
 
 

@@ -109,9 +109,14 @@ def agent_config(
     return replace(config, governor=replace(config.governor, cpu_percent=cpu_percent))
 
 
+def is_filter(config: str, tracker: str) -> bool:
+    """True if `--tracker`, or else the TOML file `config`, chooses the Kalman filter. Raises ConfigError."""
+    return agent_config(config, tracker=tracker).tracker == "ekf"
+
+
 def unused_by_filter(a: argparse.Namespace) -> list[str]:
-    """Arguments that `--tracker ekf` has no use for: it makes no scans and reads no IMU."""
-    if a.tracker != "ekf":
+    """Arguments that the Kalman filter has no use for: it makes no scans and reads no IMU. Raises ConfigError."""
+    if not is_filter(a.config, a.tracker):
         return []
     given = {"--obstacles": a.obstacles, "--imu": bool(a.imu), "--grid base": a.grid == "base"}
     return [name for name, is_given in given.items() if is_given]
@@ -195,7 +200,7 @@ def parser(forms: str = "") -> argparse.ArgumentParser:
     p.add_argument(
         "--tracker", choices=TRACKERS, default="",
         help="map (default), or ekf: a Kalman filter over pose and landmarks, for one camera with odometry and hardly "
-        "any CPU; it shares no keyframes",
+        "any CPU; it makes no scans and reads no IMU",
     )  # fmt: skip
     p.add_argument("--mavlink-key", metavar="FILE", default="", help="sign MAVLink messages, and take none unsigned")
     p.add_argument("--log", metavar="DIR", default="", help="log each start to DIR/agentN/bootNNNNN.mcap, …_1.mcap")

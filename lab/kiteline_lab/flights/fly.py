@@ -64,8 +64,8 @@ def parser() -> argparse.ArgumentParser:
                    help="who looks for ground and obstacles: the agents (default), the base in images that a wide "
                    "link carries, or nobody")  # fmt: skip
     p.add_argument("--tracker", choices=TRACKERS, default="",
-                   help="map (default), or ekf: a Kalman filter for one camera with odometry, without "
-                   "keyframes for the base")  # fmt: skip
+                   help="map (default), or ekf: a Kalman filter for one camera with odometry and hardly any CPU; it "
+                   "makes no scans and reads no IMU")  # fmt: skip
     p.add_argument("--seed", metavar="N", type=int, default=0, help="of the link model")
     p.add_argument("--seconds", metavar="S", type=float, default=0.0, help="fly only so much of the source")
     p.add_argument("--store", metavar="DIR", default="", help="the base keeps its map here, and goes on from it")

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from kiteline_agent.runtime.options import AgentOptions
+from kiteline_agent.runtime.options import AgentOptions, is_filter
 from kiteline_basestation.runtime.options import BaseOptions
 from kiteline_core.frame import Frame
 from kiteline_core.ids import MAX_BOOTS
@@ -69,11 +69,10 @@ class FlightPlan:
 def plan(o: Options, quiet: bool = False) -> FlightPlan:
     """Open the sources, so that a bad one is reported before anything starts, and make the options of each process."""
     made = FlightPlan(quiet=quiet, base_kills=o.base_kills)
+    mono = o.mono or is_filter(o.config, o.tracker)
     try:
         for text in o.sources:
-            made.sources.append(
-                open_source(text, mono=o.mono or o.tracker == "ekf", imu=o.imu, calibration=o.calibration)
-            )
+            made.sources.append(open_source(text, mono=mono, imu=o.imu, calibration=o.calibration))
             if is_live(made.sources[-1]):
                 raise SourceError(f"{text}: a camera is flown with `kiteline agent`: expected a recording or sim:SCENE")
         starts = flight_starts(made.sources)
