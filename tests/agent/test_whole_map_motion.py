@@ -162,7 +162,7 @@ def test_tiles_are_read_where_the_base_has_the_vehicle_while_the_live_pose_follo
     camera.submaps.active, camera.pose.T_o_m, camera.motion.metric = SUBMAP, np.eye(4), True
     camera.covariance.of_poses.return_value, camera.covariance.quality.return_value = (np.eye(6), np.eye(6)), 50
     report = PoseReport(AgentId(0), camera, corrections, MagicMock(), has_depth=True)
-    outcome = MagicMock(tracked=True, inliers=50)
+    outcome = MagicMock(tracked=True, inliers=50, T_o_n=None)
     report.report(MagicMock(t_ns=SECOND_NS), outcome)
     step = np.array([0.0, 0.3, 0.0])
     corrections.take(moved_by(local_map, np.array([se3.from_rt(np.eye(3), step * k / 4.0) for k in range(5)])), [])
