@@ -23,7 +23,6 @@ U8 = NDArray[np.uint8]
 Fixed = tuple[NDArray[np.int16], NDArray[np.uint16]]  # OpenCV's fastest maps
 
 _STEP_PX = 8  # of the full image: whole pixels of any disparity image
-_ROWS = 1  # of a disparity image beside a raw image's lower border: it repeats its last row in both eyes, and matches
 
 
 class WideView:
@@ -115,7 +114,7 @@ class WideView:
         view = DisparityCamera.of(self.camera)
         rows, columns = 2 * view.height, view.columns * view.width
         small = np.asarray(middle[:rows, :columns].reshape(view.height, 2, view.width, view.columns).all((1, 3)))
-        around = np.ones((2 * _ROWS + 1, 2 * self._reach + 1), np.uint8)
+        around = np.ones((2 * self._reach + 1, 2 * self._reach + 1), np.uint8)
         eroded = cv2.erode(np.asarray(small, np.uint8), around, borderType=cv2.BORDER_CONSTANT, borderValue=1)
         return np.asarray(eroded > 0)
 

@@ -15,7 +15,7 @@ from kiteline_core.ground.config import GroundConfig
 from kiteline_core.ground.disparity import DisparityCamera
 from kiteline_core.ground.wide_view import WideView
 
-WIDE = GroundConfig()
+WIDE = replace(GroundConfig(), wider=0.085, lower=0.067)
 WIDTH, HEIGHT = 640, 400
 SIDE, LOWER = 56, 24  # px of the full image, by the shares of the configuration
 K1_K2 = (-0.28, 0.07)
@@ -101,10 +101,9 @@ def test_what_either_eye_did_not_see_is_masked_with_its_border(disparity_px: flo
     left, right, some = kept(view, disparity_px)
     inside = np.ones(len(left), np.bool_)
     for side, uv in zip(rectifier.raw_sides, (left, right), strict=True):
-        # To each side all that a matched block reaches must be seen, three of its pixels of two px: what stands at the
-        # border is drawn beyond it. Below it is a row of four px, as the last row goes on alike in both eyes. Nothing
+        # All that a matched block reaches must be seen: three of its pixels to each side, of two and four px. Nothing
         # is read beyond the view.
-        for corner in ([-6.0, -4.0], [6.0, -4.0], [-6.0, 4.0], [6.0, 4.0]):
+        for corner in ([-6.0, -12.0], [6.0, -12.0], [-6.0, 12.0], [6.0, 12.0]):
             first, last = [-SIDE, LOWER], [WIDTH + SIDE - 1.0, HEIGHT + LOWER - 1.0]
             raw, _ = raw_pixels(side, np.clip(uv + corner, first, last))
             inside &= ((raw >= 0.0) & (raw <= [WIDTH - 1.0, HEIGHT - 1.0])).all(1)
