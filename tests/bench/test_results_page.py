@@ -8,7 +8,7 @@ import pytest
 
 from kiteline_bench import benchmark
 from kiteline_bench.benchmark import data_folder, main
-from kiteline_bench.harness.bars import Bar, Bench, at_most, is_true
+from kiteline_bench.harness.bars import Bar, Bench, FlightFailed, at_most, is_true
 from kiteline_bench.harness.results_page import HEADLINES, replace_section, section
 from kiteline_hw.ports import SourceError
 
@@ -59,6 +59,21 @@ def test_the_command_writes_what_it_measured_and_tells_of_a_bar_that_is_not_met(
     assert "`kiteline bench fake`" in results.read_text()
     with pytest.raises(SystemExit):
         main(["nothing"])
+
+
+def test_a_flight_that_fails_does_not_keep_others_from_being_measured(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def failing(bench: Bench) -> list[Bar]:
+        raise FlightFailed("agent 0 ended")
+
+    parts = {"first": ("First", failing), "second": ("Second", lambda _: [at_most("speed", 1.0, 2.0, "ms")])}
+    monkeypatch.setenv("KITELINE_DATA", str(tmp_path))
+    monkeypatch.setattr(benchmark, "parts", lambda name: [(f"fake/{key}", *part) for key, part in parts.items()])
+    results = tmp_path / "results.md"
+    with pytest.raises(FlightFailed, match="agent 0 ended"):
+        main(["fake", "--results", str(results)])
+    assert "## Second" in results.read_text() and "## First" not in results.read_text()
 
 
 class FakeBench:

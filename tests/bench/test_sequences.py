@@ -6,9 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from kiteline_bench.papers.sequences import _ORB_SLAM2, DataSequence, find_sequences
+from kiteline_bench.harness.result import FlownProcesses
+from kiteline_bench.papers.sequences import _ORB_SLAM2, DataSequence, SequenceResult, find_sequences, sequence_bars
 from kiteline_bench.papers.several_maps.several_maps import SEQUENCE_07, own
 from kiteline_hw.ports import SourceError
+from kiteline_lab.flights.outcome import FlightOutcome
 
 
 def folder(tmp_path: Path) -> Path:
@@ -65,3 +67,13 @@ def test_other_sequences_are_not_the_thesis_s(data_dir: Path) -> None:
 
 def test_a_short_name_is_no_other_sequence() -> None:
     assert DataSequence("KITTI", "straight", "").printed_m(_ORB_SLAM2) is None
+
+
+def test_an_error_beside_a_printed_one_counts_with_nearly_all_frames_tracked(tmp_path: Path) -> None:
+    def met(name: str, tracked: int) -> bool:
+        flown = FlownProcesses(tmp_path, {"agents": [{"tracked": tracked, "frames": 100}]}, FlightOutcome([None]))
+        [bar] = sequence_bars(SequenceResult(DataSequence("KITTI", name, ""), flown, None, None))
+        return bar.met
+
+    assert [met("07", tracked) for tracked in (100, 95, 94, 0)] == [True, True, False, False]
+    assert [met("mine", tracked) for tracked in (94, 0)] == [True, False]

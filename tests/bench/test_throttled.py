@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kiteline_bench.papers.ds_ptam import PERCENTS, table, throttled_bars
+from kiteline_bench.harness.bars import Bar, Bench, FlightFailed
+from kiteline_bench.papers.ds_ptam import PERCENTS, _unless_failed, table, throttled_bars
 from kiteline_bench.papers.throttled import MODES, NO_ERRORS, Errors, Throttled, paper_errors
 from kiteline_core.frame import Trajectory
 from kiteline_core.geometry import se3
@@ -35,6 +36,14 @@ def test_errors_are_the_papers(tmp_path: Path) -> None:
     short, _ = paper_errors(tmp_path / "live.tum", Trajectory(t_ns, truth), until_m=0.55)
     assert short.max_abs_m == pytest.approx(0.0, abs=1e-5)
     assert paper_errors(tmp_path / "none.tum", Trajectory(t_ns, truth)) == (NO_ERRORS, None)
+
+
+def test_a_part_that_cannot_be_flown_is_a_bar_that_is_not_met(tmp_path: Path) -> None:
+    def part(bench: Bench) -> list[Bar]:
+        raise FlightFailed("base ended")
+
+    [bar] = _unless_failed(Bench(tmp_path, tmp_path, lambda _: None), "street", part)
+    assert (bar.met, bar.measured) == (False, "base ended")
 
 
 def test_bars_say_what_one_computer_loses() -> None:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from kiteline_bench.harness.result import FlownProcesses
+from kiteline_core.errors import KitelineError
 from kiteline_hw.ports import SourceError
 from kiteline_lab.flights.fly import fly
 from kiteline_lab.flights.plan import Options
@@ -39,7 +40,7 @@ def is_true(name: str, wanted: str, met: bool, measured: str = "") -> Bar:
     return Bar(name, wanted, measured or ("yes" if met else "no"), met)
 
 
-class FlightFailed(Exception):
+class FlightFailed(KitelineError):
     """A process of a flight ended on its own."""
 
 
