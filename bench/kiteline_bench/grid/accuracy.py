@@ -63,7 +63,7 @@ def judged(place: Place, grid: GridFile, T_true_est: F64) -> tuple[GridScore, Gr
 
 
 def limits(place: Place, flight: FlownGrid) -> list[Sequence[object]]:
-    """Rows of grids that are drawn from the truth, on the cells of the flown one: no method does better in both."""
+    """Rows of grids drawn from the truth on the cells of the flown one: what cells alone cost, without noise."""
     rows = []
     for name, draw in (
         ("the truth at the cells' centres", by_centres),

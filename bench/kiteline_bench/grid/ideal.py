@@ -1,4 +1,4 @@
-"""The truth itself as a grid on the cells of a flown one: the most that precision and recall can be together."""
+"""The truth itself as a grid on the cells of a flown one: what precision and recall lose to the cells alone."""
 
 from __future__ import annotations
 
