@@ -9,6 +9,10 @@ import pytest
 
 from kiteline_agent.config import AgentConfig, GovernorConfig, SmoothingConfig
 from kiteline_agent.ekf.ekf_agent import EkfAgent
+from kiteline_agent.ekf.shared_keyframes import FilteredFrame, SharedKeyframes
+from kiteline_agent.governor.cost_model import Work
+from kiteline_agent.governor.governor import Governor
+from kiteline_agent.imaging.features import build_pyramid
 from kiteline_agent.runtime.options import is_filter
 from kiteline_agent.step import Estimate, Identity, StepInput
 from kiteline_codec.channel import plain_pair
@@ -24,7 +28,7 @@ from kiteline_codec.schema import (
 )
 from kiteline_core.frame import Frame, OdometryBatch
 from kiteline_core.geometry import se3
-from kiteline_core.geometry.cameras import CameraModel, CameraRig
+from kiteline_core.geometry.cameras import CameraModel, CameraRig, RectifiedCamera
 from kiteline_core.ids import KEYPOINT_BITS, AgentId
 
 _PERIOD_NS = 50_000_000
@@ -72,9 +76,6 @@ def test_base_receives_a_metric_submap_whose_observations_name_what_it_holds() -
     for r in observed:
         assert set(r.point.tolist()) <= held
         assert not r.inv_depth.any()  # else the base takes the camera for one that measures depths
-    depth = 1.0 / np.concatenate([r.inv_depth[r.inv_depth > 0] for r in received if isinstance(r, NewLandmarks)])
-    if len(depth):
-        assert np.median(depth) == pytest.approx(_DEPTH_M, rel=0.15)
     # Live poses, composed with their keyframes, are those of the odometry frame.
     T_m_k: dict[int, np.ndarray] = {}
     for header in headers:
@@ -83,6 +84,23 @@ def test_base_receives_a_metric_submap_whose_observations_name_what_it_holds() -
     last = estimates[-1]
     assert last is not None
     np.testing.assert_allclose((T_m_k[live[-1].keyframe] @ live[-1].T_k_c)[:3, 3], last.T_o_b[:3, 3], atol=1e-3)
+
+
+def test_a_landmark_has_the_depth_that_the_filter_knows() -> None:
+    image = np.random.default_rng(1).integers(0, 256, (240, 320)).astype(np.uint8)
+    camera, config = RectifiedCamera(320, 240, 200.0, 200.0, 159.5, 119.5, 0.0, False, np.eye(4)), AgentConfig()
+    ours, theirs = plain_pair()
+    keyframes = SharedKeyframes(
+        camera, config, Identity(AgentId(0), 0), ours, Governor(config.governor, inertial=True), Work()
+    )  # fmt: skip
+    depth_m = np.where(np.arange(6) % 2, np.arange(2.0, 8.0), 0.0)
+    uv, octave = np.array([[60.0 + 30.0 * i, 120.0] for i in range(6)]), np.zeros(6, np.uint8)
+    keyframes.add(
+        FilteredFrame(0, 0, build_pyramid(image, 4), np.eye(4), np.arange(6), uv, octave, depth_m), tracked=True
+    )
+    (sent,) = (r for r in theirs.receive((), 0) if isinstance(r, NewLandmarks))
+    told = dict(zip(sent.uv[:, 0].round().tolist(), sent.inv_depth.tolist(), strict=True))
+    assert [told[60.0 + 30.0 * i] for i in range(6)] == pytest.approx([0, 1 / 3, 0, 1 / 5, 0, 1 / 7], abs=1e-3)
 
 
 def test_correction_of_a_keyframe_moves_the_live_pose_and_not_the_odometry() -> None:
