@@ -74,7 +74,8 @@ def main(argv: list[str]) -> int:
         description="Measure what kiteline promises and write docs/results.md. Recordings are looked for in "
         "$KITELINE_DATA, else in ../shared/data.",
     )
-    p.add_argument("names", metavar="NAME", nargs="*", help=f"out of: {', '.join(BENCHMARKS)} (default: all)")
+    p.add_argument("names", metavar="NAME", nargs="*", help=f"out of: {', '.join(BENCHMARKS)} (default: all), or one "
+                   "part of them: NAME/PART; a PART that is unknown lists those there are")  # fmt: skip
     p.add_argument("--results", metavar="F", type=Path, default=Path("docs/results.md"), help="default: %(default)s")
     p.add_argument("--keep", metavar="DIR", type=Path, help="keep the flights in this folder")
     p.add_argument("--starts", metavar="N", type=int, default=0,
@@ -91,7 +92,8 @@ def main(argv: list[str]) -> int:
     for name in a.names or BENCHMARKS:
         found = parts(name)
         if not found:
-            p.error(f"no benchmark {name!r}; there are: {', '.join(BENCHMARKS)}")
+            known = [key for key, _, _ in parts(name.partition("/")[0])] or BENCHMARKS
+            p.error(f"no benchmark {name!r}; there are: {', '.join(known)}")
         chosen += found
     data = data_folder(a.data)
     if a.keep is not None:

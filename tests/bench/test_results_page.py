@@ -59,6 +59,13 @@ def test_the_command_writes_what_it_measured_and_tells_of_a_bar_that_is_not_met(
     assert "`kiteline bench fake`" in results.read_text()
     with pytest.raises(SystemExit):
         main(["nothing"])
+    assert "there are: fake\n" in capsys.readouterr().err
+
+
+def test_an_unknown_part_is_told_with_the_parts_there_are(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["papers/maps"])
+    assert "there are: papers/ekf, papers/ds-ptam," in capsys.readouterr().err
 
 
 def test_a_flight_that_fails_does_not_keep_others_from_being_measured(

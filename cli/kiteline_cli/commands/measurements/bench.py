@@ -6,6 +6,8 @@ SUMMARY = "run measurements and write docs/results.md"
 EXAMPLES = (
     "kiteline bench",
     "kiteline bench agent",
+    "kiteline bench papers/governor --starts 2",
+    "kiteline bench papers/sequences --data ~/datasets --results mine.md",
 )
 
 
