@@ -10,6 +10,7 @@ import pytest
 
 from kiteline_basestation.runtime.imports import read_imports
 from kiteline_basestation.station import Station
+from kiteline_basestation.store.checksums import StoreError
 from kiteline_basestation.store.saved_map import SavedMap, SavedValues
 from kiteline_codec.schema import KeyframeHeader, WireError, messages, record_log
 from kiteline_hw.logs.mcap_log import LogWriter
@@ -82,12 +83,18 @@ def test_the_later_parts_of_a_log_are_read_too(make_flight: MakeFlight, tmp_path
 def test_values_under_ids_of_another_agent_are_left_out(make_flight: MakeFlight, tmp_path: Path) -> None:
     flight = make_flight(keyframes=4, turns=0.1)
     records = [record for step in flight.records for record in step]
-    with LogWriter(tmp_path / "log.mcap", {"role": "agent"}) as log:
-        for n, record in enumerate(records):
-            key = messages.key(record)
-            if n == len(records) - 1:
-                key = key._replace(id=key.id + (1 << 44))  # of the next agent
-            log.blob(record_log.TOPIC, n, record_log.write_record(flight.agent, key, messages.encode(record)))
-    _, found = read_imports([str(tmp_path / "log.mcap")], SavedMap(), no_station)
-    assert len(found.faults) == 1 and "is not of agent" in found.faults[0]
+
+    def log_of(name: str, strange: int) -> str:
+        with LogWriter(tmp_path / name, {"role": "agent"}) as log:
+            for n, record in enumerate(records):
+                key = messages.key(record)
+                if n >= len(records) - strange:
+                    key = key._replace(id=key.id + (1 << 44))  # of the next agent
+                log.blob(record_log.TOPIC, n, record_log.write_record(flight.agent, key, messages.encode(record)))
+        return str(tmp_path / name)
+
+    _, found = read_imports([log_of("few.mcap", 3)], SavedMap(), no_station)
+    assert len(found.faults) == 1 and "left out 3 values not of agent" in found.faults[0]
     assert all(key.id < 1 << 44 for piece in found.pieces for key, _ in piece.codes)
+    with pytest.raises(StoreError, match=f"left out {len(records)} values not of agent.*earlier version"):
+        read_imports([log_of("all.mcap", len(records))], SavedMap(), no_station)

@@ -63,6 +63,7 @@ def _of_log(path: Path, make_station: Callable[[Mapping[str, str]], Station]) ->
 
 def _of_agent(log: LogReader, path: Path) -> FromLog:
     values: dict[AgentId, dict[Key, bytes]] = {}
+    strange: dict[AgentId, list[Key]] = {}  # not of the agent, as in logs of versions with another layout of ids
     faults = [] if log.cut is None else [f"{path}: {log.cut}: what came after is left out"]
     for message in log.messages((record_log.TOPIC,)):
         agent, key, code = record_log.read_record(message.blob())
@@ -71,10 +72,17 @@ def _of_agent(log: LogReader, path: Path) -> FromLog:
         except WireError as error:
             faults.append(f"{path}: {value_name(key)} of agent {agent} cannot be read ({error}): left out")
             continue
-        if not owners.of_agent(agent, key):  # as in logs of versions with another layout of ids
-            faults.append(f"{path}: {value_name(key)} is not of agent {agent}, whose log this is: left out")
+        if not owners.of_agent(agent, key):
+            strange.setdefault(agent, []).append(key)
             continue
         values.setdefault(agent, {})[key] = code
+    for agent, keys in sorted(strange.items()):
+        faults.append(
+            f"{path}: left out {len(keys)} value{'s' * (len(keys) != 1)} not of agent {agent}, whose log this is, the "
+            f"first {value_name(keys[0])}: ids of an earlier version?"
+        )
+    if strange and not values:
+        raise StoreError(f"{faults[-1]} Nothing else is in this log")
     if not values:
         raise StoreError(f"{path}: no keyframes in this log; expected an agent's log with {record_log.TOPIC} in it")
     out = []

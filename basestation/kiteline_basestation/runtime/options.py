@@ -86,8 +86,8 @@ def parser(link_forms: str = "") -> argparse.ArgumentParser:
     p.set_defaults(told=())
     p.add_argument("--insecure", action="store_true", help="serve anyone who reaches the link, without seals")
     p.add_argument("--paired-only", action="store_true",
-                   help="take no connection of anyone without a key in the file (IP links): strangers take up none of "
-                   "the 96; new keys count from the next start")  # fmt: skip
+                   help="take no connection of anyone without a key in the file (IP links): strangers take up no "
+                   "place, and 288 may connect, not 96; new keys count from the next start")  # fmt: skip
     p.add_argument("--profile", choices=("wifi", "radio"), default="", help="default: as the link allows")
     p.add_argument("--workers", metavar="N", type=_workers, default=0,
                    help=f"processes for long work, 1 to {MOST_WORKERS} (default: by cores, 2 to 4)")  # fmt: skip

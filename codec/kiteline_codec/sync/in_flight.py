@@ -41,7 +41,7 @@ class PacketsInFlight:
         self.lost = 0  # over all sessions
         self.acked_bytes = 0  # of packets with values, over all sessions
         self._packets: dict[int, SentPacket] = {}  # in order of numbers; lost ones too
-        self._probe = 0  # the last packet that repeats what was last of all; it is no reason for another
+        self._probed = False  # what was last of all is sent again, and nothing was acknowledged since
 
     @property
     def next_number(self) -> int:
@@ -55,11 +55,12 @@ class PacketsInFlight:
         """Forget all packets; acknowledgements of them are ignored."""
         self._packets.clear()
         self.in_flight = 0
+        self._probed = False
 
     def restart(self) -> None:
         """Begin a session: numbers begin again."""
         self.clear()
-        self.number = self._probe = 0
+        self.number = 0
 
     def add(self, now_ns: int, n_bytes: int, carried: list[Carried]) -> None:
         """Note the packet of the last number as sent."""
@@ -91,6 +92,7 @@ class PacketsInFlight:
                 continue
             packet = self._packets.pop(number)
             self.acked_bytes += packet.n_bytes
+            self._probed = False
             if not packet.lost:
                 self.in_flight -= 1
                 result = Acknowledged(packet.sent_ns if result is None else result.oldest_sent_ns, number)
@@ -102,13 +104,14 @@ class PacketsInFlight:
         """Mark as lost what was overtaken, what is the last of all (RFC 8985: a tail loss probe) and what timed out.
 
         overtaken_below: packets with lower numbers have been overtaken. last: nothing waits to be sent, so that nothing
-        would overtake the last packet; it is sent again, once. Returns the packets that were not marked before.
+        would overtake the last packets; they are sent again early only once until one is acknowledged, so that a link
+        that is down gets no more than the time-out allows. Returns the packets that were not marked before.
         """
         lost = self._give_up(now_ns - round_trip.overdue_ns, overtaken_below)
         newest, probe_ns = self._packets.get(self.number), round_trip.probe_ns
-        if last and newest is not None and not newest.lost and probe_ns is not None and self.number > self._probe:
+        if last and newest is not None and not newest.lost and probe_ns is not None and not self._probed:
             if now_ns - newest.sent_ns >= probe_ns:
-                self._probe = self.next_number
+                self._probed = True
                 return lost + self._give_up(now_ns)
         timed_out = self._give_up(now_ns - round_trip.timeout_ns)
         if timed_out:

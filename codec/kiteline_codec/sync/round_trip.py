@@ -37,7 +37,7 @@ class RoundTrip:
 
     @property
     def probe_ns(self) -> int | None:
-        """Time after which the last packet of all is sent again, once (RFC 8985); None before the first measurement."""
+        """Time after which the last packets of all are sent again (RFC 8985); None before the first measurement."""
         return None if self.mean_ns is None else self.overdue_ns + self._config.ack_delay_ns
 
     @property

@@ -29,16 +29,16 @@ class SharedCore:
     def advance(self, now_ns: float) -> None:
         """Do what the processes can do until a time."""
         while self._now_ns < now_ns:
-            rate = self._rate(sum(process.has_work for process in self._processes))
-            if rate == 0.0:
+            working = [process for process in self._processes if process.has_work]
+            if not working:
                 break
-            until_ns = now_ns
-            for process in self._processes:
-                if process.has_work:
-                    until_ns = min(until_ns, self._now_ns + process.next_ns / rate)
-            for process in self._processes:
-                process.run((until_ns - self._now_ns) * rate)
-            self._now_ns = until_ns
+            rate, least_ns = self._rate(len(working)), min(process.next_ns for process in working)
+            left_ns = (now_ns - self._now_ns) * rate
+            for process in working:  # exactly what one task needs: the time, which is rounded, need not move for it
+                process.run(min(least_ns, left_ns))
+            if left_ns <= least_ns:
+                break
+            self._now_ns += least_ns / rate
         self._now_ns = max(self._now_ns, now_ns)
 
     def free_ns(self, process: CoreProcess) -> int:

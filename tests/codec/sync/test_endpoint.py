@@ -400,6 +400,23 @@ def test_a_lost_packet_that_nothing_follows_is_sent_again_once_before_the_time_o
     pair.settle()
 
 
+def test_several_last_packets_are_sent_again_no_more_often_than_time_outs_allow() -> None:
+    pair = Pair(delay_ms=(5, 8))
+    for i in range(10):
+        pair.a.put(Key(KeyframePose.KIND, i), b"%d" % i)
+        pair.run(200)
+    pair.settle()
+    for i in range(8):
+        pair.a.put(Key(KeyframePose.KIND, 99 + i), bytes(800))
+    pair.loss = 1.0
+    before = len(pair.sent[0])
+    pair.run(2000)
+    again = [packet for _, packet in pair.sent[0][before:] if parse(packet, 1 << 20)[1]]
+    assert len(again) < 40
+    pair.loss = 0.0
+    pair.settle()
+
+
 @given(st.binary(max_size=200))
 def test_any_bytes_are_harmless(packet: bytes) -> None:
     b = Endpoint(PLAIN, 1)

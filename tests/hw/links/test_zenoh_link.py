@@ -212,7 +212,7 @@ def test_a_process_with_an_open_link_ends(way: str, status: int) -> None:
 
 
 def test_bad_numbers_and_names() -> None:
-    with pytest.raises(LinkError, match="expected 0 to 63"):
-        ZenohLink("tcp/127.0.0.1:1", 64)
+    with pytest.raises(LinkError, match="expected 0 to 255"):
+        ZenohLink("tcp/127.0.0.1:1", 256)
     with pytest.raises(LinkError, match="one word"):
         ZenohLink("tcp/127.0.0.1:1", 1, group="a/b")

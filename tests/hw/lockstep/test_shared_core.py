@@ -46,6 +46,17 @@ def test_a_frame_is_dropped_where_another_process_keeps_the_core() -> None:
     assert not agent.newest_wins(0, 0)
 
 
+def test_times_of_the_day_in_nanoseconds_are_no_obstacle() -> None:
+    core = SharedCore(100.0)
+    agent, base = core.process(), core.process()
+    now_ns = 1_700_000_000 * 1000 * MS  # floating-point numbers of this size are 256 apart
+    agent.spend(20, now_ns)
+    base.spend(10 * MS, now_ns)
+    assert not agent.busy(now_ns + 1 * MS)
+    assert base.busy(now_ns + 9 * MS)
+    assert not base.busy(now_ns + 11 * MS)
+
+
 def test_a_core_without_time_is_refused() -> None:
     with pytest.raises(ValueError, match="0 %"):
         SharedCore(0.0)
