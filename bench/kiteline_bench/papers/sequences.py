@@ -101,6 +101,7 @@ def _below(folder: Path, deeper: int) -> list[DataSequence]:
 def run(bench: Bench) -> list[Bar]:
     """Fly all sequences, each with a base."""
     found = find_sequences(bench.sequences or bench.data)
+    bench.warm()
     bars, results = [], []
     for k, sequence in enumerate(found):
         bench.say(f"sequence {k + 1} of {len(found)}: {sequence.title}")
