@@ -73,13 +73,12 @@ def _read_head(source: Reader) -> tuple[Suite, Direction, int]:
     return Suite(first >> 7), Direction(first >> 6 & 1), agent
 
 
-def named_agent(sealed: bytes) -> int | None:
-    """The agent that a tagged packet names; None for anything else."""
+def read_head(sealed: bytes) -> tuple[Suite, Direction, int] | None:
+    """Suite, direction and agent that a sealed packet names, unproved; None if it is too short for that."""
     try:
-        suite, _, agent = _read_head(Reader(sealed))
+        return _read_head(Reader(sealed))
     except WireError:
         return None
-    return agent if suite is Suite.TAGGED else None
 
 
 def suite_for(link: LinkTraits) -> Suite:
@@ -232,6 +231,7 @@ class Opener:
             salt = source.raw(SALT_BYTES[suite])
         except WireError:
             self.counters.truncated += 1
+            self.refusal = "truncated"
             return None
         body_at = len(sealed) - source.left
         if source.left < _TAG_BYTES[suite]:

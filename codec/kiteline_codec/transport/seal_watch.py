@@ -9,9 +9,8 @@ from __future__ import annotations
 from enum import IntEnum
 from zlib import crc32
 
-from kiteline_codec.transport import seal
 from kiteline_codec.transport.packet import CRC_BYTES
-from kiteline_codec.transport.seal import EARLIER_BOOT, Direction, Opener
+from kiteline_codec.transport.seal import EARLIER_BOOT, Direction, Opener, Suite, read_head
 
 _MAGIC = b"\0kiteline"
 _REPLY_EVERY = 32  # refused packets for one notice
@@ -81,7 +80,8 @@ def is_plain(packet: bytes) -> bool:
 
 def named_agent(packet: bytes) -> int:
     """The agent that a packet of a thin link names; 0 where it names none."""
-    return seal.named_agent(packet) or 0
+    head = read_head(packet)
+    return 0 if head is None or head[0] is not Suite.TAGGED else head[2]
 
 
 class SealWatch:
@@ -140,9 +140,9 @@ class SealWatch:
         return lines
 
     def _looks_sealed(self, agent: int, packet: bytes) -> bool:
-        """True if the first byte of a packet is that of the peer's seals."""
-        direction = Direction.UP if self._at_base else Direction.DOWN
-        return bool(packet) and packet[0] & 0x7F == direction << 6 | agent
+        """True if a packet begins as the peer's sealed ones do."""
+        head = read_head(packet)
+        return head is not None and head[1:] == (Direction.UP if self._at_base else Direction.DOWN, agent)
 
     def _trouble(self, packet: bytes) -> Trouble | None:
         assert self._opener is not None

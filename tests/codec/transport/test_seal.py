@@ -53,11 +53,12 @@ def test_agents_of_one_and_of_two_bytes_are_told_apart(suite: Suite) -> None:
     for agent, key in keys.items():
         sealed = Sealer(key, agent, 5, Direction.UP, suite).seal(b"kite")
         assert theirs.open(sealed) == (agent, b"kite")
-        assert seal.named_agent(sealed) == (agent if suite is Suite.TAGGED else None)
+        assert seal.read_head(sealed) == (suite, Direction.UP, agent)
+        assert seal.read_head(sealed[: int(agent >= 63)]) is None
         if agent >= 63:
             assert theirs.open(sealed[:1] + bytes([62]) + sealed[2:]) is None
-            assert theirs.counters.truncated == 1
-            theirs.counters.truncated = 0
+            assert theirs.counters.truncated == 1 and theirs.refusal == "truncated"
+            theirs.counters.truncated, theirs.refusal = 0, ""
 
 
 @SUITES

@@ -7,11 +7,12 @@ import pytest
 from kiteline_codec.coding.packing import WireError
 from kiteline_codec.sync.config import SyncConfig
 from kiteline_codec.sync.endpoint import Endpoint
+from kiteline_codec.transport.packet import PROTOCOL_VERSION
 from kiteline_codec.transport.seal import Direction, Opener, Sealer, Suite
 from kiteline_codec.transport.seal_watch import SealWatch, Trouble, notice, read_notice
 from kiteline_codec.transport.signed_question import OtherStartError, QuestionGuard, sign, unsigned
 
-AGENT = 5  # whose seals begin with the byte that unsealed packets begin with
+AGENT = PROTOCOL_VERSION  # whose seals begin with the byte that unsealed packets begin with
 OURS, OTHER = bytes(32), bytes([1]) * 32
 
 
@@ -50,9 +51,9 @@ def exchange(agent: End, base: End, packets: int = 4) -> tuple[int, list[str], l
 @pytest.mark.parametrize(
     ("agent_key", "base_key", "at_agent", "at_base"),
     [
-        (None, OURS, "the base seals its packets, and this agent has no key", "agent 5 sends without seals"),
-        (OURS, None, "the base sends without seals", "agent 5 seals its packets, and this base has no keys"),
-        (OTHER, OURS, "the base has another key", "agent 5 has another key"),
+        (None, OURS, "the base seals its packets, and this agent has no key", f"agent {AGENT} sends without seals"),
+        (OURS, None, "the base sends without seals", f"agent {AGENT} seals its packets, and this base has no keys"),
+        (OTHER, OURS, "the base has another key", f"agent {AGENT} has another key"),
     ],
 )
 def test_seals_on_one_side_and_other_keys_are_named_on_both(
@@ -81,7 +82,7 @@ def test_an_earlier_boot_is_named_on_both_sides_and_a_repeated_packet_is_not() -
     assert base.watch.lines() == []
     arrived, agent_lines, base_lines = exchange(earlier, base)
     assert arrived == 0
-    assert "a later start of agent 5" in agent_lines[0] and "two agents 5" in base_lines[0]
+    assert f"a later start of agent {AGENT}" in agent_lines[0] and f"two agents {AGENT}" in base_lines[0]
 
 
 def test_few_answers_go_to_a_flood() -> None:
@@ -166,3 +167,11 @@ def test_a_packet_of_a_line_names_its_agent(agent: int) -> None:
     for _ in range(4):
         base.take(None, other.seal(packet()))
     assert [f"agent {agent} has another key" in line for line in base.lines()] == [True]
+
+
+@pytest.mark.parametrize("suite", list(Suite))
+@pytest.mark.parametrize("agent", [0, 62, 63, 64, 255])
+def test_a_base_without_keys_names_every_agent_that_seals(agent: int, suite: Suite) -> None:
+    base, sealer = SealWatch(Direction.DOWN, None), Sealer(OURS, agent, 4, Direction.UP, suite)
+    assert all(base.take(agent, sealer.seal(packet()))[0] is None for _ in range(4))
+    assert [f"agent {agent} seals its packets" in line for line in base.lines()] == [True]
