@@ -120,7 +120,7 @@ class AgentRuntime:
         self._last_cpu_ns = 0  # of the last frame: modelled in lock-step, measured in a live flight
         self._live_clock = False
         self._core: VirtualCpu | CoreProcess = VirtualCpu(options.cpu_percent) if core is None else core
-        self._tracking_ms: deque[float] = deque(maxlen=_SAMPLES)
+        self._tracking_ms: deque[float] = deque(maxlen=_SAMPLES)  # until the pose: by the clock, or as modelled
         self.output: StepOutput | None = None  # of the last step
 
     def _open_record(self, config: AgentConfig) -> FlightRecord | None:
@@ -234,6 +234,7 @@ class AgentRuntime:
         self.output = output = self.agent.step(step_input, now_ns)
         if publish is not None:
             publish(output)
+        tracking_ns = time.monotonic_ns() - begin_ns
         if self._record is not None:
             self._record.step(step_input, output, now_ns, now_ns + self._log_shift_ns)
         if frame is not None:
@@ -244,8 +245,9 @@ class AgentRuntime:
                 ops = cost_ns(self.agent.work)
                 self._core.spend(ops, now_ns)
                 self._last_cpu_ns = ops
+                tracking_ns = max(self._core.free_ns - now_ns, ops)
             if output.estimate is not None:
-                self._tracking_ms.append(self._tracking_ns(begin_ns, now_ns) * 1e-6)
+                self._tracking_ms.append(tracking_ns * 1e-6)
         sent_ns = now_ns if self._live_clock else max(now_ns, self._core.free_ns)
         for packet in output.packets:
             self._wire.send(packet, sent_ns)
@@ -260,12 +262,6 @@ class AgentRuntime:
         if frame is not None and len(self._account.ms) % SAVE_FRAMES == 0:
             self._save_rig()  # a vehicle's power may be cut at any time
         return sent
-
-    def _tracking_ns(self, begin_ns: int, now_ns: int) -> int:
-        """Time that the frame of this step took until its pose: by the clock, in lock-step as modelled."""
-        if self._live_clock:
-            return time.monotonic_ns() - begin_ns
-        return max(self._core.free_ns - now_ns, self._last_cpu_ns)
 
     def report(self) -> dict[str, Any]:
         """The agent's part of report.json, with raw samples in place of statistics."""
