@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from kiteline_basestation.config import GraphConfig
 from kiteline_basestation.merging.essential_graph import GraphInputs, optimise, residuals
 from kiteline_core.geometry import se3
+from tests.yardstick import slowness
 
 F64 = NDArray[np.float64]
 
@@ -94,4 +95,4 @@ def test_a_thousand_keyframes_take_milliseconds() -> None:
         begin = time.process_time()
         optimise(inputs)
         took.append(time.process_time() - begin)
-    assert min(took) < 0.1  # the bar is 0.05 s; this only says that it is no order of magnitude
+    assert min(took) < 0.1 * slowness()  # the bar is 0.05 s; this only says that it is no order of magnitude

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from kiteline_basestation.config import GraphConfig
 from kiteline_basestation.merging.essential_graph import GraphInputs, Scaled, optimise, residuals
 from kiteline_core.geometry import se3, sim3
+from tests.yardstick import slowness
 
 F64 = NDArray[np.float64]
 
@@ -108,4 +109,4 @@ def test_a_thousand_keyframes_with_scales_take_milliseconds() -> None:
     optimise(inputs)
     begin = time.process_time()
     optimise(inputs)
-    assert time.process_time() - begin < 0.3  # 0.05 s on an idle core
+    assert time.process_time() - begin < 0.3 * slowness()  # 0.05 s on an idle core

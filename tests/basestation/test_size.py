@@ -38,6 +38,7 @@ from kiteline_core.geometry import se3
 from kiteline_core.ids import NO_KEYFRAME, KeyframeId, keyframe_id, submap_id, submap_of_keyframe
 from kiteline_core.optimisation.bundle import BundleResult
 from tests.basestation.feeding import STEP_NS, feed
+from tests.yardstick import slowness
 
 MakeFlight = Callable[..., Any]
 
@@ -287,7 +288,7 @@ def test_a_large_map_is_merged_in_a_step(words: Any) -> None:
     begin_ns = time.process_time_ns()
     mapper.merger.merge(submap_id(1, 1, 0), submap_id(0, 1, 0), np.eye(4))
     mapper.merger.search_overlap(submap_id(1, 1, 0), submap_id(0, 1, 0))
-    assert time.process_time_ns() - begin_ns < 1_500_000_000
+    assert time.process_time_ns() - begin_ns < 1.5e9 * slowness()
 
 
 def test_a_keyframe_whose_time_changed_leaves_no_frame_behind(words: Any) -> None:

@@ -32,6 +32,7 @@ _NEW_AGENT_S = 0.05  # s until the hub's sender thread notices a new agent
 _SILENCE_S = 3.0
 _LONGEST_SILENCE_S = 24.0
 _INBOXES_BYTES = 8 << 20  # memory for the packets of all agents: strangers may fill the inboxes of 256
+_EXIT_JOIN_S = 2.0  # s for the same at the end of the process, on a busy machine
 _JOIN_S = 0.3  # s for the sender thread to notice the end; it is a daemon and never keeps the process alive
 
 
@@ -119,7 +120,7 @@ class ZenohLink(_PeerLink):
         self._instances = Instances()
         self._thread = threading.Thread(target=self._run, name="zenoh-send", daemon=True)
         self._thread.start()
-        stop_at_exit(self, self._stop_sending)
+        stop_at_exit(self, partial(self._stop_sending, _EXIT_JOIN_S))
 
     @property
     def connected(self) -> bool:
@@ -191,7 +192,7 @@ class ZenohLink(_PeerLink):
         ]
         return _publisher(session, f"{key}/up")
 
-    def _stop_sending(self, within_s: float | None = None) -> None:
+    def _stop_sending(self, within_s: float) -> None:
         self._closed.set()
         with self._wake:
             self._wake.notify_all()
@@ -248,7 +249,7 @@ class ZenohHub(Closing):
             raise LinkError(f"cannot set up the hub on {endpoint}: {error}") from error
         self._thread = threading.Thread(target=self._run, name="zenoh-send", daemon=True)
         self._thread.start()
-        stop_at_exit(self, self._stop_sending)
+        stop_at_exit(self, partial(self._stop_sending, _EXIT_JOIN_S))
 
     def _link(self, key: Any) -> _AgentLink:
         agent = _checked_agent(int(str(key).split("/")[-2]))
@@ -303,7 +304,7 @@ class ZenohHub(Closing):
         with self._lock:
             return frozenset(agent for agent, link in self._links.items() if link.alive)
 
-    def _stop_sending(self, within_s: float | None = None) -> None:
+    def _stop_sending(self, within_s: float) -> None:
         self._closed.set()
         with self._wake:
             self._wake.notify_all()

@@ -32,6 +32,7 @@ from kiteline_codec.sync.endpoint import Endpoint
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, keyframe_id, submap_id
+from tests.yardstick import slowness
 
 CAMERA = RectifiedCamera(752, 480, 430.0, 431.0, 370.0, 241.0, 0.11, True, np.eye(4))
 SUBMAP = submap_id(3, 7, 2)
@@ -257,7 +258,7 @@ def test_a_keyframe_is_compressed_quickly() -> None:
             form = a.compress(key, code, values.get, values.get)
             assert form is None or b.expand(key, form, values.get) == code
         best = min(best, time.process_time() - start)
-    assert best < 0.008  # typically 1.5 ms
+    assert best < 0.008 * slowness()  # typically 1.5 ms
 
 
 @given(st.integers(0, 10_000), st.sampled_from([0.0, 0.1, 0.4]))

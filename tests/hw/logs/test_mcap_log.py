@@ -23,6 +23,7 @@ from kiteline_hw.logs.rig_json import rig_from_json, rig_to_json
 from kiteline_hw.ports import SourceError
 from kiteline_hw.sensors.images import decode_depth, decode_grey, encode_depth, encode_image
 from kiteline_hw.sources.open import open_source
+from tests.yardstick import slowness
 
 T0 = 5_000_000_000
 RNG = np.random.default_rng(3)
@@ -260,7 +261,7 @@ def test_logging_a_frame_is_cheap(tmp_path: Path) -> None:
             log.imu(IMU, frame.t_ns, batch(frame.t_ns))
             log.frame(frame)
         each_ms = (time.process_time() - begin) / len(frames) * 1e3
-    assert each_ms < 1.0  # about 0.15 on a quiet core; the bound allows for a busy one
+    assert each_ms < 1.0 * slowness()  # about 0.15 on a quiet core; the bound allows for a busy one
 
 
 def test_the_ground_truth_topic_is_found_by_a_source(tmp_path: Path) -> None:

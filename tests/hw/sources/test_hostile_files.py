@@ -29,6 +29,7 @@ from kiteline_hw.sensors.raw_pixels import BadImage
 from kiteline_hw.sources import euroc, tum
 from kiteline_hw.sources.text_files import read_yaml, seconds_to_ns
 from kiteline_hw.system.memory import rss_mib
+from tests.yardstick import slowness
 
 RIG = CameraRig(CameraModel(64, 48, 50.0, 50.0, 31.5, 23.5), None, np.eye(4), None)
 
@@ -124,7 +125,7 @@ def test_yaml_takes_no_time_to_refuse(tmp_path: Path, line: str) -> None:
     path.write_text(line + "\nrate_hz: 20\nT_BS:\n  data: [1, 0,\n   0, 1]\n")
     begin = time.process_time()
     table = read_yaml(path, "anything")
-    assert time.process_time() - begin < 1.0
+    assert time.process_time() - begin < 1.0 * slowness()
     assert table["rate_hz"] == "20" and table["T_BS.data"] == [1.0, 0.0, 0.0, 1.0]
 
 
@@ -136,7 +137,7 @@ def test_aliases_do_not_multiply_in_an_error(tmp_path: Path) -> None:
     begin = time.process_time()
     with pytest.raises(SourceError):
         read_calibration(str(path))
-    assert time.process_time() - begin < 1.0
+    assert time.process_time() - begin < 1.0 * slowness()
 
 
 def euroc_folder(root: Path, listing: str) -> Path:
@@ -174,7 +175,7 @@ def test_seconds_beyond_64_bits_are_refused(text: str) -> None:
     begin = time.process_time()
     with pytest.raises(ValueError, match="no time in seconds"):
         seconds_to_ns(text)
-    assert time.process_time() - begin < 0.5
+    assert time.process_time() - begin < 0.5 * slowness()
 
 
 @pytest.mark.parametrize(
