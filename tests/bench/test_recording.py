@@ -19,6 +19,7 @@ from kiteline_bench.harness.limited_cpu import LimitedFlight, fly_limited
 from kiteline_bench.harness.recording import Recording, load
 from kiteline_bench.harness.result import busiest_window
 from kiteline_bench.harness.run import fly_alone
+from kiteline_bench.reality.cpu import yardstick_ms
 from kiteline_core.frame import ImuBatch, joined
 from kiteline_hw.system.cpu import CpuQuota
 
@@ -200,9 +201,11 @@ def test_flight_under_the_kernel_s_limit(recording: Path) -> None:
 @pytest.mark.skipif(CpuQuota.unavailable() is not None, reason=str(CpuQuota.unavailable()))
 def test_governor_keeps_a_real_flight_within_the_kernel_s_limit(data_dir: Path) -> None:
     source = str(data_dir / "room_flight.mcap")
-    options = ("quota", source, "--percent", "3.5", "--frames", "140")
+    usual_ms = 5.3  # of a machine on which 3.5 % of a core are enough; a slower one needs more
+    percent = 3.5 * max(1.0, float(np.median(yardstick_ms(source))) / usual_ms)
+    options = ("quota", source, "--percent", f"{percent:.1f}", "--frames", "140")
     with ThreadPoolExecutor() as pool:  # each leaves a core nearly idle
         flights = pool.map(lambda more: processes.start(*options, *more), [(), ("--governor",)])
         free, found = (LimitedFlight(**flight) for flight in flights)  # free: what so little CPU time tracks here
-    assert found.peak <= 3.5 * 1.02 and found.lost == 0 and found.submaps == 1
+    assert found.peak <= found.percent * 1.02 and found.lost == 0 and found.submaps == 1
     assert found.tracked > 0.7 * free.tracked > 0 and found.ate_m < 0.02
