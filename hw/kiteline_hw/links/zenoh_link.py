@@ -32,8 +32,8 @@ _NEW_AGENT_S = 0.05  # s until the hub's sender thread notices a new agent
 _SILENCE_S = 3.0
 _LONGEST_SILENCE_S = 24.0
 _INBOXES_BYTES = 8 << 20  # memory for the packets of all agents: strangers may fill the inboxes of 256
-_EXIT_JOIN_S = 2.0  # s for the same at the end of the process, on a busy machine
 _JOIN_S = 0.3  # s for the sender thread to notice the end; it is a daemon and never keeps the process alive
+_EXIT_JOIN_S = 2.0  # s for the same at the end of the process, on a busy machine
 
 
 def _prefix(group: str) -> str:
@@ -72,6 +72,14 @@ def _put(link: QueuedLink, publisher: zenoh.Publisher, packet: bytes) -> None:
         link.count_sent(packet)
     except zenoh.ZError:
         link.counters.failed_packets += 1
+
+
+def _end(thread: threading.Thread, closed: threading.Event, wake: threading.Condition, within_s: float) -> None:
+    """Tell a sender thread that its link is closed, and wait for its end."""
+    closed.set()
+    with wake:
+        wake.notify_all()
+    thread.join(within_s)
 
 
 class _PeerLink(QueuedLink):
@@ -120,7 +128,7 @@ class ZenohLink(_PeerLink):
         self._instances = Instances()
         self._thread = threading.Thread(target=self._run, name="zenoh-send", daemon=True)
         self._thread.start()
-        stop_at_exit(self, partial(self._stop_sending, _EXIT_JOIN_S))
+        stop_at_exit(self, partial(_end, self._thread, self._closed, self._wake, _EXIT_JOIN_S))
 
     @property
     def connected(self) -> bool:
@@ -192,15 +200,9 @@ class ZenohLink(_PeerLink):
         ]
         return _publisher(session, f"{key}/up")
 
-    def _stop_sending(self, within_s: float) -> None:
-        self._closed.set()
-        with self._wake:
-            self._wake.notify_all()
-        self._thread.join(within_s)
-
     def close(self) -> None:
         """Leave, within 2 s whatever the base does. May be called twice."""
-        self._stop_sending(_JOIN_S)
+        _end(self._thread, self._closed, self._wake, _JOIN_S)
         no_stop_at_exit(self)
         with self._session_lock:
             session = self._session
@@ -249,7 +251,7 @@ class ZenohHub(Closing):
             raise LinkError(f"cannot set up the hub on {endpoint}: {error}") from error
         self._thread = threading.Thread(target=self._run, name="zenoh-send", daemon=True)
         self._thread.start()
-        stop_at_exit(self, partial(self._stop_sending, _EXIT_JOIN_S))
+        stop_at_exit(self, partial(_end, self._thread, self._closed, self._wake, _EXIT_JOIN_S))
 
     def _link(self, key: Any) -> _AgentLink:
         agent = _checked_agent(int(str(key).split("/")[-2]))
@@ -304,15 +306,9 @@ class ZenohHub(Closing):
         with self._lock:
             return frozenset(agent for agent, link in self._links.items() if link.alive)
 
-    def _stop_sending(self, within_s: float) -> None:
-        self._closed.set()
-        with self._wake:
-            self._wake.notify_all()
-        self._thread.join(within_s)
-
     def close(self) -> None:
         """Stop listening, within 2 s whatever the agents do. May be called twice."""
-        self._stop_sending(_JOIN_S)
+        _end(self._thread, self._closed, self._wake, _JOIN_S)
         no_stop_at_exit(self)
         close_session(self.session)
 
