@@ -7,6 +7,7 @@ from kiteline_hw.lockstep.zenoh_lockstep import LockstepClient
 from kiteline_hw.ports import LinkError
 from kiteline_hw.system.process import Parent
 
+_BASE_START_S = 300.0  # s that a base may take to start: a slow computer compiles its kernels the first time
 _ANSWER_S = 120.0  # s that the base may take for one tick before it counts as lost
 
 
@@ -16,7 +17,7 @@ class AgentBarrier:
     def __init__(self, endpoint: str, agent: int, parent: Parent) -> None:
         """parent: is informed if the base is lost. Raises LinkError if there is no base."""
         self._endpoint, self._agent, self._parent = endpoint, agent, parent
-        self._client: LockstepClient | None = LockstepClient(endpoint, agent)
+        self._client: LockstepClient | None = self._connected()
         self.times_lost = 0
 
     @property
@@ -38,7 +39,10 @@ class AgentBarrier:
 
     def reconnect(self) -> None:
         """Connect to a base at the same endpoint. Raises LinkError if none comes."""
-        self._client = LockstepClient(self._endpoint, self._agent)
+        self._client = self._connected()
+
+    def _connected(self) -> LockstepClient:
+        return LockstepClient(self._endpoint, self._agent, connect_timeout_s=_BASE_START_S)
 
     def close(self) -> None:
         """Disconnect."""
