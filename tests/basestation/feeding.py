@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
+from kiteline_basestation.config import BaseConfig, GridConfig
 from kiteline_basestation.job_kinds import run_job
 from kiteline_basestation.jobs import Job, JobDone
 from kiteline_basestation.mapper import Mapper, MapperInput
@@ -13,6 +15,8 @@ from kiteline_codec.schema import CameraIntrinsics, Record
 from kiteline_core.ids import AgentId
 
 STEP_NS = 250_000_000
+# A base that draws no landmarks into its grid, which takes a third of its time: for tests of the map alone.
+WITHOUT_GRID = replace(BaseConfig(), grid=replace(GridConfig(), made_per_step=0))
 LAST_STEPS = 70  # without records: corrections of whole maps take some
 
 

@@ -27,6 +27,7 @@ from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.geometry.disparity_offset import none, terms
 from kiteline_core.ids import AgentId
+from tests.basestation.feeding import WITHOUT_GRID
 
 F64 = NDArray[np.float64]
 MakeFlight = Callable[..., Any]
@@ -73,7 +74,7 @@ def mapped(make_flight: MakeFlight, words: Any) -> Mapped:
 
     def get(offset: F64) -> tuple[Any, Mapper]:
         if offset.tobytes() not in flown:
-            flown[offset.tobytes()] = Mapper(replace(BaseConfig(), disparity=exact), words)
+            flown[offset.tobytes()] = Mapper(replace(WITHOUT_GRID, disparity=exact), words)
             fly(flown[offset.tobytes()], flight, offset)
         return flight, flown[offset.tobytes()]
 
@@ -91,7 +92,7 @@ def test_an_offset_is_found(mapped: Mapped, offset: F64) -> None:
 
 def test_disparities_that_are_right_are_left_alone(make_flight: MakeFlight, words: Any) -> None:
     flight = make_flight(keyframes=40, turns=0.6, drift_m=0.001)
-    mapper = Mapper(BaseConfig(), words)
+    mapper = Mapper(WITHOUT_GRID, words)
     jobs = fly(mapper, flight, NONE)
     assert any(job.kind == "full" for job in jobs)
     assert mapper.map.disparity_offset_px == {}
@@ -110,7 +111,7 @@ def test_the_next_flight_begins_with_the_offset_unless_the_rig_was_calibrated_ag
         records = [record for _, batch in output.publish for record in batch]
         return [record for record in records if isinstance(record, DisparityCalibration)]
 
-    after = Mapper(BaseConfig(), words)  # a later base, with the saved state
+    after = Mapper(WITHOUT_GRID, words)  # a later base, with the saved state
     after.map.set_camera(AgentId(0), flight.camera)
     after.restore_state(mapper.state())
     assert [r.disparity_px.tolist() for r in told(after, flight.camera.fx)] == [kept.tolist()]
@@ -124,7 +125,7 @@ def test_what_an_agent_found_counts_until_the_base_knows_more(make_flight: MakeF
     flight = make_flight(keyframes=60, points=1500, memory=8, drift_m=0.001, noise_px=0.2)
     close = worn + [0.3, 0.0, 0.2, 0.0, 0.0]
     said = StereoAlignment(flight.agent, NONE, False, close, 0.15)
-    mapper = Mapper(BaseConfig(), words)
+    mapper = Mapper(WITHOUT_GRID, words)
     first = (CameraIntrinsics(flight.agent, flight.camera), said)
     output = mapper.step(MapperInput(((flight.agent, first),), ()), 0)
     sent = [r for _, records in output.publish for r in records]
@@ -141,7 +142,7 @@ def test_a_rig_that_was_repaired_is_not_held_to_earlier_flights(make_flight: Mak
     flight = make_flight(keyframes=4, points=200, memory=4, drift_m=0.001, noise_px=0.2)
     known = np.array([-0.6, 0.1, -0.2, -0.5, 0.8])
     for found, holds in ((known + 0.1, True), (NONE, False), (-known, False)):
-        mapper = Mapper(BaseConfig(), words)
+        mapper = Mapper(WITHOUT_GRID, words)
         mapper.map.set_camera(flight.agent, flight.camera)
         mapper.map.set_stereo_alignment(StereoAlignment(flight.agent, NONE, False, known))  # of a rig file
         mapper.map.set_stereo_alignment(StereoAlignment(flight.agent, NONE, False, found, 0.1))  # of this flight
@@ -156,7 +157,7 @@ def test_a_restarted_base_tells_an_offset_that_it_knows_better(make_flight: Make
     flight = make_flight(keyframes=4, points=200, memory=4, drift_m=0.001, noise_px=0.2)
     found, better = np.array([-0.6, 0.1, -0.2, -0.5, 0.8]), np.array([-0.55, 0.1, -0.2, -0.45, 0.8])
     received = (CameraIntrinsics(flight.agent, flight.camera), StereoAlignment(flight.agent, NONE, False, found, 0.1))
-    first, second = Mapper(BaseConfig(), words), Mapper(BaseConfig(), words)
+    first, second = Mapper(WITHOUT_GRID, words), Mapper(WITHOUT_GRID, words)
     first.restore(flight.agent, received, (), 0)
     first.map.disparity_offset_px[flight.agent], first.map.disparity_sigma_px[flight.agent] = better, 0.04
     second.restore(flight.agent, received, (), 0)
@@ -171,7 +172,7 @@ def test_an_offset_of_a_worn_rig_is_found_early(make_flight: MakeFlight, words: 
     worn = np.array([1.2, 0.1, -0.2, 0.6, 0.2])
     flight = make_flight(keyframes=60, points=1500, memory=8, drift_m=0.001, noise_px=0.2)
     flight.records[8:] = []
-    mapper = Mapper(BaseConfig(), words)
+    mapper = Mapper(WITHOUT_GRID, words)
     fly(mapper, flight, worn)
     corners = terms(np.array([[x, y] for x in (-0.7, 0.0, 0.7) for y in (-0.45, 0.0, 0.45)]))
     left = corners @ (worn - mapper.map.disparity_offset_px.get(AgentId(0), NONE))
@@ -192,7 +193,7 @@ def test_motion_across_the_axis_is_that_of_the_cameras_own_axes() -> None:
 
 def test_a_base_begins_with_what_the_agent_began_with_but_keeps_its_own(words: Any, make_flight: MakeFlight) -> None:
     flight = make_flight(keyframes=2)
-    mapper = Mapper(BaseConfig(), words)
+    mapper = Mapper(WITHOUT_GRID, words)
     said = StereoAlignment(flight.agent, BENT_ROWS, True, WORN)
     first = (CameraIntrinsics(flight.agent, flight.camera), said)
     mapper.step(MapperInput(((flight.agent, first),), ()), 0)
@@ -213,7 +214,7 @@ def test_a_worn_rig_is_held_about_what_earlier_flights_found(words: Any, make_fl
     left = []
     for told in (NONE, WORN):
         config = replace(BaseConfig().disparity, min_sideways=2.0)  # no motion is believed
-        mapper = Mapper(replace(BaseConfig(), disparity=config), words)
+        mapper = Mapper(replace(WITHOUT_GRID, disparity=config), words)
         fly(mapper, flight, WORN, (StereoAlignment(flight.agent, 0.1 * BENT_ROWS, False, told),))
         assert not has_bent(mapper.map, flight.agent, config)
         error = WORN - mapper.map.disparity_offset_px.get(AgentId(0), NONE)
@@ -223,7 +224,7 @@ def test_a_worn_rig_is_held_about_what_earlier_flights_found(words: Any, make_fl
 
 
 def test_what_a_good_calibration_may_have_is_not_carried_from_flight_to_flight(words: Any) -> None:
-    mapper, config = Mapper(BaseConfig(), words), BaseConfig().disparity
+    mapper, config = Mapper(WITHOUT_GRID, words), BaseConfig().disparity
     assert not np.any(prior_mean(mapper.map, AgentId(0), config))
     camera = RectifiedCamera(752, 480, FOCAL, FOCAL, CX, CY, 0.11, True, np.eye(4))
     mapper.map.set_camera(AgentId(0), camera)
@@ -238,7 +239,7 @@ def test_bent_rows_let_a_large_offset_be_found_whatever_the_motion(make_flight: 
     flight = make_flight(keyframes=14, points=1500, memory=8, drift_m=0.001, noise_px=0.2)
     left = []
     for rows_px in (0.4 * BENT_ROWS, BENT_ROWS):  # as in a good calibration, and bent
-        mapper = Mapper(replace(BaseConfig(), disparity=replace(BaseConfig().disparity, min_sideways=2.0)), words)
+        mapper = Mapper(replace(WITHOUT_GRID, disparity=replace(BaseConfig().disparity, min_sideways=2.0)), words)
         fly(mapper, flight, WORN, (StereoAlignment(flight.agent, rows_px, True, NONE),))
         error = WORN - mapper.map.disparity_offset_px.get(AgentId(0), NONE)
         left.append(float(np.sqrt(np.mean(np.square(terms(CORNERS) @ error)))))

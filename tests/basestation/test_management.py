@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -66,8 +67,8 @@ def ids(value: dict[str, Any]) -> list[str]:
     return [m["id"] for m in value["maps"]]
 
 
-@pytest.fixture
-def pair(make_flight: MakeFlight, words: Any) -> Base:
+@pytest.fixture(scope="module")
+def flown_pair(make_flight: MakeFlight, words: Any) -> Base:
     """Two agents in one room, whose maps have become one."""
     base = Base(words)
     a = make_flight(keyframes=30, turns=0.6)
@@ -75,6 +76,12 @@ def pair(make_flight: MakeFlight, words: Any) -> Base:
     base.fly([a, b])
     assert base.mapper.summary()["merges"] == 1
     return base
+
+
+@pytest.fixture
+def pair(flown_pair: Base) -> Base:
+    """A copy of it, which a test may change."""
+    return copy.deepcopy(flown_pair)
 
 
 def test_list_and_get_describe_all_maps(pair: Base) -> None:

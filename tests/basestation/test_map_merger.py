@@ -20,7 +20,7 @@ from kiteline_codec.channel import plain_pair
 from kiteline_codec.schema import CameraIntrinsics, Key, SubmapPlacement
 from kiteline_core.geometry import se3
 from kiteline_core.ids import SEQUENCE_BITS, submap_of_keyframe
-from tests.basestation.feeding import STEP_NS, feed
+from tests.basestation.feeding import STEP_NS, WITHOUT_GRID, feed
 
 F64 = NDArray[np.float64]
 MakeFlight = Callable[..., Any]
@@ -42,7 +42,7 @@ def joint_error_m(mapper: Mapper, flights: Sequence[Any]) -> F64:
 def test_maps_of_two_agents_in_one_room_are_merged(make_flight: MakeFlight, words: Any) -> None:
     a = make_flight(keyframes=40, turns=0.8)
     b = make_flight(keyframes=40, turns=0.8, start=0.5, variant=1, agent=1, T_w_m=ELSEWHERE)
-    mapper = Mapper(BaseConfig(), words)
+    mapper = Mapper(WITHOUT_GRID, words)
     published = feed(mapper, [a, b])
     assert mapper.summary()["merges"] == 1
     assert np.sqrt(np.mean(joint_error_m(mapper, [a, b]) ** 2)) < 0.02
@@ -59,7 +59,7 @@ def test_similar_rooms_are_not_merged(
     one, other = request.getfixturevalue(rooms)
     a = make_flight(keyframes=40, turns=1.0, scene=one)
     b = make_flight(keyframes=40, turns=1.0, scene=other, variant=1, agent=1)
-    mapper = Mapper(BaseConfig(), words)
+    mapper = Mapper(WITHOUT_GRID, words)
     feed(mapper, [a, b])
     assert mapper.merger is not None
     assert mapper.merger.detector.verified > 0  # single walls do look alike
@@ -70,7 +70,7 @@ def test_similar_rooms_are_not_merged(
 def test_repetitive_corridor_is_not_merged(make_flight: MakeFlight, corridor: Any, words: Any) -> None:
     a = make_flight(keyframes=40, turns=0.6, scene=corridor)
     b = make_flight(keyframes=40, turns=0.6, start=0.35, scene=corridor, variant=1, agent=1)
-    mapper = Mapper(BaseConfig(), words)
+    mapper = Mapper(WITHOUT_GRID, words)
     feed(mapper, [a, b])
     assert mapper.summary()["merges"] == 0
 
@@ -82,7 +82,7 @@ def test_predecessors_of_a_matched_keyframe_are_verified(
     first = make_flight(keyframes=24, turns=0.45, start=0.3, variant=1, agent=1)
     second = make_flight(keyframes=24, turns=0.45, T_w_m=ELSEWHERE)
     loops = replace(BaseConfig().loops, predecessors=predecessors, min_likeness=0.075)  # the index finds one keyframe
-    mapper = Mapper(replace(BaseConfig(), loops=loops), words)
+    mapper = Mapper(replace(WITHOUT_GRID, loops=loops), words)
     feed(mapper, [first, second], [0, 24])
     assert mapper.summary()["merges"] == merges
     if merges:
@@ -95,7 +95,7 @@ def test_agents_share_maps_within_groups(make_flight: MakeFlight, words: Any) ->
         for n in range(3)
     ]
     for share, merges in (("all", 2), ("0 1", 1), ("none", 0)):
-        config = replace(BaseConfig(), loops=replace(BaseConfig().loops, share=share))
+        config = replace(WITHOUT_GRID, loops=replace(BaseConfig().loops, share=share))
         mapper = Mapper(config, words)
         feed(mapper, flights)
         assert mapper.summary()["merges"] == merges
@@ -106,7 +106,7 @@ def test_agents_share_maps_within_groups(make_flight: MakeFlight, words: Any) ->
 def test_submap_after_a_loss_is_merged_and_split_again(make_flight: MakeFlight, words: Any) -> None:
     a = make_flight(keyframes=30, turns=0.6)
     b = make_flight(keyframes=30, turns=0.6, start=0.3, variant=1, submap=1, T_w_m=ELSEWHERE)
-    mapper = Mapper(BaseConfig(), words)
+    mapper = Mapper(WITHOUT_GRID, words)
     feed(mapper, [a, b], [0, 30])
     assert mapper.summary()["merges"] == 1
     assert np.sqrt(np.mean(joint_error_m(mapper, [a, b]) ** 2)) < 0.02
@@ -129,7 +129,7 @@ def test_placement_of_a_split_map_is_withdrawn(make_flight: MakeFlight, words: A
     ours, theirs = {}, {}
     for flight in (a, b):
         theirs[flight.agent], ours[flight.agent] = plain_pair()
-    station = Station(BaseConfig(), ours.__getitem__, words)
+    station = Station(WITHOUT_GRID, ours.__getitem__, words)
     done: tuple[JobDone, ...] = ()
     young = submap_of_keyframe(b.keyframes[0])
     for n in range(70):

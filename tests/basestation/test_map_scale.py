@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from kiteline_basestation.config import BaseConfig, InertialScaleConfig
+from kiteline_basestation.config import InertialScaleConfig
 from kiteline_basestation.inertial import band_kernels
 from kiteline_basestation.inertial.chain import Segment, path_along, segments_of
 from kiteline_basestation.inertial.map_scale import in_metres, map_scale, tells_scale
@@ -29,6 +29,7 @@ from kiteline_core.geometry import se3, sim3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, keyframe_id, submap_id, submap_of_keyframe
 from kiteline_core.optimisation.bundle import BundleResult
+from tests.basestation.feeding import WITHOUT_GRID
 
 F64 = NDArray[np.float64]
 
@@ -273,7 +274,7 @@ def steps_along(true: Callable[[float], F64], from_s: float, to_s: float, n: int
 
 def fed(flight: Any, words: Any, told: list[SubmapPlacement] | None = None) -> Mapper:
     """The base after a flight. told: takes the placements that it publishes."""
-    mapper = Mapper(BaseConfig(), words)
+    mapper = Mapper(WITHOUT_GRID, words)
     done: tuple[JobDone, ...] = ()
     for n in range(len(flight.records) + 30):
         records: list[Record] = [CameraIntrinsics(flight.agent, flight.camera)] if n == 0 else []
@@ -313,7 +314,7 @@ def test_the_world_is_in_metres_by_all_accelerations_and_the_agents_map_stays(
     assert length_ratio(sim3.place(S_w_m, own)[:, :3, 3], told) == pytest.approx(1.0, abs=0.01)
     assert length_ratio(own[:, :3, 3], told) == pytest.approx(UNIT, abs=0.01)
     assert sim3.scale_of(other.placements[submap]) == 1.0
-    again = Mapper(BaseConfig(), words)
+    again = Mapper(WITHOUT_GRID, words)
     sigma = mapper._placements._scale_sigma[submap]
     placement = SubmapPlacement(submap, S_w_m, scale_sigma=sigma)
     again.restore(told.agent, tuple(told.all_records()), (placement,), 0)

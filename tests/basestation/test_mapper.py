@@ -32,7 +32,7 @@ from kiteline_codec.schema import (
 )
 from kiteline_core.geometry import se3
 from kiteline_core.ids import KeyframeId, submap_of_keyframe
-from tests.basestation.feeding import STEP_NS, feed_groups
+from tests.basestation.feeding import STEP_NS, WITHOUT_GRID, feed_groups
 
 F64 = NDArray[np.float64]
 MakeFlight = Callable[..., Any]
@@ -47,18 +47,26 @@ def drift_m(flight: Any) -> F64:
     return np.array([np.linalg.norm(a[:3, 3] - t[:3, 3]) for a, t in zip(flight.agent_T_m_k, flight.true_T_m_k)])
 
 
-def test_mapper_reduces_drift_over_two_rounds(make_flight: MakeFlight) -> None:
+Mapped = tuple[Any, Mapper]
+
+
+@pytest.fixture(scope="module")
+def two_rounds(make_flight: MakeFlight) -> Mapped:
+    """A flight of two rounds and its map, which no test changes."""
     flight = make_flight(keyframes=60, turns=2.0, memory=3)
     mapper = Mapper()
     feed_groups(mapper, flight, flight.records)
+    return flight, mapper
+
+
+def test_mapper_reduces_drift_over_two_rounds(two_rounds: Mapped) -> None:
+    flight, mapper = two_rounds
     assert len(mapper.map) == 60
     assert np.sqrt(np.mean(errors_m(mapper, flight) ** 2)) < 0.5 * np.sqrt(np.mean(drift_m(flight) ** 2))
 
 
-def test_landmark_matching_fuses_only_true_duplicates(make_flight: MakeFlight) -> None:
-    flight = make_flight(keyframes=60, turns=2.0, memory=3)
-    mapper = Mapper()
-    feed_groups(mapper, flight, flight.records)
+def test_landmark_matching_fuses_only_true_duplicates(two_rounds: Mapped) -> None:
+    flight, mapper = two_rounds
     table = mapper.map.keypoints
     slots = np.flatnonzero((table.kind == LANDMARK) & (table.root != np.arange(len(table.root)))).astype(np.int32)
     aliases, roots = mapper.map.landmark_ids(slots).tolist(), mapper.map.landmark_ids(table.root[slots]).tolist()
@@ -68,15 +76,14 @@ def test_landmark_matching_fuses_only_true_duplicates(make_flight: MakeFlight) -
     assert all(r < a for a, r in zip(aliases, roots))
 
 
-def test_rounds_stay_unconnected_without_landmark_matching(make_flight: MakeFlight) -> None:
+def test_rounds_stay_unconnected_without_landmark_matching(make_flight: MakeFlight, two_rounds: Mapped) -> None:
+    other, joined_other = make_flight(keyframes=60, turns=2.0, memory=3, seed=1), Mapper(WITHOUT_GRID)
+    feed_groups(joined_other, other, other.records)
     apart, together = [], []
-    for seed in (0, 1):
-        flight = make_flight(keyframes=60, turns=2.0, memory=3, seed=seed)
-        mapper = Mapper(replace(BaseConfig(), landmark_matching=LandmarkMatchingConfig(max_hamming=-1)))
+    for flight, joined in (two_rounds, (other, joined_other)):
+        mapper = Mapper(replace(WITHOUT_GRID, landmark_matching=LandmarkMatchingConfig(max_hamming=-1)))
         feed_groups(mapper, flight, flight.records)
         assert mapper.counts.found == 0
-        joined = Mapper()
-        feed_groups(joined, flight, flight.records)
         apart.append(np.mean(errors_m(mapper, flight)[40:]))
         together.append(np.mean(errors_m(joined, flight)[40:]))
     assert np.mean(together) < 0.7 * np.mean(apart)

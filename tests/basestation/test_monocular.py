@@ -39,7 +39,7 @@ from kiteline_codec.schema import (
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import agent_of_keyframe, agent_of_submap, submap_of_keyframe
 from kiteline_core.optimisation.bundle import BundleResult
-from tests.basestation.feeding import STEP_NS, feed
+from tests.basestation.feeding import STEP_NS, WITHOUT_GRID, feed
 
 F64 = NDArray[np.float64]
 MakeFlight = Callable[..., Any]
@@ -102,7 +102,7 @@ def test_a_loop_takes_back_the_drift_of_the_unit(make_flight: MakeFlight, ring: 
         make_flight(keyframes=88, turns=1.2, scene=ring, drift_m=0.002, seed=4, noise_px=0.5, memory=3, stereo=False),
         0.4, growth,
     )  # fmt: skip
-    blind, mapper = Mapper(BaseConfig()), Mapper(BaseConfig(), words)
+    blind, mapper = Mapper(WITHOUT_GRID), Mapper(WITHOUT_GRID, words)
     feed(blind, [flight], run=untouched)
     published = feed(mapper, [flight], run=untouched)
     assert mapper.summary()["loops"] >= 1
@@ -129,7 +129,7 @@ Met = tuple[Any, Any, Mapper, list[Record]]
 def met(make_flight: MakeFlight, words: Any) -> Met:
     """A stereo agent and a monocular one that fly together, the map of both, and what was published."""
     pair, eye = make_flight(keyframes=40, turns=0.8), the_other_eye(make_flight)
-    mapper = Mapper(BaseConfig(), words)
+    mapper = Mapper(WITHOUT_GRID, words)
     return pair, eye, mapper, feed(mapper, [pair, eye])
 
 
@@ -138,7 +138,7 @@ def test_a_monocular_map_takes_the_scale_of_a_stereo_map(met: Met, words: Any, l
     pair, eye, mapper, published = met
     flights = [eye, pair] if late else [pair, eye]  # whose map is the world at first
     if late:
-        mapper = Mapper(BaseConfig(), words)
+        mapper = Mapper(WITHOUT_GRID, words)
         published = feed(mapper, flights, [0, 20])
     assert mapper.summary()["merges"] == 1
     found = np.concatenate([placed(mapper, f) for f in flights])
@@ -218,7 +218,7 @@ def test_rooms_with_one_wallpaper_stay_two_for_monocular_agents_too(
         a = make_flight(keyframes=40, turns=1.0, scene=one, stereo=stereo)
         a = a if stereo else in_own_unit(a, 1.7)
         b = in_own_unit(make_flight(keyframes=40, turns=1.0, scene=other, variant=1, agent=1, stereo=False), 0.6)
-        mapper = Mapper(BaseConfig(), words)
+        mapper = Mapper(WITHOUT_GRID, words)
         feed(mapper, [a, b])
         assert mapper.summary()["merges"] == 0
 
@@ -229,17 +229,17 @@ def test_a_repetitive_corridor_is_not_merged_by_a_monocular_agent(
     a = make_flight(keyframes=40, turns=0.6, scene=corridor)
     b = make_flight(keyframes=40, turns=0.6, start=0.35, scene=corridor, variant=1, agent=1, stereo=False)
     b = in_own_unit(b, 0.6)
-    mapper = Mapper(BaseConfig(), words)
+    mapper = Mapper(WITHOUT_GRID, words)
     feed(mapper, [a, b])
     assert mapper.summary()["merges"] == 0
-    lone = Mapper(BaseConfig(), words)
+    lone = Mapper(WITHOUT_GRID, words)
     feed(lone, [in_own_unit(make_flight(keyframes=60, turns=1.0, scene=corridor, seed=4, stereo=False), 0.6)])
     assert lone.summary()["loops"] == 0
 
 
 def test_a_loop_may_be_off_by_as_much_as_its_scale_says(make_flight: MakeFlight, ring: Any, words: Any) -> None:
     flight = make_flight(keyframes=40, turns=0.5, scene=ring, drift_m=0.002, seed=4, memory=3, stereo=False)
-    mapper = Mapper(BaseConfig(), words)
+    mapper = Mapper(WITHOUT_GRID, words)
     feed(mapper, [flight])
     assert mapper.merger is not None
     old, new = flight.keyframes[0], flight.keyframes[-1]
@@ -272,7 +272,7 @@ def test_depths_that_do_not_say_one_length_say_none() -> None:
 
 def test_what_a_base_remembers_of_units_is_known_to_the_next(met: Met, words: Any) -> None:
     pair, eye, mapper, published = met
-    again = Mapper(BaseConfig(), words)
+    again = Mapper(WITHOUT_GRID, words)
     for flight in (eye, pair):
         own = [r for r in published if agent_of_record(r) == flight.agent]
         again.restore(flight.agent, tuple(flight.all_records()), tuple(own), 0)

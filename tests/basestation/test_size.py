@@ -37,7 +37,7 @@ from kiteline_codec.sync.resumption import agent_session
 from kiteline_core.geometry import se3
 from kiteline_core.ids import NO_KEYFRAME, KeyframeId, keyframe_id, submap_id, submap_of_keyframe
 from kiteline_core.optimisation.bundle import BundleResult
-from tests.basestation.feeding import STEP_NS, feed
+from tests.basestation.feeding import STEP_NS, WITHOUT_GRID, feed
 from tests.yardstick import slowness
 
 MakeFlight = Callable[..., Any]
@@ -166,7 +166,7 @@ def test_many_corrections_are_sent_newest_first_a_batch_at_a_time(mapped: tuple[
 
 def test_deleted_maps_leave_their_memory_to_the_next_ones(make_flight: MakeFlight, words: Any) -> None:
     stays = make_flight(keyframes=24, agent=1, seed=5)
-    mapper, alone = Mapper(BaseConfig(), words), Mapper(BaseConfig(), words)
+    mapper, alone = Mapper(WITHOUT_GRID, words), Mapper(WITHOUT_GRID, words)
     feed(alone, [stays])
     feed(mapper, [stays])
     sizes = []
@@ -326,7 +326,7 @@ def test_a_map_too_large_for_one_bundle_is_bundled_in_parts(make_flight: MakeFli
     flight = make_flight(keyframes=70, turns=0.8, scene=ring, drift_m=0.01, seed=3)
     errors = {}
     for most in (0, 24):
-        config = BaseConfig()
+        config = WITHOUT_GRID
         graph = replace(config.graph, max_full=most or 800, full_share=1.0)
         jobs: list[Job] = []
 

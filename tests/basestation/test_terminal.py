@@ -18,6 +18,7 @@ from kiteline_codec.channel import CodedChannel
 from kiteline_codec.schema import CameraIntrinsics
 from kiteline_codec.sync.config import SyncConfig
 from kiteline_core.geometry import se3
+from tests.basestation.feeding import WITHOUT_GRID
 
 MakeFlight = Callable[..., Any]
 STEP_NS = 200_000_000
@@ -29,7 +30,7 @@ def told(flights: list[Any], words: Any, away: range, restart: int) -> tuple[lis
     begins anew.
     """
     ends = {f.agent: CodedChannel(SyncConfig(), 1) for f in flights}
-    station = Station(BaseConfig(), lambda _: CodedChannel(SyncConfig(), 1), words)
+    station = Station(WITHOUT_GRID, lambda _: CodedChannel(SyncConfig(), 1), words)
     reporter, lines = TerminalReporter(station), []
     done: tuple[JobDone, ...] = ()
     for n in range(max(len(f.records) for f in flights) + 30):

@@ -16,6 +16,8 @@ from kiteline_core.geometry.se3 import F64
 
 # Rotates vectors from o to l: x stays, left becomes right, up becomes down.
 R_L_O: F64 = np.diag([1.0, -1.0, -1.0])
+_TWICE_R_L_O: F64 = np.asarray(np.kron(np.eye(2), R_L_O), np.float64)
+_UPPER = np.triu_indices(6)
 
 # Unit vectors in FRD of the six directions of a vehicle.
 _DIRECTIONS = {
@@ -55,7 +57,9 @@ def controller_rates(T_o_b: F64, velocity: F64, rate: F64, T_b_f: F64) -> tuple[
     velocity: (3,) m/s of the body's origin in o. rate: (3,) rad/s in b.
     """
     r_f_b = T_b_f[:3, :3].T
-    at_origin = T_o_b[:3, :3].T @ velocity + np.cross(rate, T_b_f[:3, 3])
+    (p, q, r), (x, y, z) = rate.tolist(), T_b_f[:3, 3].tolist()
+    lever = np.array((q * z - r * y, r * x - p * z, p * y - q * x))  # rate x T_b_f[:3, 3]
+    at_origin = T_o_b[:3, :3].T @ velocity + lever
     return np.asarray(r_f_b @ at_origin), np.asarray(r_f_b @ rate)
 
 
@@ -73,13 +77,13 @@ def euler_angles(q: Sequence[float]) -> list[float]:
 
 def upper_triangle(covariance: F64) -> list[float]:
     """The upper right triangle of a (6,6) matrix by rows: the 21 numbers of a covariance in MAVLink."""
-    return [float(v) for v in covariance[np.triu_indices(6)]]
+    values: list[float] = covariance[_UPPER].tolist()
+    return values
 
 
 def local_covariance(covariance_o: F64) -> F64:
     """Rotate a (6,6) covariance [position, rotation vector] from the axes of o to those of l."""
-    a = np.kron(np.eye(2), R_L_O)
-    return np.asarray(a @ covariance_o @ a.T)
+    return np.asarray(_TWICE_R_L_O @ covariance_o @ _TWICE_R_L_O.T)
 
 
 def controller_covariance(covariance: F64, T_o_b: F64, T_b_f: F64) -> F64:
