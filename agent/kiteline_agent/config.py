@@ -70,9 +70,10 @@ class OdometerConfig:
     seen_rad_s: float = 0.02  # the same of the rotation rate
     unit_window_s: float = 0.4  # window of a comparison while the scale of a monocular map is unknown
     unit_windows: int = 40  # newest such windows that are kept
-    unit_least: int = 8  # least number of agreeing windows for a scale
+    unit_least: int = 5  # least number of agreeing windows for a scale
     unit_moved_m: float = 0.05  # least motion by the odometer in a window that counts
     unit_share: float = 0.7  # least share of the windows that must agree
+    unit_wait_s: float = 20.0  # s for which poses wait for that scale; then they are given in a unit of their own
 
 
 @dataclass(frozen=True, slots=True)

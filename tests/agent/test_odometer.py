@@ -124,6 +124,11 @@ def test_its_scale_is_found_and_taken_off() -> None:
     assert np.linalg.norm(flown.error(8.0)[:3]) < 0.06  # 5 % of 3 m would be 0.15
 
 
+def test_noise_does_not_bias_its_scale() -> None:
+    scales = [Flown(driven(20.0, 0.4, seed), 20.0).odometer.scale for seed in range(6)]
+    assert np.mean(scales) == pytest.approx(1.0, abs=0.012)
+
+
 def dead(batch: OdometryBatch) -> OdometryBatch:
     return replace(batch, velocity=0.0 * batch.velocity, rate=0.0 * batch.rate)
 
@@ -309,6 +314,9 @@ def test_the_monocular_unit_becomes_known(unit_m: float) -> None:
     assert found is not None
     assert found[0] == pytest.approx(unit_m, rel=0.01)
     assert found[1] < 0.02 * unit_m
+    early = Flown(driven(6.0, 0.05), 2.5, unit_m=unit_m, metric=False).odometer.metres_per_unit()
+    assert early is not None
+    assert early[0] == pytest.approx(unit_m, rel=0.02)
     assert flown.odometer.predict(flown.pose, 6_000_000_000) is None  # not before the map is in metres
 
 
@@ -323,7 +331,11 @@ def test_a_slip_does_not_move_the_unit() -> None:
 
 @pytest.mark.parametrize("spoil", [dead, in_camera_axes])
 def test_no_unit_comes_from_what_disagrees(spoil: object) -> None:
-    assert Flown(spoil(driven(8.0)), 8.0, unit_m=2.0, metric=False).odometer.metres_per_unit() is None  # type: ignore[operator]
+    config = OdometerConfig(unit_wait_s=7.0)
+    for seconds in (6.0, 8.0):
+        odometer = Flown(spoil(driven(8.0)), seconds, unit_m=2.0, metric=False, config=config).odometer  # type: ignore[operator]
+        assert odometer.metres_per_unit() is None
+        assert odometer.awaits_scale == (seconds < 7.0)
 
 
 @given(st.lists(st.floats(-3.0, 3.0), min_size=6, max_size=6).map(np.array))

@@ -126,6 +126,16 @@ def test_a_monocular_map_gets_its_metre(room_flight: RoomFlight) -> None:
     assert not plain.metric
 
 
+def test_no_pose_is_given_in_another_unit_before_the_metre_is_known(room_flight: RoomFlight) -> None:
+    agent, found, _ = fly(room_flight, room_flight.driven, one_eye=True)
+    assert agent.metric
+    metric = next(k for k, e in enumerate(found) if not e.initialising)
+    assert any(e.submap == 0 for e in found[:metric])  # the map in its own unit
+    assert not any(e.tracked or e.quality >= 0 for e in found[:metric])
+    assert all(e.tracked for e in found[metric:])
+    assert found[metric].submap == agent.submap
+
+
 def _ate(room_flight: RoomFlight, found: list[Estimate]) -> float:
     flown = np.array([(se3.inverse(found[0].T_o_b) @ e.T_o_b)[:3, 3] for e in found])
     true = np.array([(se3.inverse(room_flight.truth[0]) @ T)[:3, 3] for T in room_flight.truth])

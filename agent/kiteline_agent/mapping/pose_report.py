@@ -35,7 +35,9 @@ class PoseReport:
 
     def report(self, ctx: FrameContext, outcome: FrameOutcome) -> Estimate:
         """The estimate of a frame; shares the live pose with the base."""
-        camera, tracked = self._camera, outcome.tracked
+        camera = self._camera
+        initialising = not camera.submaps.any or camera.motion.awaits_scale
+        tracked = outcome.tracked and not initialising
         submap, T_m_b, T_o_m = camera.submaps.active, camera.T_m_b, camera.pose.T_o_m
         in_first = self._has_depth and camera.submaps.in_first
         cov_m, cov_o = camera.covariance.of_poses(camera.pose, T_m_b, in_first=in_first)
@@ -43,7 +45,7 @@ class PoseReport:
             cov_m if tracked and self._knows_place() else cov_o, outcome.inliers or None
         )
         carried = camera.submaps.any and camera.motion.measures_motion
-        if not tracked and (not carried or quality < ctx.config.covariance.flagged_below):
+        if not tracked and (initialising or not carried or quality < ctx.config.covariance.flagged_below):
             quality = -1
         keyframe, T_k_c = camera.reference.keyframe, camera.reference.T_k_c
         if keyframe != NO_KEYFRAME:
@@ -58,7 +60,7 @@ class PoseReport:
         self._last = Estimate(
             ctx.t_ns, tracked, outcome.bridged, T_m_b if tracked else None, T_o_m @ T_m_b, keyframe, T_k_c.copy(),
             submap, outcome.inliers, quality, cov_m, cov_o, camera.gravity.R_l_o, T_w_b if tracked else None,
-            not camera.submaps.any,
+            initialising,
         )  # fmt: skip
         self._recent.add(ctx.t_ns, self._last.T_o_b, measured=tracked and not outcome.bridged)
         return self._last

@@ -84,6 +84,11 @@ class MotionModel:
         """True if the map's lengths are in metres."""
         return self._metric or self.odometer.metric or (self.tracker is not None and self.tracker.metric)
 
+    @property
+    def awaits_scale(self) -> bool:
+        """True if lengths are not in metres yet, but the odometer may still tell the scale."""
+        return not self.metric and self.odometer.awaits_scale
+
     def known_imu(self) -> KnownImuConfig | None:
         """What is known of the IMU, for the next flight; None before anything was measured."""
         return None if self.tracker is None else self.tracker.known

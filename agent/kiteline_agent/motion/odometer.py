@@ -22,6 +22,7 @@ from kiteline_core.geometry import se3
 F64 = NDArray[np.float64]
 
 _UNMATCHED = 10  # windows without a sample, after which the stamps are reported to be wrong
+_OUTLYING = 3.0  # deviations of a window from the median scale: slip, a moment of bad images
 _WELL = 0.09  # (m/s)^2 or (rad/s)^2; directions measured worse than this count less and less
 
 
@@ -50,7 +51,10 @@ class Odometer:
         self.image_loss_s = 0.0
         self._path, self._path_cov, self._path_cross = np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3))  # in m
         self._rotation_cov, self._rotation_cross = np.zeros((3, 3)), np.zeros((3, 3))  # about the body's axes
-        self._scale_windows: list[tuple[float, bool]] = []  # metres per unit, and whether directions agreed
+        # Of a map of unknown scale: displacement by the odometer times that by the images, m times units; the latter's
+        # square; whether directions agreed.
+        self._scale_windows: list[tuple[float, float, bool]] = []
+        self._unscaled_ns: int | None = None  # stamp of the first frame in a map of unknown scale
         self._trusted = self._reported_trust = False
         self._unmatched = 0  # windows without a sample before the first comparison
         self._compared = 0
@@ -88,6 +92,14 @@ class Odometer:
             "noise_m_s": round(float(np.sqrt(self._noise)), 4),
             "compared": self._compared,
         }
+
+    @property
+    def awaits_scale(self) -> bool:
+        """True in a map of unknown scale while the odometer may still tell it."""
+        if self.metric or not self.has_samples:
+            return False
+        began_ns = self._unscaled_ns
+        return began_ns is None or self._last is None or self._last[0] - began_ns < self._config.unit_wait_s * 1e9
 
     def take_events(self) -> list[str]:
         """Events since the last call, for the log."""
@@ -185,6 +197,8 @@ class Odometer:
             if self._last is not None and t_ns > self._last[0] and self.image_loss_s == 0.0 and self.metric:
                 self._set_velocity(self._last[1], T_m_c, (t_ns - self._last[0]) * 1e-9)
         self._last = (t_ns, T_m_c)
+        if self._unscaled_ns is None and not self.metric:
+            self._unscaled_ns = t_ns
         if self.image_loss_s > 0.0:
             self._reset_image_loss()
 
@@ -253,18 +267,24 @@ class Odometer:
         """Change the map's unit to metres, or to an unknown one."""
         self.metric = metric
         self._anchor = self._last = None
-        self._scale_windows = []
+        self._scale_windows, self._unscaled_ns = [], None
         self._reset_image_loss()
 
     def metres_per_unit(self) -> tuple[float, float] | None:
         """Metres per unit of the map and its standard deviation; None while unknown."""
         c = self._config
-        agreed = [metres for metres, agrees in self._scale_windows if agrees]
+        agreed = np.array([window[:2] for window in self._scale_windows if window[2]])
         if len(agreed) < max(c.unit_least, c.unit_share * len(self._scale_windows)):
             return None
-        metres = float(np.median(agreed))
-        spread = 1.4826 * float(np.median(np.abs(np.array(agreed) - metres)))
-        return metres, 1.25 * spread / float(np.sqrt(len(agreed)))
+        along, square = agreed.T
+        each = along / square
+        middle = float(np.median(each))
+        spread = 1.4826 * float(np.median(np.abs(each - middle)))
+        near = np.abs(each - middle) <= _OUTLYING * spread
+        metres = float(along[near].sum() / square[near].sum())
+        left = along[near] - metres * square[near]
+        count = np.count_nonzero(near)
+        return metres, float(np.sqrt(left @ left * count / (count - 1)) / square[near].sum())
 
     # steps
 
@@ -320,10 +340,12 @@ class Odometer:
         square = float(by_odometer @ by_odometer)
         self._scale_var += c.scale_walk**2 * dt
         if square > c.least_moved_m**2:
-            measured_scale = float(by_odometer @ by_images) / square
-            var = (c.scale_sigma_m_s * dt) ** 2 / square
+            along = float(by_odometer @ by_images)
+            # Over the part along the images' motion: the odometer's own noise in its square would shorten it.
+            measured_scale = distance**2 / along if along > 0.0 else 0.0
+            var = (c.scale_sigma_m_s * dt / distance) ** 2 if distance > 0.0 else np.inf
             off = measured_scale - self.scale
-            aligned = float(by_odometer @ by_images) > c.aligned * distance * float(np.sqrt(square))
+            aligned = along > c.aligned * distance * float(np.sqrt(square))
             if aligned and off * off < 9.0 * (self._scale_var + var):
                 gain = self._scale_var / (self._scale_var + var)
                 self.scale = float(np.clip(self.scale + gain * off, 1.0 - c.scale_most, 1.0 + c.scale_most))
@@ -349,7 +371,7 @@ class Odometer:
         if a < self._config.unit_moved_m or b <= 0.0:
             return
         along = float(by_odometer @ by_images)
-        self._scale_windows.append((along / (b * b), along > self._config.aligned * a * b))
+        self._scale_windows.append((along, b * b, along > self._config.aligned * a * b))
         del self._scale_windows[: -self._config.unit_windows]
 
 

@@ -20,7 +20,8 @@ F64 = NDArray[float64]
 class FrameCounts:
     """frames = tracked + lost + dropped.
 
-    bridged: tracked, by dead reckoning. initialising: lost, before the map. predicted: dropped, with a predicted pose.
+    bridged: tracked, by dead reckoning. initialising: lost, before a map of known scale. predicted: dropped, with a
+    predicted pose.
     """
 
     tracked: int = 0
