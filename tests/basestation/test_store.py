@@ -144,7 +144,7 @@ def same_or_told(folder: Path, saved: SavedMap) -> bool:
     return same
 
 
-@settings(max_examples=150)
+@settings(max_examples=60)
 @given(st.data())
 def test_no_flipped_bit_is_loaded_silently(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
     folder = tmp_path_factory.mktemp("store")

@@ -25,7 +25,7 @@ TURNS = ((0.2, 2.4, 0, 0.3, 0.9), (2.4, 4.6, 1, 0.3, 0.9), (4.6, 6.8, 2, 0.5, 0.
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("guided") / "guided.mcap"
-    return guided.record(out, 5, TURNS, (), "room?scale=0.5&texture_bits=9")
+    return guided.record(out, 5, TURNS, (), "room?scale=0.4&texture_bits=8")
 
 
 def test_a_camera_that_was_mounted_by_a_ruler_is_found_by_turns(

@@ -22,10 +22,10 @@ def values() -> list[tuple[Key, bytes]]:
 def test_nothing_but_refusals(tmp_path: Path) -> None:
     corpus = fuzz.read_corpus(HERE / "corpus")
     assert len(corpus) > 20
-    found = fuzz.fuzz(corpus, values(), 14_000, seed=1, others=doors(tmp_path))
+    found = fuzz.fuzz(corpus, values(), 5_000, seed=1, others=doors(tmp_path))
     assert found.failures == []
-    assert found.refused > 4_000
-    assert found.accepted > 100
+    assert found.refused > 1_400
+    assert found.accepted > 40
     assert found.slowest_s < 1.0
     assert found.grown_mib < 100
 

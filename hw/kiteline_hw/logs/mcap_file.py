@@ -250,6 +250,9 @@ class McapFile:
                 if (wanted is None or channel in wanted) and channel in self.channels:
                     data = body[at + _MESSAGE.size : at + length]
                     yield RawMessage(channel, sequence, log_ns, publish_ns, data)
+            elif opcode == 0:
+                self._note(f"damaged chunk at byte {span.offset}")
+                return
             elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL) and not self.indexed:
                 self._read_definition(opcode, body[at : at + length])
             at += length

@@ -86,16 +86,20 @@ def chunk_file(path: Path, packed: bytes, size: int, compression: str = "zstd") 
     return path
 
 
+@pytest.fixture(scope="module")
+def bomb() -> bytes:
+    """600 MiB of zeros in a few kB."""
+    return zstandard.ZstdCompressor().compress(bytes(600 << 20))
+
+
 @pytest.mark.parametrize("size", [64, MOST_CHUNK_BYTES, 1 << 30, (1 << 64) - 1])
-def test_a_bomb_in_a_chunk_is_cut_at_what_it_claims(tmp_path: Path, size: int) -> None:
-    before = rss_mib()
-    bomb = zstandard.ZstdCompressor().compress(bytes(600 << 20))
-    assert rss_mib() - before < 1000
-    before = rss_mib()
+def test_a_bomb_in_a_chunk_is_cut_at_what_it_claims(tmp_path: Path, bomb: bytes, size: int) -> None:
+    before, begin_s = rss_mib(), time.process_time()
     log = McapFile(chunk_file(tmp_path / "bomb.mcap", bomb, size))
     assert list(log.messages()) == []
     assert rss_mib() - before < 100
-    assert log.notes or size <= MOST_CHUNK_BYTES
+    assert log.notes
+    assert time.process_time() - begin_s < 0.5 * slowness()  # each zero was read as a record: 7 s
 
 
 def test_lengths_that_lie_are_refused(tmp_path: Path) -> None:
