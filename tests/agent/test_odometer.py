@@ -269,7 +269,7 @@ def test_a_sudden_turn_in_the_dark_is_followed() -> None:
 
 
 @given(st.lists(st.floats(allow_nan=True, allow_infinity=True), min_size=9, max_size=9), st.integers(0, 1000))
-@settings(max_examples=60)
+@settings(max_examples=25)
 def test_no_numbers_break_it(numbers: list[float], seed: int) -> None:
     """Samples that hold anything, among good ones, in sight and in the dark."""
     batch, rng = driven(3.0), np.random.default_rng(seed)
@@ -339,7 +339,7 @@ def test_no_unit_comes_from_what_disagrees(spoil: object) -> None:
 
 
 @given(st.lists(st.floats(-3.0, 3.0), min_size=6, max_size=6).map(np.array))
-@settings(max_examples=20)
+@settings(max_examples=10)
 def test_where_the_map_lies_does_not_matter(move: F64) -> None:
     """The same flight in a map that is moved while blind gives the same flight, moved."""
     batch, T = driven(3.0), se3.exp(move)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kiteline_agent.config import SmoothingConfig
@@ -87,6 +87,7 @@ def test_what_adds_up_to_more_than_a_merge_is_no_jump() -> None:
     assert goal[0, 3] - told[0, 3] < goal[0, 3] * np.exp(-14.0 / limits.time_s)
 
 
+@settings(max_examples=20)
 @given(st.floats(0.02, 0.9), st.floats(0.2, 2.0))
 def test_where_lengths_are_uncertain_no_window_is_stretched_by_more_than_a_share_of_the_correction(
     size_m: float, speed_m_s: float

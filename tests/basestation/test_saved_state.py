@@ -35,7 +35,8 @@ from kiteline_codec.schema import (
 )
 from kiteline_codec.sync.config import SyncConfig
 from kiteline_core.geometry import se3
-from kiteline_core.ids import AgentId, KeyframeId, agent_of_submap, keyframe_id, submap_of_keyframe
+from kiteline_core.ids import AgentId, KeyframeId, agent_of_submap, keyframe_id, submap_id, submap_of_keyframe
+from tests.basestation.feeding import WITHOUT_GRID
 
 STEP_NS = 100_000_000
 ELSEWHERE = se3.exp(np.array([0.5, -0.3, 0.2, 0.1, 0.4, -1.1]))
@@ -43,8 +44,8 @@ ELSEWHERE = se3.exp(np.array([0.5, -0.3, 0.2, 0.1, 0.4, -1.1]))
 MakeFlight = Callable[..., Any]
 
 
-def new_station(words: Any, session: int = 1) -> Station:
-    return Station(BaseConfig(), lambda agent: CodedChannel(SyncConfig(), session), words)
+def new_station(words: Any, session: int = 1, config: BaseConfig = WITHOUT_GRID) -> Station:
+    return Station(config, lambda agent: CodedChannel(SyncConfig(), session), words)
 
 
 class Agents:
@@ -169,7 +170,7 @@ def test_map_survives_six_restarts(make_flight: MakeFlight, words: Any, tmp_path
     flight = make_flight(keyframes=40, turns=1.0)
     agents, at = Agents([flight]), 0
     for session, until in enumerate((3, 9, 14, 22, 27, 35, 80), 1):
-        station, keeper = new_station(words, session), Keeper(tmp_path)
+        station, keeper = new_station(words, session, BaseConfig()), Keeper(tmp_path)
         held = keeper.load()
         restored = restore(station, held, agents.now_ns)
         assert restored.faults == ()
@@ -289,25 +290,28 @@ def test_contradictions_in_the_tables_are_found(make_flight: MakeFlight, words: 
     assert any("no rigid pose" in text for text in contradictions(station.mapper))
 
 
-def test_new_flight_is_merged_with_a_restored_map(make_flight: MakeFlight, words: Any) -> None:
-    yesterday = Agents([make_flight(keyframes=30, turns=0.6, agent=0)])
-    old = new_station(words)
-    yesterday.fly(old, 0, 40)
-    today = Agents([make_flight(keyframes=30, turns=0.6, start=0.3, variant=1, agent=1, T_w_m=ELSEWHERE)])
-    station = new_station(words, session=2)
-    restore(station, snapshot(old, SavedMap()), 0)
-    today.fly(station, 0, 60)
-    assert station.mapper.summary()["merges"] == 1
-    assert next(iter(station.mapper.placements)) == submap_of_keyframe(yesterday.flights[0].keyframes[0])
-
-
-def test_combined_maps_are_merged_by_loop_closure(make_flight: MakeFlight, words: Any) -> None:
-    kept = []
+@pytest.fixture(scope="module")
+def kept(make_flight: MakeFlight, words: Any) -> list[SavedMap]:
+    """Two maps of one room, by agents 0 and 1, each saved by a base of its own."""
+    maps = []
     for agent, start in ((0, 0.0), (1, 0.3)):
         agents = Agents([make_flight(keyframes=30, turns=0.6, start=start, variant=agent, agent=agent)])
         station = new_station(words)
         agents.fly(station, 0, 40)
-        kept.append(snapshot(station, SavedMap()))
+        maps.append(snapshot(station, SavedMap()))
+    return maps
+
+
+def test_new_flight_is_merged_with_a_restored_map(make_flight: MakeFlight, kept: list[SavedMap], words: Any) -> None:
+    today = Agents([make_flight(keyframes=30, turns=0.6, start=0.3, variant=1, agent=1, T_w_m=ELSEWHERE)])
+    station = new_station(words, session=2)
+    restore(station, kept[0], 0)
+    today.fly(station, 0, 60)
+    assert station.mapper.summary()["merges"] == 1
+    assert next(iter(station.mapper.placements)) == submap_id(0, 1, 0)
+
+
+def test_combined_maps_are_merged_by_loop_closure(kept: list[SavedMap], words: Any) -> None:
     both = combine(*kept)
     station = new_station(words, session=2)
     assert restore(station, both, 0).faults == ()

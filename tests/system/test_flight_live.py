@@ -104,7 +104,8 @@ def test_flying_in_real_time(recording: Path, tmp_path: Path) -> None:
 
 def test_agent_and_base_meet_and_a_killed_base_resumes(recording: Path, tmp_path: Path, start: Start) -> None:
     endpoint, port = free_endpoint(), free_endpoint().rpartition(":")[2]
-    words = ("--link", f"zenoh:{endpoint}", "--store", tmp_path / "store", "--web", f"127.0.0.1:{port}")
+    store = tmp_path / "store" / FILE
+    words = ("--workers", 1, "--link", f"zenoh:{endpoint}", "--store", store.parent, "--web", f"127.0.0.1:{port}")
     base = start("base", *words, "--log", tmp_path / "log")
 
     def seen() -> dict[str, int]:
@@ -117,7 +118,6 @@ def test_agent_and_base_meet_and_a_killed_base_resumes(recording: Path, tmp_path
 
     agent = start("agent", recording, "--link", f"zenoh:{endpoint}", "--log", tmp_path / "log")
     assert agent.wait(60.0) == 0  # a recording ends by itself, once the base has it all
-    store = tmp_path / "store" / FILE
     wait_for("the store", lambda: 3 <= heads(store) == seen().get("Keyframes"))
     keyframes = heads(store)
     base.kill()

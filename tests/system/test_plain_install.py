@@ -75,7 +75,8 @@ def plain(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
                 (packages / top).symlink_to(Path(str(one.locate_file(top))))
     assert not {"gtsam", "matplotlib", "websockets", "hypothesis", "scipy"} & {p.name for p in packages.iterdir()}
     python = environment / "bin" / "python"
-    done = run(sys.executable, "-m", "pip", "--python", python, "install", "--no-index", "--no-deps", "--quiet", wheel,
+    done = run(sys.executable, "-m", "pip", "--python", python, "install", "--no-index", "--no-deps", "--no-compile",
+               "--quiet", wheel,
                folder=environment)  # fmt: skip
     assert done.returncode == 0, done.stderr
     return environment / "bin"

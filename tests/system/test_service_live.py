@@ -93,6 +93,7 @@ def test_an_agent_stops_within_a_second_and_closes_its_log(serve: Serve, raw_fli
         assert sum(1 for _ in log.messages((LEFT,))) >= 3
 
 
+@pytest.mark.usefixtures("forked")
 def test_the_number_of_a_start_outlives_the_logs(serve: Serve, recording: Path, tmp_path: Path) -> None:
     logs = tmp_path / "logs" / "agent0"
     found = []
@@ -109,6 +110,7 @@ def test_the_number_of_a_start_outlives_the_logs(serve: Serve, recording: Path, 
     assert found[1] == (found[0][0] + 1, (found[0][1] + 1) % MAX_BOOTS)
 
 
+@pytest.mark.usefixtures("forked")
 def test_a_start_that_fails_takes_no_number(serve: Serve, recording: Path, tmp_path: Path) -> None:
     for words in (("no-such-recording.mcap",), (recording, "--link", "zenoh:tcp/127.0.0.1:7", "--key", "no-key")):
         program, _ = serve("agent", *words)
@@ -116,6 +118,7 @@ def test_a_start_that_fails_takes_no_number(serve: Serve, recording: Path, tmp_p
     assert not (tmp_path / "state" / "agent0").exists()
 
 
+@pytest.mark.usefixtures("forked")
 def test_logs_of_all_starts_stay_within_their_limit(serve: Serve, recording: Path, tmp_path: Path) -> None:
     logs = tmp_path / "logs" / "agent0"
     for _ in range(2):

@@ -34,11 +34,18 @@ def match_landmarks(
     known = sparse_map.sorted_by_id(np.concatenate([sparse_map.landmarks_of(k) for k in others]))
     known = known[~np.isin(known, sparse_map.landmarks_of(keyframe))]
     fused += _match_projected(sparse_map, known, keyframe, config, publisher)
+    new = _new_landmarks(sparse_map, keyframe)
     for other in others:
-        observed = sparse_map.landmarks_of(keyframe)
-        new = observed[sparse_map.keypoints.row[observed] == sparse_map.rows[keyframe]]
-        fused += _match_projected(sparse_map, new, other, config, publisher)
+        if found := _match_projected(sparse_map, new, other, config, publisher):
+            fused += found
+            new = _new_landmarks(sparse_map, keyframe)
     return fused
+
+
+def _new_landmarks(sparse_map: SparseMap, keyframe: KeyframeId) -> I32:
+    """Root landmarks that a keyframe is the first to observe, in order of id."""
+    observed = sparse_map.landmarks_of(keyframe)
+    return np.asarray(observed[sparse_map.keypoints.row[observed] == sparse_map.rows[keyframe]])
 
 
 def nearby_keyframes(sparse_map: SparseMap, keyframe: KeyframeId, config: LandmarkMatchingConfig) -> list[KeyframeId]:
