@@ -15,7 +15,7 @@ export PYTHONUNBUFFERED := 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test check format lint types contracts kernels docs bench clean
+.PHONY: help install demo test check format lint types contracts kernels refs docs bench clean
 
 help: ## say what can be made
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -59,6 +59,9 @@ contracts: $(STAMP) ## who may import whom
 
 kernels: $(STAMP) ## list anew what a first start compiles (after a change to the arguments of a kernel)
 	$(BIN)/python -m kiteline_hw.system.kernel_compilation --list kiteline_codec.warm kiteline_agent.runtime.warm kiteline_basestation.runtime.warm
+
+refs: $(STAMP) ## renew what replays of the kept logs are expected to compute (LOGS=new: fly them anew, too)
+	$(BIN)/python -m kiteline_lab.references --logs $(or $(LOGS),kept) $(NAMES)
 
 docs: $(STAMP) ## build the documentation site in site/, links checked
 	@$(BIN)/python -c 'import mkdocs, material, mkdocstrings' 2>/dev/null || $(BIN)/python -m pip install --quiet -e '.[docs]'

@@ -1,0 +1,1 @@
+"""Kept logs enter and are replayed; what each stage computes leaves as text, and what differs from the kept text."""

@@ -1,0 +1,56 @@
+"""What numbers depend on beside the code: library versions, and the CPU kernels that libraries choose."""
+
+from __future__ import annotations
+
+import ctypes
+import platform
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+_LIBRARIES = ("numpy", "numba", "opencv-python-headless", "gtsam")
+
+
+@cache
+def machine() -> str:
+    """Processor type, versions, and the kernels of OpenBLAS, numpy and OpenCV, as one line."""
+    versions = [f"{name} {_version(name)}" for name in _LIBRARIES]
+    kernels = f"OpenBLAS for {_blas_core()}", f"numpy for {_numpy_features()}", f"OpenCV for {_opencv_features()}"
+    return "; ".join((platform.machine(), *versions, *kernels))
+
+
+def _version(name: str) -> str:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return "none"
+
+
+def _blas_core() -> str:
+    """The CPU that OpenBLAS took its kernels for."""
+    folder = Path(np.__file__).parent.parent / "numpy.libs"
+    for file in sorted(folder.glob("libscipy_openblas*")):
+        try:
+            name = ctypes.CDLL(str(file)).scipy_openblas_get_corename64_
+        except (OSError, AttributeError):
+            continue
+        name.restype = ctypes.c_char_p
+        return str(name().decode())
+    return "unknown"
+
+
+def _numpy_features() -> str:
+    """The highest group of CPU features that numpy dispatches to."""
+    from numpy._core import _multiarray_umath as core
+
+    found = [name for name in core.__cpu_dispatch__ if core.__cpu_features__.get(name)]
+    return "+".join(found) or "baseline"
+
+
+def _opencv_features() -> str:
+    """The highest CPU feature that OpenCV dispatches to; those that the CPU lacks end in "?"."""
+    found = [word.strip("*") for word in cv2.getCPUFeaturesLine().split() if not word.endswith("?")]
+    return found[-1] if found else "baseline"
