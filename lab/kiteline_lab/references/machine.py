@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import importlib
 import platform
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
@@ -44,8 +45,7 @@ def _blas_core() -> str:
 
 def _numpy_features() -> str:
     """The highest group of CPU features that numpy dispatches to."""
-    from numpy._core import _multiarray_umath as core
-
+    core = importlib.import_module("numpy._core._multiarray_umath")
     found = [name for name in core.__cpu_dispatch__ if core.__cpu_features__.get(name)]
     return "+".join(found) or "baseline"
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from kiteline_agent.runtime.frame_counts import FrameCounts, live_pose
 from kiteline_agent.step import Estimate, StepOutput
+from kiteline_basestation.job_kinds import run_job
 from kiteline_basestation.jobs import Job
 from kiteline_basestation.runtime import flight_log as base_log
 from kiteline_basestation.runtime.base_runtime import load_vocabulary
@@ -142,10 +143,7 @@ def replay_base(folder: Path, flight: KeptFlight) -> Half:
         for step in steps(log):
             logged = {m.json()["id"]: m for m in step.of(base_log.JOB)}
             due = [n for n in step.head["done"] if n in jobs] + sorted(jobs.keys() - known)
-            done = [
-                base_log.done_again(jobs.pop(n), logged[n]) if n in logged else base_log.run_job(jobs.pop(n))
-                for n in due
-            ]
+            done = [base_log.done_again(jobs.pop(n), logged[n]) if n in logged else run_job(jobs.pop(n)) for n in due]
             arrived = {AgentId(int(a)): step.blobs(base_log.packets_in(int(a))) for a in step.head["agents"]}
             output = station.step(arrived, done, step.head["now_ns"])
             jobs.update({job.id: job for job in output.jobs})

@@ -1,0 +1,1 @@
+"""Logs: flown for hours, cut anywhere, replayed; bars leave."""
