@@ -24,6 +24,7 @@ from kiteline_hw.logs.mcap_log_read import read_odometry
 from kiteline_hw.sensors.images import detect_format
 from kiteline_hw.sensors.odometry_buffer import RATE_SIGMA_RAD_S, VELOCITY_SIGMA_M_S, reported_covariance
 from kiteline_hw.sensors.raw_pixels import BadImage, RawPixels
+from kiteline_hw.sources.ros2_samples import fast_decoder
 
 F64 = NDArray[np.float64]
 
@@ -107,7 +108,7 @@ class MessageDecoder:
         for factory in self._factories:
             found: Callable[[bytes], Any] | None = factory.decoder_for(channel.message_encoding, schema)
             if found is not None:
-                return found
+                return fast_decoder(schema, found)
         kind = schema.encoding if schema is not None else "none"
         raise BadMessage(
             f"{channel.topic}: message encoding {channel.message_encoding!r} with schema encoding {kind!r} is unknown: "
