@@ -47,14 +47,14 @@ _INPUTS = (RIG, agent_log.STEP, agent_log.IMU, agent_log.ODOMETER, agent_log.PAC
 @dataclass(frozen=True, slots=True)
 class KeptFlight:
     """A flight whose logs are kept. about: in words. frames: first and last + 1 of each agent's. depth: in place of
-    the right image. options: of `kiteline fly`. tracker: of the configuration, as the logs keep none.
+    the right image. odometer: its samples are given. options: of `kiteline fly`.
     """
 
     name: str
     about: str
     frames: tuple[tuple[int, int], ...] = ((0, FRAMES),)
     depth: bool = False
-    tracker: str = "map"
+    odometer: bool = False
     options: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -68,7 +68,7 @@ FLIGHTS = (
     KeptFlight("two-agents", "two stereo pairs without IMU on one path, whose maps are merged",
                ((0, 20), (10, 30)), options={"imu": False}),
     KeptFlight("ekf", "one camera with an odometer and the Kalman tracker, a base on a wide link",
-               tracker="ekf", options={"mono": True, "imu": False, "tracker": "ekf"}),
+               odometer=True, options={"mono": True, "imu": False, "tracker": "ekf"}),
 )  # fmt: skip
 
 
@@ -125,7 +125,7 @@ def recordings(folder: Path, flight: KeptFlight, out: Path) -> list[Path]:
                         log.rig(item.t_ns, rig, source.imu)
                 elif isinstance(item, ImuBatch) and inside:
                     log.imu(IMU, int(item.t_ns[-1]), item)
-                elif isinstance(item, OdometryBatch) and inside:
+                elif isinstance(item, OdometryBatch) and inside and flight.odometer:
                     log.odometer(ODOMETER, int(item.t_ns[-1]), item)
     return made
 
