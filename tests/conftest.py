@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import gc
 import os
+import sys
 from pathlib import Path
 
 for _threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
     os.environ.setdefault(_threads, "1")  # before numpy is loaded: results and timings do not depend on the machine
 
 import cv2
+import numpy as np
 import pytest
 from hypothesis import HealthCheck, settings
 
 ROOT = Path(__file__).resolve().parent.parent
+EMPTY = np.zeros((1, 1), np.uint8)
 IN_CI = os.environ.get("CI", "").lower() in ("1", "true")
 
 gc.disable()  # until all tests are collected: nearly all that is made till then stays
@@ -43,6 +46,18 @@ def pytest_collection_finish() -> None:
     gc.enable()
 
 
+@pytest.fixture
+def drawn() -> None:
+    """For tests that look at the picture of a flight: others get an empty one, as drawing takes half of their time."""
+
+
+@pytest.fixture(autouse=True)
+def _no_pictures(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    results = sys.modules.get("kiteline_lab.flights.results")
+    if results is not None and "drawn" not in request.fixturenames:
+        monkeypatch.setattr(results, "plot_trajectories", lambda path, *_, **__: cv2.imwrite(str(path), EMPTY))
+
+
 @pytest.fixture(scope="session", autouse=True)
 def _state_of_tests(tmp_path_factory: pytest.TempPathFactory) -> None:
     """Numbers of starts of the tests are their own."""
@@ -70,8 +85,6 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A log of 1.5 s that agents track in milliseconds: a rectified 320x240 stereo pair at 20 Hz slides past a textured
     wall 2 m away, with its ground truth. No data needed.
     """
-    import numpy as np
-
     from kiteline_core.frame import Frame, Trajectory
     from kiteline_core.geometry.cameras import CameraModel, CameraRig
     from kiteline_hw.logs.mcap_log import LogWriter

@@ -120,15 +120,18 @@ def serve(number: int) -> None:
     import cv2
 
     import kiteline_agent.__main__
+    import kiteline_agent.config
     import kiteline_agent.runtime.warm
     import kiteline_basestation.__main__
+    import kiteline_basestation.config
     import kiteline_basestation.runtime.warm
     import kiteline_basestation.web.status_page
     import kiteline_codec.warm
 
     cv2.setNumThreads(1)  # a process with threads cannot be forked
-    for warm in (kiteline_codec.warm.warm, kiteline_agent.runtime.warm.warm, kiteline_basestation.runtime.warm.warm):
-        warm()
+    kiteline_codec.warm.warm()
+    kiteline_agent.runtime.warm.warm(kiteline_agent.config.AgentConfig())
+    kiteline_basestation.runtime.warm.warm(kiteline_basestation.config.BaseConfig())
     gc.collect()
     gc.freeze()
     assert len(os.listdir("/proc/self/task")) == 1

@@ -15,6 +15,7 @@ from kiteline_lab.flights.fly import fly, main
 from kiteline_lab.flights.plan import Options
 
 
+@pytest.mark.usefixtures("drawn")
 @pytest.mark.parametrize("mode", ["tracker", "local", "monolith"])
 def test_each_mode_keeps_the_contract(recording: Path, tmp_path: Path, mode: str) -> None:
     report, outcome = fly(Options((str(recording),), tmp_path, mode), quiet=True)

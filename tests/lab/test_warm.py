@@ -8,6 +8,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
+import kiteline_agent.runtime.warm as agent_warm
+import kiteline_basestation.runtime.warm as base_warm
+from kiteline_agent.config import AgentConfig
+from kiteline_basestation.config import BaseConfig
 from kiteline_hw.system.kernel_compilation import listed
 from kiteline_lab.tools.doctor import WARMING
 
@@ -49,3 +55,14 @@ def test_flights_of_two_eyes_and_of_one_compile_nothing(recording: Path, tmp_pat
     lists = {name: set(listed(importlib.import_module(name))) for name in WARMING}
     named = set().union(*lists.values())
     assert named == set(lines), "write the lists anew: make kernels"
+
+
+def test_kernels_run_once_in_a_process_for_each_configuration(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A second flight in one process took half a second of CPU for them."""
+    for module, config in ((agent_warm, AgentConfig(tracker="ekf")), (base_warm, BaseConfig())):
+        run: list[object] = []
+        monkeypatch.setattr(module, "_warmed", set())
+        monkeypatch.setattr(module, "_run_all", lambda *given, run=run: run.append(given[0]))
+        for given in (None, config, config, None):
+            module.warm(given)
+        assert run == [None, config]
