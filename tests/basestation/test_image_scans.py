@@ -99,7 +99,7 @@ def result_of(job: Job, obstacle_m: float = 4.0, lowest_m: float = HEIGHT_M) -> 
     inputs = job.inputs
     assert isinstance(inputs, ScanInputs)
     labels = np.ones(len(inputs.uv), np.uint8)
-    return JobDone(job.id, job.kind, ScanResult(Segmented(scan, True, lowest_m), labels), 0)
+    return JobDone(job.id, job.kind, ScanResult(Segmented(scan, True, lowest_m), labels, inputs.brightness), 0)
 
 
 def test_one_job_at_a_time_is_made_for_an_agent_and_scans_wait_for_the_ground() -> None:

@@ -173,6 +173,7 @@ class ScanStage:
         assert self._stripes is not None
         if begun.stripe == self._stripes.stripes:
             begun.disparity = self._view.mask(self._stripes.finish())
+            self._stripes.learn_brightness(begun.disparity)
             return True
         if begun.stripe == 0:  # not in the frame of the keyframe
             self._stripes.begin(*self._take_pair())

@@ -15,6 +15,7 @@ from kiteline_basestation.map.map_tables import LANDMARK
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_codec.schema import Key, KeyframeScan, ScanImages, WireError, messages
 from kiteline_core.geometry import disparity_offset
+from kiteline_core.ground.brightness import Brightness
 from kiteline_core.ground.config import GroundConfig
 from kiteline_core.ground.ground_height import GroundHeight, Seen, without_ground
 from kiteline_core.ids import (
@@ -59,6 +60,7 @@ class ImageScans:
         self._waiting: dict[AgentId, deque[ScanImages]] = {}
         self._pending: dict[int, _Pending] = {}
         self._ground: dict[tuple[int, int], GroundHeight[KeyframeScan]] = {}  # by start of an agent, and stretch
+        self._brightness: dict[AgentId, Brightness] = {}  # of the agents' rigs, by the images so far
         self.made: dict[tuple[int, int], MadeScan] = {}
         self.unreadable = 0  # images that were none
 
@@ -96,7 +98,8 @@ class ImageScans:
             index, uv = self._landmarks(record)
             offset_px = self._map.disparity_offset_px.get(agent, disparity_offset.none())
             expected = self._ground_of(record).expected(record.T_o_c, record.up_c)
-            inputs = ScanInputs(record.images, camera, self._config, record.up_c, offset_px, expected, uv)
+            brightness = self._brightness.get(agent, Brightness())
+            inputs = ScanInputs(record.images, camera, self._config, record.up_c, offset_px, expected, uv, brightness)
             job = Job(next(self._job_ids), SCAN.name, inputs)
             jobs.append(job)
             self._pending[job.id] = _Pending(record, index)
@@ -115,6 +118,7 @@ class ImageScans:
             self.unreadable += 1
             return []
         record, seen = pending.record, result.seen
+        self._brightness[agent_of_keyframe(record.keyframe)] = result.brightness
         labels = np.zeros(int(pending.index.max(initial=-1)) + 1, np.uint8)
         labels[pending.index] = result.labels
         scan = KeyframeScan(record.keyframe, seen.scan, labels, record.part, record.T_k_s)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from kiteline_basestation.jobs import JobKind
 from kiteline_core.geometry.cameras import RectifiedCamera
+from kiteline_core.ground.brightness import Brightness
 from kiteline_core.ground.config import GroundConfig
 from kiteline_core.ground.disparity import DisparityStripes
 from kiteline_core.ground.image_codes import decode_pair
@@ -23,7 +24,7 @@ _PIXEL_OPS = 110  # of matching, ground and labels, by pixel of a disparity imag
 @dataclass(frozen=True, slots=True)
 class ScanInputs:
     """Images as coded, and what is known of them. offset_px: (5,) of the full image's disparities. uv: (n,2) pixels to
-    label. expected: the height of the ground, where it is known.
+    label. expected: the height of the ground, where it is known. brightness: of the rig, by the images before.
     """
 
     images: bytes
@@ -33,6 +34,7 @@ class ScanInputs:
     offset_px: F64
     expected: ExpectedGround | None
     uv: F64
+    brightness: Brightness
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +43,7 @@ class ScanResult:
 
     seen: Segmented
     labels: U8
+    brightness: Brightness
 
 
 def _run(inputs: ScanInputs) -> ScanResult | None:
@@ -50,10 +53,13 @@ def _run(inputs: ScanInputs) -> ScanResult | None:
     if pair is None:
         return None
     stripes = DisparityStripes(segmenter.camera, inputs.config)
+    stripes.brightness = inputs.brightness
     stripes.begin_reduced(pair)
     offset_px = inputs.offset_px * (segmenter.camera.bf / inputs.camera.bf)
-    seen = segmenter.segment(stripes.measure_begun(), stripes.pair, inputs.up_c, offset_px, inputs.expected)
-    return ScanResult(seen, segmenter.label_of(inputs.uv))
+    disparity = stripes.measure_begun()
+    stripes.learn_brightness(disparity)
+    seen = segmenter.segment(disparity, stripes.pair, inputs.up_c, offset_px, inputs.expected)
+    return ScanResult(seen, segmenter.label_of(inputs.uv), stripes.brightness)
 
 
 def _cost_ops(inputs: ScanInputs, result: ScanResult | None) -> int:

@@ -62,6 +62,7 @@ class Scanner:
         T_w_c = T_w_b @ self.camera.T_b_c
         halves = (np.asarray(cv2.pyrDown(image), np.uint8) for image in (frame.left, frame.right))
         disparity = self._view.mask(self._stripes.measure(*self._view.pair(*halves)))
+        self._stripes.learn_brightness(disparity)
         if self._damage is not None:
             disparity = self._damage(disparity)
         if self._start_z is not None and not self._made:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ground import level_kernels
+from kiteline_core.ground.brightness import Brightness, falloff
 from kiteline_core.ground.config import GroundConfig
 
 F32 = NDArray[np.float32]
@@ -69,7 +70,10 @@ class DisparityCamera:
 
 
 class DisparityStripes:
-    """The disparity image of one pair at a time, by semi-global matching (H. Hirschmueller, 2008) in stripes."""
+    """The disparity image of one pair at a time, by semi-global matching (H. Hirschmueller, 2008) in stripes.
+
+    brightness: of the rig, as it is known by the pairs before.
+    """
 
     def __init__(self, camera: DisparityCamera, config: GroundConfig) -> None:
         self._camera = camera
@@ -80,7 +84,10 @@ class DisparityStripes:
             uniquenessRatio=config.uniqueness, mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
         )  # fmt: skip
         self.stripes = config.stripes
-        self.pair: tuple[U8, U8] | None = None  # the images of the disparities, of their size
+        self.brightness = Brightness()
+        self._falloff = falloff(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+        self._taken: tuple[U8, U8] | None = None
+        self.pair: tuple[U8, U8] | None = None  # the images of the disparities, of their size, of one brightness
         self._padded: tuple[U8, U8] | None = None
         self._raw = np.empty((camera.height, camera.width + _PAD_PX), np.int16)
 
@@ -90,8 +97,9 @@ class DisparityStripes:
 
     def begin_reduced(self, pair: tuple[U8, U8]) -> None:
         """Take a pair of the size of disparities (h,w)."""
-        self.pair = pair
-        self._padded = _padded(self.pair[0]), _padded(self.pair[1])
+        self._taken = pair
+        self.pair = left, right = self.brightness.evened(pair, self._falloff)
+        self._padded = _padded(left), _padded(right)
 
     def match(self, stripe: int) -> None:
         """Measure the rows of a stripe."""
@@ -107,6 +115,11 @@ class DisparityStripes:
         cv2.filterSpeckles(self._raw, -_STEPS, _SPECKLE_PX, _STEPS)
         self._padded = None
         return unlocked(self._raw, _PAD_PX)
+
+    def learn_brightness(self, disparity: F32) -> None:
+        """Learn how bright the eyes are from the last pair and its disparities (h,w), with 0 for what is masked."""
+        assert self._taken is not None
+        self.brightness = self.brightness.learned(self._taken, disparity, self._falloff)
 
     @property
     def stripe_px(self) -> int:

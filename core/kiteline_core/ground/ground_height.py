@@ -63,6 +63,7 @@ class GroundHeight(Generic[Tag]):
         self._config = config
         self._foot: F64 | None = None  # (3,) in o, of the ground that was seen last
         self._refuted = 0
+        self._lower = 0  # newest scans that saw ground below the foot, and none as high
         self._held: deque[_Place[Tag]] = deque(maxlen=_HELD)
         self._believed: deque[_Place[Tag]] = deque(maxlen=_BELIEVED)
         self._low: deque[F64] = deque(maxlen=_LOW)  # (3,) in o: the ground lies no higher
@@ -100,7 +101,12 @@ class GroundHeight(Generic[Tag]):
         place = _Place(tag, camera, foot, _ends(T, scan))
         if self._foot is not None:
             if not self._is_level(foot, self._foot, up):
+                lower = seen.ground and float((self._foot - foot) @ up) > 0.0
+                self._lower = self._lower + 1 if lower else 0
+                if self._lower >= _REFUTED:  # a step down, or the height was a little too large from the start
+                    self._foot, self._lower = None, 0
                 return Verdict([], [])
+            self._lower = 0
             if seen.ground:
                 self._foot = foot
             self._believed.append(place)

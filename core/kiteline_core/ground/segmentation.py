@@ -32,6 +32,7 @@ _HALF_COUNTS = 30.0  # pixels of a cell of the v-disparity that count half as mu
 _STIFFNESS = 1e-3  # of the spline
 _ROUNDS = 5
 _BETTER = 1.3  # times the pixels of level ground that make a curve the ground
+_NEAREST = 0.25  # of the ground's pixels, which tell its height below the camera
 _HALF_SURE = 200.0  # pixels near the expected height that move it half of the way
 _REFINED = 0.4  # of a disparity's deviation that remains of a surface that is refined by all of its pixels
 _UNDER = 0.5  # pixels below the ground for one on it, at most: nothing is seen through it
@@ -57,7 +58,7 @@ class Ground:
     coefficients: F64
     low_px: float
     high_px: float
-    height_m: float  # of the camera above its nearest part
+    height_m: float  # of the camera above the nearest quarter of its pixels
     seen: bool = True
 
 
@@ -197,8 +198,11 @@ class GroundSegmenter:
         if _BETTER * self._pixels_near(np.full(self._bins, level.height_m)).sum() > self._heights.sum():
             return level  # no curve passes through so many more
         curved = self._curved_ground(expected)
-        if curved is None or abs(curved.height_m - expected.height_m) > expected.within_m:
+        if curved is None:
             return level
+        if abs(curved.height_m - expected.height_m) > expected.within_m:
+            # Where nothing lies as high as expected, ground that is seen lower is the better one.
+            return curved if not level.seen and curved.height_m > expected.height_m else level
         return replace(curved, seen=level.seen) if self._is_better(curved, level) else level
 
     def _is_better(self, curved: Ground, level: Ground) -> bool:
@@ -252,9 +256,7 @@ class GroundSegmenter:
         coefficients = np.zeros(profile_kernels.COEFFICIENTS)
         if not profile_kernels.fit_spline(d, slope, n, low, high, sigma, _STIFFNESS, _ROUNDS, coefficients):
             return None
-        return Ground(
-            coefficients, low, high, float(profile_kernels.spline_at(coefficients, low, high, high)) * bf / high
-        )
+        return Ground(coefficients, low, high, _near_height(n, d, slope) * bf)
 
     def _lowest_ground(self, lowest_m: float) -> Ground | None:
         """Level ground next to the lowest points; None if too little of it is seen."""
@@ -265,7 +267,7 @@ class GroundSegmenter:
         first = max(int((lowest_m - config.expected_m) / _HEIGHT_STEP_M), 0)
         last = int((lowest_m + config.lower_m) / _HEIGHT_STEP_M) + 1
         some = np.convolve(rows, np.ones(3), "same")[first:last]
-        if not len(some) or some.max() < config.expected_pixels:
+        if not len(some) or some.max() < config.least_pixels:
             return None
         height_m = (first + int(np.argmax(some)) + 0.5) * _HEIGHT_STEP_M
         ground = self._expected_ground(ExpectedGround(height_m, config.expected_m))
@@ -347,3 +349,17 @@ class GroundSegmenter:
             clear, height_m,
         )  # fmt: skip
         return scan, False
+
+
+def _near_height(n: F64, d: F64, slope: F64) -> float:
+    """Median height, over bf, of the nearest quarter of n pixels with disparities d and slopes (m,).
+
+    The end of a spline hangs on a few pixels.
+    """
+    by_range = np.argsort(-d, kind="stable")
+    last = int(np.searchsorted(np.cumsum(n[by_range]), _NEAREST * n.sum())) + 1
+    near = by_range[:last]
+    heights = slope[near] / d[near]
+    by_height = np.argsort(heights, kind="stable")
+    counts = np.cumsum(n[near][by_height])
+    return float(heights[by_height[int(np.searchsorted(counts, 0.5 * counts[-1]))]])

@@ -107,3 +107,23 @@ def test_a_scan_without_ground_keeps_its_line_of_sight_alone() -> None:
     blank = without_ground(scan)
     assert np.isnan(blank.camera_height_m) and not blank.free_m.any() and not blank.bands.any()
     assert np.isinf(blank.obstacle_m).all() and np.array_equal(blank.clear_m, scan.clear_m)
+
+
+def test_ground_that_is_seen_a_little_lower_again_and_again_takes_the_place_of_the_first() -> None:
+    """A height that was too large by less than what refutes it does not stay."""
+    ground: GroundHeight[int] = GroundHeight(GroundConfig())
+    fly(ground, *(seen(x, 1.6, 0.2, 0.05) for x in (0.0, 0.3)))
+    assert expected(ground, 0.3, 1.6) == pytest.approx(1.4)
+    once = fly(ground, seen(0.4, 1.6, 0.0, 0.05), first=2)
+    assert expected(ground, 0.4, 1.6) == pytest.approx(1.4)  # one view may be an error
+    later = fly(ground, *(seen(0.4 + 0.2 * k, 1.6, 0.0, 0.05) for k in range(1, 4)), first=3)
+    assert expected(ground, 1.0, 1.6) == pytest.approx(1.6)
+    assert not once[0].believed and later[-1].believed
+
+
+def test_a_box_beside_the_way_does_not_lift_the_ground() -> None:
+    ground: GroundHeight[int] = GroundHeight(GroundConfig())
+    fly(ground, *(seen(x, 1.6, 0.0, 0.05) for x in (0.0, 0.3)))
+    boxes = fly(ground, *(seen(0.4 + 0.1 * k, 1.6, 0.2, 0.1) for k in range(6)), first=2)
+    assert not any(v.believed for v in boxes)
+    assert expected(ground, 1.0, 1.6) == pytest.approx(1.6)

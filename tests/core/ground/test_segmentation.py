@@ -13,7 +13,7 @@ from kiteline_core.ground.column_scan import ColumnScan, level_rotation
 from kiteline_core.ground.config import GroundConfig
 from kiteline_core.ground.disparity import DisparityStripes, unlocked
 from kiteline_core.ground.label_kernels import GROUND, OBSTACLE, UNKNOWN
-from kiteline_core.ground.segmentation import ExpectedGround, GroundSegmenter
+from kiteline_core.ground.segmentation import ExpectedGround, GroundSegmenter, _near_height
 
 CAMERA = RectifiedCamera(752, 480, 430.0, 430.0, 375.0, 245.0, 0.11, True, np.eye(4))
 HEIGHT_M = 1.5
@@ -304,3 +304,11 @@ def test_labels_outside_of_the_image_are_unknown() -> None:
     segmenter.segment(disparity, None, up(0.0, 0.0), expected=ExpectedGround(HEIGHT_M, 0.1))
     uv = np.array([[375.0, 460.0], [375.0, 480.5], [-3.0, 460.0], [760.0, 460.0], [375.0, -20.0]])
     assert segmenter.label_of(uv).tolist() == [GROUND, UNKNOWN, UNKNOWN, UNKNOWN, UNKNOWN]
+
+
+def test_the_height_of_ground_hangs_on_many_of_its_pixels() -> None:
+    """A few pixels at the near end that lie higher do not lift it."""
+    d = np.array([12.0, 8.0, 7.0, 6.0, 5.0, 4.0])
+    n = np.array([5.0, 100.0, 120.0, 150.0, 150.0, 150.0])
+    heights = np.array([0.8, 1.5, 1.5, 1.5, 1.5, 1.5])
+    assert _near_height(n, d, heights * d) == pytest.approx(1.5)
