@@ -13,7 +13,7 @@ from pathlib import Path
 import cv2
 
 from kiteline_lab.references.comparison import TOLERANCE, differences
-from kiteline_lab.references.flights import FOLDER, IMAGES, KeptFlight, by_name, fly_kept, make_logs
+from kiteline_lab.references.flights import FOLDER, KeptFlight, by_name, make_logs
 from kiteline_lab.references.machine import machine
 from kiteline_lab.references.observation import Observation, from_text, to_text
 from kiteline_lab.references.replays import replay
@@ -74,11 +74,8 @@ def main(argv: list[str]) -> int:
         return 0
     if a.check:
         return int(not all(list(map(partial(check, a.folder), flights))))
-    if a.logs == "new" and a.names and (a.folder / IMAGES).exists():
-        for flight in flights:
-            fly_kept(a.folder, flight)
-    elif a.logs == "new":
-        make_logs(a.folder)
+    if a.logs == "new":
+        make_logs(a.folder, flights, images=not a.names)
     agree = all(list(map(partial(renew, a.folder), flights)))
     print(f"made with: {machine()}\nwanted? Commit {a.folder} alone, with these lines as the message.")
     return int(not agree)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from kiteline_agent.runtime import flight_log as agent_log
 from kiteline_basestation.runtime import flight_log as base_log
-from kiteline_core.frame import EncodedImage, Frame, ImuBatch, OdometryBatch
+from kiteline_core.frame import EncodedImage, Frame, ImuBatch, OdometryBatch, joined
 from kiteline_core.geometry import se3, tum
 from kiteline_hw.logs.mcap_file import McapFile
 from kiteline_hw.logs.mcap_log import GROUND_TRUTH, IMU, ODOMETER, RIG, LogWriter
@@ -31,8 +31,10 @@ from kiteline_lab.flights.plan import Options, plan
 F64 = NDArray[np.float64]
 
 FOLDER = Path("tests/references/kept")
-IMAGES = "images.mcap"  # of all kept flights
+IMAGES = "images.mcap"  # of all kept flights but one
+LEFT_IMAGES = "images-left.mcap"  # one camera takes 3 s to find its scale: fewer and longer
 FRAMES, DEPTH_FRAMES = 32, 14  # frames of it, and of them those with depth
+LEFT_FRAMES = 35  # of the latter, every second one of the simulation
 _RATE_HZ = 20.0
 _QUALITY = 40  # of WebP: 4 kB an image
 _DEPTH_STEPS = 50.0  # per metre: steps of 2 cm, which a depth camera has, and which compress well
@@ -56,11 +58,13 @@ class KeptFlight:
     depth: bool = False
     odometer: bool = False
     options: Mapping[str, Any] = field(default_factory=dict)
+    images: str = IMAGES
 
 
 FLIGHTS = (
     KeptFlight("stereo-imu", "a stereo pair with an IMU, a base on a wide link"),
-    KeptFlight("mono-imu", "one camera with an IMU, a base on a wide link", options={"mono": True}),
+    KeptFlight("mono-imu", "one camera with an IMU, a base on a wide link", ((0, LEFT_FRAMES),),
+               options={"mono": True}, images=LEFT_IMAGES),
     KeptFlight("rgbd", "a camera with depth, no IMU, a base on a wide link", ((0, DEPTH_FRAMES),), True,
                options={"imu": False}),
     KeptFlight("lossy", "a stereo pair with an IMU, a base on a slow link that loses a fifth of the packets",
@@ -72,10 +76,12 @@ FLIGHTS = (
 )  # fmt: skip
 
 
-def make_logs(folder: Path, flights: tuple[KeptFlight, ...] = FLIGHTS) -> None:
-    """Simulate and fly all anew; write images and logs into a folder."""
+def make_logs(folder: Path, flights: tuple[KeptFlight, ...] = FLIGHTS, *, images: bool = True) -> None:
+    """Fly anew; write logs into a folder, and images that it lacks. images: simulate those of the flights anew, too."""
     folder.mkdir(parents=True, exist_ok=True)
-    _write_images(folder / IMAGES)
+    for name in sorted({flight.images for flight in flights}):
+        if images or not (folder / name).exists():
+            _write_images(folder / name)
     for flight in flights:
         fly_kept(folder, flight)
 
@@ -109,8 +115,8 @@ def recordings(folder: Path, flight: KeptFlight, out: Path) -> list[Path]:
     """Recordings of the flight's agents, cut from the kept images."""
     made = []
     for k, (first, last) in enumerate(flight.frames):
-        source = open_source(str(folder / IMAGES))
-        depth = _depth_images(folder / IMAGES) if flight.depth else {}
+        source = open_source(str(folder / flight.images))
+        depth = _depth_images(folder / flight.images) if flight.depth else {}
         rig = replace(source.rig, right=None, T_c_r=None, has_depth=True) if flight.depth else source.rig
         made.append(out / f"agent{k}.mcap")
         with contextlib.closing(source), LogWriter(made[-1], {"role": "recording"}) as log:
@@ -144,29 +150,43 @@ def _depth_images(file: Path) -> dict[int, EncodedImage]:
 
 def _write_images(path: Path) -> None:
     """Simulate the flight and encode its images small."""
+    few = path.name == LEFT_IMAGES
     with tempfile.TemporaryDirectory(prefix="kiteline-references-") as scratch:
         trajectory = Path(scratch) / "path.txt"
         _write_path(trajectory)
+        options = {**_SIM, "trajectory": str(trajectory)}
         workers = os.cpu_count() or 1
-        pair = open_sim("room", workers, **_SIM, trajectory=str(trajectory))
-        deep = open_sim("room", workers, **{**_SIM, "seconds": DEPTH_FRAMES / _RATE_HZ}, trajectory=str(trajectory),
-                        depth=True, imu=False)  # fmt: skip
-        depths = {item.t_ns: item.depth_m for item in deep if isinstance(item, Frame)}
-    truth, number = pair.ground_truth, 0
+        if few:
+            options |= {"mono": True, "odometry": 0.0, "seconds": 2 * LEFT_FRAMES / _RATE_HZ}
+        source = open_sim("room", workers, **options)
+        depths = {} if few else _simulated_depths(options, workers)
+    truth, number = source.ground_truth, 0
     assert truth is not None
-    with LogWriter(path, {"role": "recording", "source": pair.name}) as log:
-        log.rig(int(truth.t_ns[0]), pair.rig, pair.imu)
-        for item in pair:
+    samples: list[ImuBatch] = []
+    with LogWriter(path, {"role": "recording", "source": source.name}) as log:
+        log.rig(int(truth.t_ns[0]), source.rig, source.imu)
+        for item in source:
             if isinstance(item, ImuBatch):
-                log.imu(IMU, int(item.t_ns[-1]), item)
+                samples.append(item)
             elif isinstance(item, OdometryBatch):
                 log.odometer(ODOMETER, int(item.t_ns[-1]), item)
             else:
-                log.pose(GROUND_TRUTH, item.t_ns, "world", truth.T_w_b[number])
-                number += 1
-                log.frame(replace(item, encoded=tuple(_webp(i) for i in (item.left, item.right) if i is not None)))
+                if not (few and number % 2):
+                    if (batch := joined(samples)) is not None:
+                        log.imu(IMU, int(batch.t_ns[-1]), batch)
+                    samples = []
+                    log.pose(GROUND_TRUTH, item.t_ns, "world", truth.T_w_b[number])
+                    log.frame(replace(item, encoded=tuple(_webp(i) for i in (item.left, item.right) if i is not None)))
                 if (depth := depths.get(item.t_ns)) is not None:
                     log.image("/kept/depth", item.t_ns, _coarse_depth(depth), "left")
+                number += 1
+
+
+def _simulated_depths(options: Mapping[str, Any], workers: int) -> dict[int, NDArray[np.float32]]:
+    """Depth images of the first frames, by stamp."""
+    part = {**options, "seconds": DEPTH_FRAMES / _RATE_HZ, "depth": True, "imu": False}
+    frames = [item for item in open_sim("room", workers, **part) if isinstance(item, Frame)]
+    return {frame.t_ns: frame.depth_m for frame in frames if frame.depth_m is not None}
 
 
 def _webp(image: NDArray[np.uint8]) -> EncodedImage:

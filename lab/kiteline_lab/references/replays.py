@@ -26,7 +26,7 @@ from kiteline_hw.sources.open import open_source
 from kiteline_lab.evaluation import metrics
 from kiteline_lab.evaluation.metrics import TrajectoryAlignment
 from kiteline_lab.references import kept_log
-from kiteline_lab.references.flights import IMAGES, KeptFlight, agent_log_of, base_log_of
+from kiteline_lab.references.flights import KeptFlight, agent_log_of, base_log_of
 from kiteline_lab.references.machine import machine
 from kiteline_lab.references.observation import Half, Observation, Row, add_digests, digest
 from kiteline_lab.replay.logged_steps import Step, agent_input, agent_of_log, check_replayable, steps
@@ -43,7 +43,7 @@ _NOTHING = (math.nan,) * 3
 
 def replay(folder: Path, flight: KeptFlight) -> Observation:
     """Replay the logs of a kept flight. Raises SourceError."""
-    images = kept_log.read_images(folder / IMAGES)
+    images = kept_log.read_images(folder / flight.images)
     found = Observation(flight.name, flight.about, machine())
     for k in range(len(flight.frames)):
         found.halves.append(replay_agent(folder, flight, k, images))
@@ -77,7 +77,7 @@ def replay_agent(folder: Path, flight: KeptFlight, number: int, images: kept_log
     for name in ("frames", "tracked", "bridged", "lost", "initialising", "dropped", "submaps", "keyframes"):
         half.facts[name] = str(report[name])
     half.facts["bytes up"] = f"{counts.bytes_up} in {packets} packets"
-    half.facts |= _accuracy(folder, live)
+    half.facts |= _accuracy(folder / flight.images, live)
     add_digests(half)
     return half
 
@@ -114,11 +114,11 @@ def _pose(T: F64) -> tuple[float, ...]:
     return (*T[:3, 3].tolist(), *se3.so3_log(T[:3, :3]).tolist())
 
 
-def _accuracy(folder: Path, live: list[tuple[int, F64]]) -> dict[str, str]:
+def _accuracy(images: Path, live: list[tuple[int, F64]]) -> dict[str, str]:
     """Error of the live poses and the last one."""
     if len(live) < 3:
         return {"error of live poses": "none: fewer than 3 poses"}
-    source = open_source(str(folder / IMAGES))
+    source = open_source(str(images))
     truth = source.ground_truth
     source.close()
     assert truth is not None
