@@ -12,6 +12,8 @@ import pytest
 
 from kiteline_core.frame import Frame
 from kiteline_hw.sources.open import open_source
+from kiteline_lab.flights.fly import fly
+from kiteline_lab.flights.plan import Options
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -42,8 +44,7 @@ def test_images_become_poses(recording: Path, tmp_path: Path) -> None:
 
 
 def test_a_flown_log_becomes_arrays(recording: Path, tmp_path: Path) -> None:
-    fly = [sys.executable, "-m", "kiteline_cli", "fly", str(recording), "--out", str(tmp_path), "--mode", "tracker"]
-    subprocess.run(fly, check=True, capture_output=True)
+    fly(Options((str(recording),), tmp_path, "tracker"), quiet=True)
     lines = run("read_log.py", str(tmp_path / "agent0" / "log.mcap"))
     assert lines[0].startswith("left images    (30, 240, 320) uint8")
     assert lines[1] == "gyro, accel    (0, 3), (0, 3)"

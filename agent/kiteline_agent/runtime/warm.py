@@ -52,10 +52,11 @@ def _run_all(config: AgentConfig | None) -> None:
     if config is not None and config.tracker == "ekf":
         warm_filter()
         return
-    state, pixels = 1, np.empty(240 * 320, np.uint8)
-    for i in range(pixels.size):  # deterministic noise: corners everywhere
-        state = state * 1103515245 + 12345 & 0x7FFFFFFF
-        pixels[i] = state >> 16 & 255
+    # Deterministic noise, corners everywhere: s <- 1103515245 s + 12345 from s = 1 on, modulo 2^31, in closed form.
+    powers = np.cumprod(np.full(240 * 320, 1103515245, np.uint64), dtype=np.uint64)
+    sums = np.cumsum(np.concatenate([np.ones(1, np.uint64), powers[:-1]]), dtype=np.uint64)
+    states = powers + np.uint64(12345) * sums
+    pixels = (states >> np.uint64(16) & np.uint64(255)).astype(np.uint8)
     image = np.kron(pixels.reshape(240, 320)[:60, :80], np.ones((4, 4), np.uint8))
     camera = CameraModel(320, 240, 200.0, 200.0, 159.5, 119.5)
     small = CameraRig(camera, camera, np.eye(4), from_rt(np.eye(3), np.array([0.1, 0.0, 0.0])))
