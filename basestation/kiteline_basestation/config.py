@@ -100,20 +100,23 @@ class LoopConfig:
 
     share: str = "all"  # agents whose maps may be merged: "all", "none", or groups such as "0 1, 1 2"
     enabled: bool = True  # False: no loops are closed and no maps merged
-    candidates: int = 4  # most similar keyframes of other maps that are verified
+    candidates: int = 8  # most similar keyframes of other maps that are verified: a room's map has as many views
     candidates_same_map: int = 3  # most similar keyframes of the same map that are verified
     min_gap: int = 12  # keyframes of one submap between two that are matched
     loop_gap: int = 30  # keyframes; landmarks observed again after so many count as a loop
     max_shared: int = 15  # landmarks that a candidate may share with the keyframe already
-    min_likeness: float = 0.005  # similarity of places, 0..1: of unrelated images on average 0.01, of a revisit more
-    min_neighbour_ratio: float = 0.03  # of the similarity to the previous keyframe, whose descriptors hardly differ
+    min_likeness: float = (
+        0.002  # similarity of places, 0..1: of unrelated images 0.01, of one from 0.5 m beside no more
+    )
+    min_neighbour_ratio: float = 0.03  # in one map, of the similarity to the previous keyframe: drift leaves near views
     match: MatchConfig = field(default_factory=MatchConfig)
     ransac: RansacConfig = field(default_factory=RansacConfig)
     sigma_disparity_px: float = 0.4  # px; standard deviation of the disparities behind the landmarks' depths
     max_neighbours: int = 8  # covisible keyframes whose landmarks are matched too
     radius_px: float = 10.0  # px at octave 0; search radius around predicted projections, halved in the second round
     octave_gap: float = 1.5  # octaves between the predicted and the detected scale
-    min_inliers: int = 20  # landmarks that agree between the two keyframes alone
+    min_inliers: int = 20  # landmarks that are enough to judge a keyframe, a plane or a merge by
+    min_inliers_local: int = 13  # between two maps, landmarks that agree before guided matching: by chance up to 10
     min_inliers_all: int = 35  # landmarks that agree, with those of the neighbours, to merge maps
     min_inliers_loop: int = 40  # landmarks that agree, with those of the neighbours, to close a loop in one map
     min_matched_share: float = 0.25  # of the landmarks expected in view: less is an object that stands in two places

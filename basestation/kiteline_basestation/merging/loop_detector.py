@@ -18,7 +18,12 @@ from kiteline_basestation.exchange.sharing import SharingPolicy
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.merging import loop_consistency as consistency
 from kiteline_basestation.merging.loop_edges import LoopMatch, correction_of, rescaled, slot_pairs
-from kiteline_basestation.merging.loop_verification import KeyframeObservations, observations_of, verify_loop
+from kiteline_basestation.merging.loop_verification import (
+    KeyframeObservations,
+    guessed_pose,
+    observations_of,
+    verify_loop,
+)
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import AgentId, KeyframeId, SubmapId, agent_of_keyframe, submap_of_keyframe
 from kiteline_core.places.place_index import PlaceIndex, Vocabulary
@@ -179,9 +184,10 @@ class LoopDetector:
         at = sparse_map.number_of(keyframe)
         near = same[max(0, at - config.min_gap) : at + config.min_gap + 1]
         before = [k for k in near if k < keyframe][-1:]
-        enough = config.min_likeness
+        enough = {True: config.min_likeness, False: config.min_likeness}  # in the same map, and in others
         if before and keyframe in self._index and before[0] in self._index:
-            enough = max(enough, config.min_neighbour_ratio * float(self._index.similarity(keyframe, before)[0]))
+            usual = float(self._index.similarity(keyframe, before)[0])
+            enough[True] = max(config.min_likeness, config.min_neighbour_ratio * usual)
         places = self._index.query(
             observations.descriptor, known | set(near) | {keyframe}, _QUERIED * config.candidates
         )  # fmt: skip
@@ -191,11 +197,10 @@ class LoopDetector:
         map_id = sparse_map.map_id(submap_of_keyframe(keyframe))
         for key, score in zip(places.keys.tolist(), places.score.tolist()):
             old = KeyframeId(key)
-            if score < enough:
-                break
             same_map = sparse_map.map_id(submap_of_keyframe(old)) == map_id
             if (
                 key in taken
+                or score < enough[same_map]
                 or left[same_map] == 0
                 or not self._sharing.allows(agent_of_keyframe(keyframe), agent_of_keyframe(old))
                 or self.is_kept_apart(submap_of_keyframe(keyframe), submap_of_keyframe(old))
@@ -263,7 +268,8 @@ class LoopDetector:
         for keyframe in reversed(same[max(0, at - self._config.predecessors) : at]):
             if any(m.new == keyframe for m in self._matches[_pair(new, old)]):
                 continue
-            other = verify_loop(self._map, keyframe, match.old, self._config)
+            guess = guessed_pose(self._map, match, keyframe)
+            other = verify_loop(self._map, keyframe, match.old, self._config, guess=guess)
             if other is None:
                 continue
             self.verified += 1

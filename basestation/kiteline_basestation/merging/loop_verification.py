@@ -1,7 +1,9 @@
 """Verifies geometrically that a keyframe shows the same place as an older keyframe.
 
-Descriptor matching, absolute pose by RANSAC, then guided matching of the neighbours' landmarks, as in ORB-SLAM2,
-section III-E. The matched landmarks must also be spread over the image and make up most of those expected in view.
+Descriptors are matched to the landmarks of the older keyframe and of its covisible neighbours, as in ORB-SLAM3
+(C. Campos et al., T-RO 2021, section VII-A): one keyframe alone has too few of those that a distant view shows. A
+pose by RANSAC and guided matching follow (ORB-SLAM2, section III-E). The matched landmarks must also be spread over the
+image and make up most of those expected in view.
 """
 
 from __future__ import annotations
@@ -14,7 +16,7 @@ from numpy.typing import NDArray
 from kiteline_basestation.config import LoopConfig
 from kiteline_basestation.map.map_tables import LANDMARK
 from kiteline_basestation.map.sparse_map import SparseMap
-from kiteline_basestation.merging.loop_edges import LoopMatch
+from kiteline_basestation.merging.loop_edges import LoopMatch, correction_of
 from kiteline_basestation.merging.similarity import align_views
 from kiteline_basestation.refinement.landmark_matching import predict_projections
 from kiteline_core.geometry import se3, sim3
@@ -31,6 +33,7 @@ U8 = NDArray[np.uint8]
 
 
 _UNIT_RATIO = 1.15  # of depths in two maps: monocular scale drift stays below it
+_NEAREST_M = 0.1  # of a landmark before a camera
 _UNIT_POINTS = 8  # with depth in both maps; fewer are not tested
 
 
@@ -60,41 +63,67 @@ def observations_of(sparse_map: SparseMap, keyframe: KeyframeId) -> KeyframeObse
     slots = sparse_map.observations_of(keyframe)
     points = table.root[slots]
     described_by = np.where(table.kind[slots] == LANDMARK, slots, points)
-    T = sparse_map.keyframes.T_w_k
-    turn = np.einsum("ji,njk->nik", T[row, :3, :3], T[table.row[described_by], :3, :3])
-    roll = np.arctan2(turn[:, 1, 0] - turn[:, 0, 1], turn[:, 0, 0] + turn[:, 1, 1])
-    angle = (table.angle[described_by].astype(np.int64) + np.rint(roll * (128.0 / np.pi)).astype(np.int64)) & 255
+    angle = _rotated(sparse_map, row, described_by)
     xyz, known = sparse_map.positions(points)
     bf = sparse_map.keyframes.camera[row, 4]
     ranged = (table.inv_depth[slots] > 0) & (bf > 0) & (not sparse_map.is_up_to_scale(submap_of_keyframe(keyframe)))
     measured = np.where(ranged, bf * table.inv_depth[slots].astype(np.float64), -1.0)
     return KeyframeObservations(
-        slots, points, table.uv[slots].astype(np.float64), measured, table.octave[slots], angle.astype(np.uint8),
+        slots, points, table.uv[slots].astype(np.float64), measured, table.octave[slots], angle,
         table.descriptor[described_by], xyz, known,
     )  # fmt: skip
 
 
+@dataclass(frozen=True, slots=True)
+class LocalLandmarks:
+    """Landmarks of a keyframe and its covisible neighbours, described as that keyframe would see them.
+
+    points: (n,) roots with a depth. xyz: (n,3) m in w. angle: (n,). descriptor: (n,32).
+    """
+
+    points: I32
+    xyz: F64
+    angle: U8
+    descriptor: U8
+
+
+def local_landmarks(sparse_map: SparseMap, keyframe: KeyframeId, neighbours: int) -> LocalLandmarks:
+    """Landmarks of a keyframe and of its most covisible neighbours, with directions rotated to the keyframe's roll."""
+    table = sparse_map.keypoints
+    around = [keyframe, *sparse_map.covisible_keyframes(keyframe, 1)[:neighbours]]
+    points = sparse_map.sorted_by_id(np.concatenate([sparse_map.landmarks_of(k) for k in around]))
+    xyz, known = sparse_map.positions(points)
+    points = points[known]
+    angle = _rotated(sparse_map, sparse_map.rows[keyframe], points)
+    return LocalLandmarks(points, xyz[known], angle, table.descriptor[points])
+
+
 def verify_loop(
     sparse_map: SparseMap, new: KeyframeId, old: KeyframeId, config: LoopConfig,
-    view: KeyframeObservations | None = None,
+    view: KeyframeObservations | None = None, guess: tuple[F64, float] | None = None,
 ) -> LoopMatch | None:  # fmt: skip
     """Match `new` against `old` and its covisible neighbours; None if the match cannot be verified.
 
     Poses are taken within the map of each keyframe; the current alignment of the two maps is not used. view: the
-    observations of `new`, if already gathered.
+    observations of `new`, if already gathered. guess: T_c_w (4,4) of `new` in the old map and the scale of the old over
+    the new map, as another keyframe's match implies them; guided matching begins there if RANSAC finds no pose.
     """
     mine = observations_of(sparse_map, new) if view is None else view
-    theirs = observations_of(sparse_map, old)
+    across = sparse_map.map_id(submap_of_keyframe(new)) != sparse_map.map_id(submap_of_keyframe(old))
+    theirs = local_landmarks(sparse_map, old, config.max_neighbours if across else 0)
+    if not across:  # loops in one map wait for near views, which correct it best
+        config = replace(config, min_inliers_local=config.min_inliers)
     wanted, offered = comparable(mine.descriptor, theirs.descriptor)
     pairs = matching.match(wanted, mine.angle, offered, theirs.angle, config.match)
-    a, b = pairs.a[theirs.known[pairs.b]], pairs.b[theirs.known[pairs.b]]
-    if len(a) < config.min_inliers:
-        return None
+    a, b = pairs.a, pairs.b
     free = any(sparse_map.is_up_to_scale(submap_of_keyframe(k)) for k in (new, old))
     if free:
         mine = replace(mine, disparity=np.full(len(mine.uv), -1.0))  # in another unit than the old map
-    start = _solve_similarity(sparse_map, new, old, mine, theirs, a, b, config) if free else None
-    start = start or _solve_pnp(sparse_map, new, old, mine, theirs, a, b, config)
+    start = None
+    if len(a) >= config.min_inliers_local:
+        start = _solve_similarity(sparse_map, new, old, mine, theirs, a, b, config) if free else None
+        start = start or _solve_pnp(sparse_map, new, old, mine, theirs, a, b, config)
+    start = start or guess
     if start is None:
         return None
     observed = np.column_stack([mine.uv, mine.disparity])
@@ -124,16 +153,23 @@ def verify_loop(
     )  # fmt: skip
 
 
+def guessed_pose(sparse_map: SparseMap, match: LoopMatch, keyframe: KeyframeId) -> tuple[F64, float]:
+    """T_c_w (4,4) of a keyframe in the old map, and the old map's scale over its own, by another keyframe's match."""
+    correction = correction_of(sparse_map, match)
+    moved = correction @ sim3.of(1.0, sparse_map.keyframes.T_w_k[sparse_map.rows[keyframe]])
+    return se3.inverse(se3.orthonormalise(sim3.rigid(moved))), sim3.scale_of(correction)
+
+
 def _solve_pnp(
     sparse_map: SparseMap, new: KeyframeId, old: KeyframeId, mine: KeyframeObservations,
-    theirs: KeyframeObservations, a: I32, b: I32, config: LoopConfig,
+    theirs: LocalLandmarks, a: I32, b: I32, config: LoopConfig,
 ) -> tuple[F64, float] | None:  # fmt: skip
     """T_c_w (4,4) of the new camera in the old map by RANSAC PnP, and a rough scale of the old over the new map."""
     rays = _depth_rays(sparse_map, theirs.points, theirs.xyz, config)
     observed = np.column_stack([mine.uv, mine.disparity])
     camera = sparse_map.keyframes.camera[sparse_map.rows[new]].copy()
     fit = pnp.solve_pnp(theirs.xyz[b], rays[b], observed[a], mine.octave[a], camera, _seed(new, old), config.ransac)
-    if fit is None or fit.inliers < config.min_inliers:
+    if fit is None or fit.inliers < config.min_inliers_local:
         return None
     a, b = a[fit.inlier], b[fit.inlier]
     other = se3.transform(fit.T_c_m, theirs.xyz[b])[mine.known[a], 2]
@@ -143,27 +179,39 @@ def _solve_pnp(
 
 def _solve_similarity(
     sparse_map: SparseMap, new: KeyframeId, old: KeyframeId, mine: KeyframeObservations,
-    theirs: KeyframeObservations, a: I32, b: I32, config: LoopConfig,
+    theirs: LocalLandmarks, a: I32, b: I32, config: LoopConfig,
 ) -> tuple[F64, float] | None:  # fmt: skip
     """T_c_w (4,4) of the new camera in the old map, and the scale of the old over the new map.
 
     Aligns landmarks known in both maps (B. Horn, 1987, in RANSAC, as monocular ORB-SLAM does). None with too few.
     """
-    both = mine.known[a]
-    a, b = a[both], b[both]
-    if len(a) < config.min_inliers:
-        return None
     rows = [sparse_map.rows[k] for k in (old, new)]
     T_old, T_new = sparse_map.keyframes.T_w_k[rows]
     lens_old, lens_new = sparse_map.keyframes.camera[rows]
+    in_old = se3.transform(se3.inverse(T_old), theirs.xyz)
+    both = mine.known[a] & (in_old[b, 2] > _NEAREST_M)
+    a, b = a[both], b[both]
+    if len(a) < config.min_inliers_local:
+        return None
+    in_old = in_old[b]
+    uv_old = in_old[:, :2] / in_old[:, 2:] * lens_old[:2] + lens_old[2:4]  # where `old` sees them, or would
     fit = align_views(
-        se3.transform(se3.inverse(T_old), theirs.xyz[b]), theirs.uv[b], theirs.octave[b], lens_old,
+        in_old, uv_old, sparse_map.keypoints.octave[theirs.points[b]], lens_old,
         se3.transform(se3.inverse(T_new), mine.xyz[a]), mine.uv[a], mine.octave[a], lens_new,
         with_scale=True, seed=_seed(new, old), config=config.ransac,
     )  # fmt: skip
-    if fit is None or fit.inliers < config.min_inliers or not np.isfinite(fit.S_a_b).all():
+    if fit is None or fit.inliers < config.min_inliers_local or not np.isfinite(fit.S_a_b).all():
         return None
     return se3.inverse(se3.orthonormalise(T_old @ sim3.rigid(fit.S_a_b))), fit.scale
+
+
+def _rotated(sparse_map: SparseMap, row: int, slots: I32) -> U8:
+    """Directions (n,) of keypoints as the keyframe of a row would see them, which may be rolled against theirs."""
+    table, T = sparse_map.keypoints, sparse_map.keyframes.T_w_k
+    turn = np.einsum("ji,njk->nik", T[row, :3, :3], T[table.row[slots], :3, :3])
+    roll = np.arctan2(turn[:, 1, 0] - turn[:, 0, 1], turn[:, 0, 0] + turn[:, 1, 1])
+    angle = (table.angle[slots].astype(np.int64) + np.rint(roll * (128.0 / np.pi)).astype(np.int64)) & 255
+    return np.asarray(angle, np.uint8)
 
 
 def _seed(new: KeyframeId, old: KeyframeId) -> int:
@@ -275,7 +323,7 @@ def _expected_in_view(
         z = np.maximum(there[:, 2], 1e-3)
         u, v = fx * there[:, 0] / z + cx, fy * there[:, 1] / z + cy
         size = sparse_map.cameras[agent_of_keyframe(keyframe)]
-        inside |= (there[:, 2] > 0.1) & (u >= 0) & (v >= 0) & (u < size.width) & (v < size.height)
+        inside |= (there[:, 2] > _NEAREST_M) & (u >= 0) & (v >= 0) & (u < size.width) & (v < size.height)
     return int(np.count_nonzero(inside))
 
 
