@@ -101,7 +101,7 @@ class Agent:
         self._inertial_start = inertial_start
         self._submaps = SubmapStage(
             self._camera, self.map, self._tracker, maker, self._keyframes, self._relocaliser, self._depth,
-            self._two_view_start, inertial_start, self._governor, channel,
+            self._two_view_start, inertial_start, self._governor, channel, self._rectifier,
         )  # fmt: skip
         self._scans = None
         if self._has_depth and config.scan.on:

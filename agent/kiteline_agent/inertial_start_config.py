@@ -29,6 +29,10 @@ class InertialBundleConfig:
     accel_walk: float = 0.015  # m/s^2 per sqrt(s), beside the calibration's: errors of scale and axes, vibration
     gyro_bias_rad_s: float = 0.1  # deviation of an unknown gyro bias
     accel_bias_m_s2: float = 0.2  # the same of the accelerometer
+    lens_focal: float = 0.004  # relative deviation of the calibrated focal length
+    lens_centre_px: float = 1.0  # px; the same of the centre
+    lens_radial: float = 0.005  # of pixels over focal length where r is 1: half a pixel in between
+    camera_turn_rad: float = 0.003  # rad about an axis; the same of the camera's rotation in the body
     first_depth_m: float = 3.0  # at which all landmarks start; only the sign matters
     structure_iterations: int = 25  # steps of the first stage: none of it is known
     iterations: int = 20  # steps of the last stage

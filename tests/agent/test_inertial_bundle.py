@@ -15,6 +15,7 @@ from kiteline_agent.inertial_start_config import InertialBundleConfig
 from kiteline_agent.initialisation.corner_tracks import CornerObservations
 from kiteline_agent.initialisation.inertial_bundle import InertialBundle
 from kiteline_agent.initialisation.inertial_window import WarmStart, WindowSolution
+from kiteline_agent.initialisation.lens_correction import TERMS, moved
 from kiteline_agent.initialisation.window_noise import NoiseEvidence, WindowNoise
 from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry import se3
@@ -92,6 +93,37 @@ def test_deviations_of_the_scale_are_honest() -> None:
         assert found is not None
         ratios.append(np.log(scale_of(found, truth)) / found.scale_sigma)
     assert 0.05 < np.sqrt(np.mean(np.square(ratios))) < 1.5
+
+
+def test_errors_of_the_lens_are_found_and_do_not_bend_the_path() -> None:
+    """A lens that shows pixels up to 2 px off, and a camera that is turned by 3 mrad against the IMU."""
+    lens = np.array([0.004, 1.0 / FOCAL, -1.0 / FOCAL, -0.006, 0.005, -0.003, 0.002, 0.001])
+    shown = [0, 3, 4]  # a shift of the centre and a rotation resemble each other too much to be told apart
+    told_apart, calibrated, known = [], [], []
+    for seed in range(4):
+        corners, samples, truth = window(seed, keyframes=16, noise_px=0.2)
+        worn = replace(corners, xy=np.where(corners.seen[..., None], moved(corners.xy, lens), corners.xy))
+        config = replace(CONFIG, sigma_px=0.3)
+        fixed = np.eye(TERMS) * 1e12
+        for info, paths in ((None, known), (fixed, calibrated)):
+            found = InertialBundle(
+                worn, samples, CALIBRATION, T_B_C, FOCAL, 9.81, PRIOR, config, lens_info=info
+            ).solve()
+            assert found is not None
+            paths.append(_bend(found, truth))
+            if info is None:
+                off = (found.state.lens - lens)[shown]
+                told_apart.append(off / np.sqrt(np.diag(found.lens_cov))[shown])
+    assert np.sqrt(np.mean(np.square(told_apart))) < 1.6
+    assert np.mean(known) < 0.5 * np.mean(calibrated)
+
+
+def _bend(found: WindowSolution, truth: F64) -> float:
+    """By how much a path differs from the true one, rms, in shares of its size, whatever its scale."""
+    p, q = found.state.p - found.state.p.mean(axis=0), truth[:, :3, 3] - truth[:, :3, 3].mean(axis=0)
+    p, q = p / np.linalg.norm(p), q / np.linalg.norm(q)
+    u, _, vt = np.linalg.svd(q.T @ p)
+    return float(np.linalg.norm(q - p @ (u @ vt).T))
 
 
 def test_a_noisier_model_of_the_imu_knows_the_scale_less_well() -> None:

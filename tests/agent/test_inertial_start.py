@@ -62,7 +62,12 @@ def begins_after(monkeypatch: pytest.MonkeyPatch, poor: int) -> tuple[float, flo
 
     monkeypatch.setattr(InertialStart, "_points", points)
     monkeypatch.setattr(inertial_start, "realigned", lambda _keyframes, observations, *_: observations)
-    start = InertialStart(CAMERA, CALIBRATION, AgentConfig(), Work())
+    config = AgentConfig()
+    known = replace(
+        config.inertial_start.bundle, lens_focal=1e-5, lens_centre_px=1e-2, lens_radial=1e-5, camera_turn_rad=1e-5
+    )
+    config = replace(config, inertial_start=replace(config.inertial_start, bundle=known))  # the scale is known sooner
+    start = InertialStart(CAMERA, CALIBRATION, config, Work())
     start._tracks = Tracks(corners)  # type: ignore[assignment]
     monkeypatch.setattr(start, "_intervals", lambda keyframes, _offset: samples[: len(keyframes) - 1])
     monkeypatch.setattr(start, "_measured_noise", WindowNoise)

@@ -16,9 +16,11 @@ from numpy.typing import NDArray
 from kiteline_agent.inertial import initial_alignment
 from kiteline_agent.inertial.preintegration import BiasPrior, Samples
 from kiteline_agent.inertial_start_config import InertialBundleConfig
+from kiteline_agent.initialisation import lens_correction
 from kiteline_agent.initialisation.corner_tracks import CornerObservations
 from kiteline_agent.initialisation.inertial_terms import SHARED, STATE, InertialTerms
 from kiteline_agent.initialisation.inertial_window import WarmStart, WindowSolution, WindowState, tangent
+from kiteline_agent.initialisation.lens_correction import TERMS
 from kiteline_agent.initialisation.window_kernels import add_observations
 from kiteline_agent.initialisation.window_noise import WindowNoise
 from kiteline_core.frame import ImuCalibration
@@ -58,8 +60,12 @@ class InertialBundle:
         prior: BiasPrior,
         config: InertialBundleConfig,
         noise: WindowNoise | None = None,
+        lens_info: F64 | None = None,
     ) -> None:
-        """intervals: K - 1, between the keyframes. noise: factors on the inertial error model."""
+        """intervals: K - 1, between the keyframes. noise: factors on the inertial error model.
+
+        lens_info: (8,8) inverse covariance of the lens before this window; None: by the options.
+        """
         self._obs = observations
         self._terms = InertialTerms(intervals, calibration, gravity_m_s2, prior, config, noise or WindowNoise())
         self._r_bc, self._t_bc = T_b_c[:3, :3].copy(), T_b_c[:3, 3].copy()
@@ -67,6 +73,7 @@ class InertialBundle:
         self._length = gravity_m_s2
         self._prior = prior
         self._config = config
+        self._lens_info = lens_prior(config, focal_px) if lens_info is None else lens_info
         self._converged = False
         self._keyframes, self._landmarks = observations.seen.shape
         self._origin, self._axes = np.zeros((self._landmarks, 3)), np.zeros((self._landmarks, 3, 3))
@@ -81,7 +88,7 @@ class InertialBundle:
             if state is None:
                 return None
             self._terms.integrate(state)
-            every = np.arange(6, STATE * self._keyframes + SHARED)
+            every = np.arange(6, STATE * self._keyframes + SHARED + TERMS)
             state, system = self._consistent(state, every, self._config.iterations, inertial=True)
             return self._solution(state, system, every)
         except np.linalg.LinAlgError:
@@ -166,7 +173,8 @@ class InertialBundle:
         first = np.argmax(self._obs.seen, axis=0)
         camera = state.p + state.R @ self._t_bc
         self._axes, self._origin = (state.R @ self._r_bc)[first], camera[first]
-        return replace(state, m=self._obs.xy[first, np.arange(self._landmarks)].copy())
+        shown = self._obs.xy[first, np.arange(self._landmarks)]
+        return replace(state, m=lens_correction.true_place(shown, state.lens))
 
     def _consistent(
         self, state: WindowState, unknown: I64, iterations: int, *, inertial: bool
@@ -246,7 +254,7 @@ class InertialBundle:
         return WindowSolution(
             state, se3.from_rt(state.R[-1], state.p[-1]), state.v[-1],
             np.concatenate([state.gyro_bias, state.accel_bias[-1]]), state.gravity, cov[np.ix_(order, order)],
-            float(np.sqrt(variance)), system.cost, self._converged,
+            cov[-TERMS:, -TERMS:].copy(), float(np.sqrt(variance)), system.cost, self._converged,
             reprojection_px, self._terms.mean_chi2(state), self._terms.evidence(state, cov),
             scaled[:, 2] / state.rho, np.sqrt(np.maximum(system.inv[:, 2, 2], 0.0)) / state.rho,
         )  # fmt: skip
@@ -262,7 +270,7 @@ class InertialBundle:
         q = (y - state.rho[None, :, None] * self._t_bc) @ self._r_bc
         z = np.maximum(q[..., 2], 1e-3)
         xy = q[..., :2] / z[..., None]
-        error = (xy - self._obs.xy) / self._sigma
+        error = (lens_correction.moved(xy, state.lens) - self._obs.xy) / self._sigma
         found = y, z, xy, np.where(q[..., 2:] > 1e-2, error, 1e3)
         self._projected = state, found
         return found
@@ -279,28 +287,34 @@ class InertialBundle:
         return float(np.where(norm < k, 0.5 * norm**2, k * (norm - 0.5 * k)).sum()) + left_out, weight
 
     def _cost(self, state: WindowState, *, inertial: bool) -> float:
-        return self._visual_cost(self._project(state)[3])[0] + self._terms.cost(state, inertial=inertial)
+        lens = 0.5 * float(state.lens @ self._lens_info @ state.lens)
+        return self._visual_cost(self._project(state)[3])[0] + self._terms.cost(state, inertial=inertial) + lens
 
     # normal equations
 
     def _linearise(self, state: WindowState, *, inertial: bool) -> _System:
-        n, size = self._keyframes, STATE * self._keyframes + SHARED
+        n, size, lens = self._keyframes, STATE * self._keyframes + SHARED + TERMS, 6 * self._keyframes
         y, z, xy, error = self._project(state)
         cost, weight = self._visual_cost(error)
         h, b = np.zeros((size, size)), np.zeros(size)
         hpp, bp = np.zeros((self._landmarks, 3, 3)), np.zeros((self._landmarks, 3))
-        hpk, reduced, rest = np.zeros((self._landmarks, 3, 6 * n)), np.zeros((6 * n, 6 * n)), np.zeros(6 * n)
+        seen = lens + TERMS  # unknowns that the observations depend on
+        hpk, reduced, rest = np.zeros((self._landmarks, 3, seen)), np.zeros((seen, seen)), np.zeros(seen)
         add_observations(
             xy, error, weight, self._sigma, y, z, self._r_bc, state.R, state.p, self._t_bc, state.rho, self._origin,
             self._axes, hpp, bp, hpk, reduced, rest,
         )  # fmt: skip
+        reduced[:lens, lens:] = reduced[lens:, :lens].T
+        reduced[lens:, lens:] += self._lens_info
+        rest[lens:] += self._lens_info @ state.lens
+        cost += 0.5 * float(state.lens @ self._lens_info @ state.lens)
         # landmarks are eliminated (Schur complement)
         hpp[:, [0, 1, 2], [0, 1, 2]] += np.array([1e-6, 1e-6, 1e-4]) + 1e-12 * np.einsum("pii->p", hpp)[:, None]
         inv = np.asarray(np.linalg.inv(hpp), np.float64)
         iw = inv @ hpk
-        reduced -= hpk.reshape(-1, 6 * n).T @ iw.reshape(-1, 6 * n)
-        rest -= bp.ravel() @ iw.reshape(-1, 6 * n)
-        rows = (STATE * np.arange(n)[:, None] + np.arange(6)).ravel()
+        reduced -= hpk.reshape(-1, seen).T @ iw.reshape(-1, seen)
+        rest -= bp.ravel() @ iw.reshape(-1, seen)
+        rows = np.append((STATE * np.arange(n)[:, None] + np.arange(6)).ravel(), np.arange(size - TERMS, size))
         h[np.ix_(rows, rows)] += reduced
         b[rows] += rest
         cost += self._terms.add(state, h, b, inertial=inertial)
@@ -308,15 +322,25 @@ class InertialBundle:
 
     def _moved(self, state: WindowState, step: F64, system: _System) -> WindowState:
         n = self._keyframes
-        x = step[: STATE * n].reshape(n, STATE)
+        x, shared = step[: STATE * n].reshape(n, STATE), step[STATE * n : STATE * n + SHARED]
         R = np.array([r @ se3.so3_exp(phi) for r, phi in zip(state.R, x[:, :3], strict=True)])
         gravity = state.gravity
         if gravity.any():
-            gravity = gravity + self._length * tangent(gravity) @ step[STATE * n + 3 :]
+            gravity = gravity + self._length * tangent(gravity) @ shared[3:]
             gravity = self._length * gravity / np.linalg.norm(gravity)
-        landmark = -(system.inv @ system.bp[..., None])[..., 0] - system.iw @ x[:, :6].ravel()
+        lens = step[STATE * n + SHARED :]
+        landmark = -(system.inv @ system.bp[..., None])[..., 0] - system.iw @ np.append(x[:, :6].ravel(), lens)
         return WindowState(
             R, state.p + x[:, 3:6], state.v + x[:, 6:9], state.accel_bias + x[:, 9:],
-            state.gyro_bias + step[STATE * n : STATE * n + 3], gravity,
+            state.gyro_bias + shared[:3], gravity,
             state.m + landmark[:, :2], np.maximum(state.rho + landmark[:, 2], 1e-4),
+            state.lens + lens,
         )  # fmt: skip
+
+
+def lens_prior(config: InertialBundleConfig, focal_px: float) -> F64:
+    """(8,8) inverse covariance of the errors of a calibrated camera."""
+    centre = config.lens_centre_px / focal_px
+    radial, turn = config.lens_radial, config.camera_turn_rad
+    sigma = np.array([config.lens_focal, centre, centre, radial, radial, turn, turn, turn])
+    return np.diag(sigma**-2.0)

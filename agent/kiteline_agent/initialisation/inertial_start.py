@@ -12,8 +12,9 @@ from kiteline_agent.config import AgentConfig
 from kiteline_agent.governor.cost_model import Work
 from kiteline_agent.inertial.preintegration import BiasPrior, Samples
 from kiteline_agent.inertial.sample_buffer import SampleBuffer
+from kiteline_agent.initialisation import lens_correction
 from kiteline_agent.initialisation.corner_tracks import CornerObservations, CornerTracks, TrackedKeyframe
-from kiteline_agent.initialisation.inertial_bundle import InertialBundle
+from kiteline_agent.initialisation.inertial_bundle import InertialBundle, lens_prior
 from kiteline_agent.initialisation.inertial_window import WarmStart, WindowSolution
 from kiteline_agent.initialisation.landmark_realignment import realigned
 from kiteline_agent.initialisation.metric_restart import MetricPoints, metric_points_at
@@ -36,7 +37,8 @@ class InertialMap:
     """The first keyframe of a map in metres, which is this frame, and the state there.
 
     points: new landmarks. solution: its window. cov: (17,17) of the state, as in InertialState. scale_sigma: relative
-    deviation of the scale. duration_s: length of the window. accel_noise: factor on the accelerometer's noise.
+    deviation of the scale. duration_s: length of the window. accel_noise: factor on the accelerometer's noise. lens:
+    (8,) found of the camera (lens_correction), with which the landmarks' pixels are corrected.
     """
 
     points: MetricPoints
@@ -45,6 +47,7 @@ class InertialMap:
     scale_sigma: float
     duration_s: float
     accel_noise: float
+    lens: F64
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,6 +85,7 @@ class InertialStart:
         self._buffer = SampleBuffer(start.max_span_s + 1.0, config.inertial.max_gap_s)
         self._before: _Window | None = None
         self._noise: WindowNoise | None = None  # as the windows so far show it
+        self._lens_info = lens_prior(start.bundle, camera.fx)  # of what is left of the lens's errors
         self._tried_ns: int | None = None
         self._last_samples_ns: int | None = None  # stamp of the last frame with samples
 
@@ -168,7 +172,9 @@ class InertialStart:
             return None
         cov = config.state_inflation**2 * solution.cov
         duration_s = (stamps[-1] - stamps[0]) * 1e-9
-        return InertialMap(points, solution, cov, solution.scale_sigma, duration_s, noise.accel)
+        self._lens_info = np.asarray(np.linalg.inv(solution.lens_cov), np.float64)
+        lens = solution.state.lens
+        return InertialMap(points, solution, cov, solution.scale_sigma, duration_s, noise.accel, lens)
 
     def _solve(
         self, corners: CornerObservations, intervals: list[Samples], prior: BiasPrior, warm: WarmStart | None
@@ -236,14 +242,17 @@ class InertialStart:
         camera = self._camera
         uv = corners.xy[-1, seen] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
         octave = np.zeros(len(uv), np.uint8)
-        return metric_points_at(ctx, uv, octave, solution.depth_m[seen], solution.depth_sigma[seen], self._camera)
+        found = metric_points_at(ctx, uv, octave, solution.depth_m[seen], solution.depth_sigma[seen], self._camera)
+        focal, centre = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
+        true = lens_correction.true_place((found.points.uv - centre) / focal, solution.state.lens)
+        return replace(found, points=replace(found.points, uv=true * focal + centre))
 
     def _bundle(self, corners: CornerObservations, intervals: list[Samples], prior: BiasPrior) -> InertialBundle:
         self._work.window_keyframes += len(intervals) + 1
         return InertialBundle(
             corners, intervals, self._calibration, self._camera.T_b_c, self._camera.fx,
             self._config.inertial.gravity_m_s2, prior, self._config.inertial_start.bundle,
-            self._noise,
+            self._noise, self._lens_info,
         )  # fmt: skip
 
     def _default_prior(self) -> BiasPrior:

@@ -73,19 +73,20 @@ class InertialTerms:
 
     def add(self, state: WindowState, h: F64, b: F64, *, inertial: bool) -> float:
         """Add the normal equations of the errors; returns their cost."""
-        cost, shared = 0.0, STATE * len(state.R)
+        cost, begin = 0.0, STATE * len(state.R)
+        shared = slice(begin, begin + SHARED)
         errors, infos, tilt = self._errors(state), self._used_info(inertial=inertial), self._tilt(state)
         for k, e in enumerate(errors):
             j = self._jacobian(state, e, k, tilt)
             weighted = j.T @ infos[k]
             both, system = slice(STATE * k, STATE * (k + 2)), weighted @ j
             h[both, both] += system[:_PAIR, :_PAIR]
-            h[both, shared:] += system[:_PAIR, _PAIR:]
-            h[shared:, both] += system[_PAIR:, :_PAIR]
-            h[shared:, shared:] += system[_PAIR:, _PAIR:]
+            h[both, shared] += system[:_PAIR, _PAIR:]
+            h[shared, both] += system[_PAIR:, :_PAIR]
+            h[shared, shared] += system[_PAIR:, _PAIR:]
             change = weighted @ e
             b[both] += change[:_PAIR]
-            b[shared:] += change[_PAIR:]
+            b[shared] += change[_PAIR:]
             cost += 0.5 * float(e @ infos[k] @ e)
         return cost + self._add_priors(state, h, b)
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
+from kiteline_agent.initialisation.lens_correction import TERMS
 from kiteline_agent.initialisation.window_noise import NoiseEvidence
 
 F64 = NDArray[np.float64]
@@ -17,7 +18,7 @@ class WindowState:
     """Unknowns of the window, in the body frame of its first keyframe, w.
 
     R: (K,3,3) R_w_b. p: (K,3) m. v: (K,3) m/s. accel_bias: (K,3) m/s^2. gyro_bias: (3,) rad/s. gravity: (3,) m/s^2.
-    m: (P,2) and rho: (P,) 1/m: landmark at origin + axes @ (m, 1) / rho.
+    m: (P,2) and rho: (P,) 1/m: landmark at origin + axes @ (m, 1) / rho. lens: (8,) see lens_correction.
     """
 
     R: F64
@@ -28,6 +29,7 @@ class WindowState:
     gravity: F64
     m: F64
     rho: F64
+    lens: F64 = field(default_factory=lambda: np.zeros(TERMS))
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,9 +45,9 @@ class WindowSolution:
     """Result of a window.
 
     T_w_b: (4,4) of the newest keyframe; velocity: (3,) m/s; bias: (6,); gravity: (3,) m/s^2, in w. cov: (17,17) as in
-    InertialState, of that keyframe. scale_sigma: relative deviation of all lengths. reprojection_px: rms of inliers.
-    cost: half the squared errors of all. converged: the solver came to an end. imu_chi2: mean squared error of the
-    inertial factors in deviations. evidence: of the IMU's noise. depth_m: (P,) in the newest camera, and
+    InertialState, of that keyframe. lens_cov: (8,8). scale_sigma: relative deviation of all lengths. reprojection_px:
+    rms of inliers. cost: half the squared errors of all. converged: the solver came to an end. imu_chi2: mean squared
+    error of the inertial factors in deviations. evidence: of the IMU's noise. depth_m: (P,) in the newest camera, and
     depth_sigma: (P,) its relative deviation with known poses.
     """
 
@@ -55,6 +57,7 @@ class WindowSolution:
     bias: F64
     gravity: F64
     cov: F64
+    lens_cov: F64
     scale_sigma: float
     cost: float
     converged: bool

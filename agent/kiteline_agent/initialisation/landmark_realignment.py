@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from kiteline_agent.config import AlignConfig
 from kiteline_agent.imaging import alignment_kernels
 from kiteline_agent.imaging.alignment_kernels import TEMPLATE, TEMPLATE_LEVELS
+from kiteline_agent.initialisation import lens_correction
 from kiteline_agent.initialisation.corner_tracks import CornerObservations, TrackedKeyframe
 from kiteline_agent.initialisation.inertial_window import WindowState
 from kiteline_agent.tracking.frame_images import NO_GRID
@@ -39,14 +40,15 @@ def realigned(
     depth = np.einsum("pi,pi->p", xyz - centre[first], R[first, :, 2])
     corners = [xyz]
     for du, dv in ((1, 0), (-1, 0), (0, 1), (0, -1)):
-        ray = np.column_stack([xy0 + np.array([du, dv]) * _OFFSET_PX / f, np.ones(len(xyz))])
+        beside = lens_correction.true_place(xy0 + np.array([du, dv]) * _OFFSET_PX / f, state.lens)
+        ray = np.column_stack([beside, np.ones(len(xyz))])
         corners.append(centre[first] + np.einsum("pij,pj->pi", R[first], ray * depth[:, None]))
     xy, seen = observations.xy.copy(), np.zeros_like(observations.seen)
     octave = np.zeros(len(xyz), np.uint8)
     size = np.array([camera.width, camera.height]) - _MARGIN_PX
     for k, keyframe in enumerate(keyframes):
         local = [(x - centre[k]) @ R[k] for x in corners]
-        uv = [p[:, :2] / np.maximum(p[:, 2:], 1e-3) * f + c for p in local]
+        uv = [lens_correction.moved(p[:, :2] / np.maximum(p[:, 2:], 1e-3), state.lens) * f + c for p in local]
         warp = np.stack([uv[1] - uv[2], uv[3] - uv[4]], axis=2) / (2.0 * _OFFSET_PX)
         area = np.abs(np.linalg.det(warp))
         inside = (uv[0] > _MARGIN_PX).all(axis=1) & (uv[0] < size).all(axis=1) & (local[0][:, 2] > 0.1)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from kiteline_agent.governor.governor import Extra, Governor
 from kiteline_agent.inertial.imu_initialisation import InertialStartState
+from kiteline_agent.initialisation import lens_correction
 from kiteline_agent.initialisation.inertial_start import InertialStart
 from kiteline_agent.initialisation.metric_restart import MetricPoints, metric_points
 from kiteline_agent.initialisation.two_view_start import TwoViewStart
@@ -25,6 +26,7 @@ from kiteline_agent.tracking.tracker import Tracker
 from kiteline_codec.channel import RecordChannel
 from kiteline_codec.schema import SubmapScale, SubmapTie
 from kiteline_core.geometry import se3
+from kiteline_core.geometry.cameras import Rectifier
 from kiteline_core.ids import NO_KEYFRAME, KeyframeId, SubmapId
 
 F64 = NDArray[np.float64]
@@ -60,9 +62,10 @@ class SubmapStage:
     def __init__(
         self, camera: CameraState, local_map: LocalMap, tracker: Tracker, maker: KeyframeMaker,
         keyframes: KeyframeStage, relocaliser: Relocaliser, depth: DepthFromMotion, two_view_start: TwoViewStart | None,
-        inertial_start: InertialStart | None, governor: Governor, channel: RecordChannel,
+        inertial_start: InertialStart | None, governor: Governor, channel: RecordChannel, rectifier: Rectifier,
     ) -> None:  # fmt: skip
         self._camera = camera
+        self._rectifier = rectifier
         self._map = local_map
         self._tracker = tracker
         self._maker = maker
@@ -133,6 +136,7 @@ class SubmapStage:
         if found is None:
             return None
         solution = found.solution
+        ctx = self._corrected(ctx, found.lens)
         if camera.submaps.any:
             camera.leave_submap()
         else:
@@ -148,7 +152,15 @@ class SubmapStage:
         camera.motion.begin_metric_map(ctx.t_ns, state)
         start.clear()
         text = f"mono: metric within {100.0 * found.scale_sigma:.1f} %, from {found.duration_s:.1f} s of images and IMU"
-        return OpenedSubmap(True, ["submap: opened", text])
+        off_px = lens_correction.rms_px(found.lens, self._rectifier.camera)
+        return OpenedSubmap(True, ["submap: opened", text, f"camera: pixels corrected by {off_px:.2f} px rms"])
+
+    def _corrected(self, ctx: FrameContext, lens: F64) -> FrameContext:
+        """Read this frame and all later ones through the corrected lens (8,)."""
+        camera = self._rectifier.camera
+        focal, centre = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
+        self._rectifier.correct_left(lambda uv: lens_correction.moved((uv - centre) / focal, lens) * focal + centre)
+        return replace(ctx, images=ctx.images.rectified_by(self._rectifier))
 
     def _open_from_two_views(self, ctx: FrameContext, start: TwoViewStart) -> OpenedSubmap | None:
         """Begin a monocular submap: its first keyframe is an earlier frame, the second one this frame.

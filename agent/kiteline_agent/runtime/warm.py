@@ -127,7 +127,7 @@ def _warm_monocular(image: NDArray[np.uint8], draw: NDArray[np.float64]) -> None
     one, two, three, turn = np.ones((1, 1)), np.zeros((1, 1, 2)), np.zeros((1, 3)), np.eye(3)
     add_observations(
         two, two, one, 1.0, three[None], one, turn, turn[None], three, three[0], one[0], three, turn[None],
-        np.zeros((1, 3, 3)), np.zeros((1, 3)), np.zeros((1, 3, 6)), np.zeros((6, 6)), np.zeros(6),
+        np.zeros((1, 3, 3)), np.zeros((1, 3)), np.zeros((1, 3, 14)), np.zeros((14, 14)), np.zeros(14),
     )  # fmt: skip
     place = np.array([[160.0, 120.0]])
     templates = np.zeros((1, TEMPLATE_LEVELS, TEMPLATE, TEMPLATE), np.uint8)

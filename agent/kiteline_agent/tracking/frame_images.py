@@ -114,6 +114,12 @@ class FrameImages:
         """The whole level 0, and coarser levels rectified at half size, as the right image's: for templates."""
         return self.left if self.rectifier is None else (self.left[0], *self._halves(self.rectifier))
 
+    def rectified_by(self, rectifier: Rectifier) -> FrameImages:
+        """The same frame, read through a rectifier that has changed."""
+        grid = NO_GRID if rectifier.left_grid is None else rectifier.left_grid
+        used = None if rectifier.left_grid is None else rectifier
+        return FrameImages(self.sampled, self.right, self.depth_m, self.first, grid, used)
+
     def raw_half(self) -> U8:
         """Level 1 of the left image as it came."""
         return self.sampled[1]

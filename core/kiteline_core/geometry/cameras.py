@@ -114,7 +114,8 @@ class Rectifier:
 
     def __init__(self, rig: CameraRig) -> None:
         left = rig.left
-        self._size = (left.width, left.height)
+        self._size, self._left = (left.width, left.height), left
+        self._shown_left: Callable[[F64], F64] | None = None  # see correct_left
         self.readout_s = left.readout_s
         self._maps: list[tuple[NDArray[np.int16], NDArray[np.uint16]] | None] = [None, None]
         self.raw_sides: tuple[RawSide, ...] = ()  # left and right, of a pair that is remapped
@@ -170,6 +171,43 @@ class Rectifier:
     def remaps(self) -> bool:
         """True if images must be remapped."""
         return self._maps[0] is not None
+
+    def correct_left(self, shown: Callable[[F64], F64]) -> None:
+        """Read the left image of a single camera where it shows what the lens should show elsewhere.
+
+        shown: pixels (n,2) of the image that was rectified so far, for true ones (n,2). `camera` stays as it is.
+        """
+        width, height = self._size
+        columns, rows = ((side + GRID_STEP - 1) // GRID_STEP + 1 for side in self._size)
+        before = self._shown_left
+
+        def raw_of(x: F64, y: F64) -> NDArray[np.float32]:
+            at = shown(np.stack([x.ravel(), y.ravel()], axis=1))
+            at = at if before is None else before(at)
+            return self._raw_left(at).reshape(*x.shape, 2).astype(np.float32)
+
+        self._shown_left = shown if before is None else lambda uv: before(shown(uv))
+        grid = np.meshgrid(GRID_STEP * np.arange(columns, dtype=float), GRID_STEP * np.arange(rows, dtype=float))
+        self.left_grid = np.ascontiguousarray(raw_of(*grid))
+        full = raw_of(*np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float)))
+        fixed = cv2.convertMaps(full[..., 0], full[..., 1], cv2.CV_16SC2)
+        self._maps[0] = np.asarray(fixed[0], np.int16), np.asarray(fixed[1], np.uint16)
+        self._halves[0] = None
+
+    def _raw_left(self, uv: F64) -> F64:
+        """Raw pixels (n,2) of rectified ones of a single camera, by its calibration."""
+        camera, lens = self.camera, self._left
+        xy = (uv - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+        if lens.lens is Lens.NONE:
+            return np.asarray(xy * [lens.fx, lens.fy] + [lens.cx, lens.cy])
+        none, d = np.zeros(3), np.array(lens.distortion, np.float64)
+        if lens.lens is Lens.EQUIDISTANT:
+            found = cv2.fisheye.projectPoints(
+                np.append(xy, np.ones((len(xy), 1)), axis=1)[None], none, none, lens.matrix(), d
+            )[0]
+        else:
+            found = cv2.projectPoints(np.append(xy, np.ones((len(xy), 1)), axis=1), none, none, lens.matrix(), d)[0]
+        return np.asarray(found.reshape(-1, 2), np.float64)
 
     def set_right_rows(self, offset_px: Callable[[F64], F64]) -> None:
         """Read the right image lower than its calibration says, where points are read singly.
