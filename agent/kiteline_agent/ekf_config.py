@@ -12,7 +12,7 @@ class EkfConfig:
     landmarks: int = 300  # in the state at most: the cost of an update grows with their square
     views: int = 10  # past camera poses in the state, whose rays give new landmarks
     view_m: float = 0.15  # m between two of them: nearer ones add no parallax indoors
-    sigma_px: float = 2.0  # deviation of a tracked pixel: flow errs by less, but alike over frames
+    sigma_px: float = 1.0  # deviation of a tracked pixel: templates err by a tenth, but alike over frames
     gate: float = 10.6  # squared deviations of a pixel beyond which a match is wrong: 0.5 % of right ones
     seeds: int = 6  # matches with which a compatible set is begun before the largest set is taken
     agree: float = 0.6  # share of the matches in a set at which no other set is tried
@@ -38,6 +38,4 @@ class EkfConfig:
     corners: int = 120  # followed in the image at most
     replenish: float = 0.75  # share of them below which new ones are searched
     window_px: int = 21  # px of the flow's window
-    anchor_frames: int = 8  # frames between two comparisons of corners with an earlier frame
-    slide_px: float = 0.5  # px by which such a comparison may differ
-    backward_px: float = 0.5  # px by which flow back to the image before may miss
+    slide_px: float = 3.0  # px of its octave between the flow and a corner's template at most

@@ -1,4 +1,9 @@
-"""Corners followed from frame to frame by optical flow, with an id each."""
+"""Corners followed from frame to frame, with an id each.
+
+Optical flow finds where a corner went, but drifts: by half a pixel in a second, alike over frames, which a filter takes
+for motion. So each corner is aligned with the image in which it was found, warped by the rotation since and, once the
+filter knows it, by its distance.
+"""
 
 from __future__ import annotations
 
@@ -6,9 +11,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from kiteline_agent.config import AlignConfig
 from kiteline_agent.ekf_config import EkfConfig
-from kiteline_agent.imaging import features
+from kiteline_agent.imaging import alignment_kernels, features
+from kiteline_agent.imaging.alignment_kernels import TEMPLATE, TEMPLATE_LEVELS
 from kiteline_agent.imaging.features import DetectorConfig, Pyramid
+from kiteline_agent.tracking.frame_images import NO_GRID
+from kiteline_core.geometry.cameras import RectifiedCamera
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -21,61 +30,87 @@ _BORDER_PX = 8.0  # a window of the flow and its gradients lie inside
 class CornerFlow:
     """Follows corners; ids increase and are never used again."""
 
-    def __init__(self, detector: DetectorConfig, config: EkfConfig) -> None:
-        self._detector, self._config = detector, config
+    def __init__(
+        self, camera: RectifiedCamera, detector: DetectorConfig, align: AlignConfig, config: EkfConfig
+    ) -> None:
+        self._focal, self._centre = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
+        self._detector, self._align, self._config = detector, align, config
         self._last: Pyramid | None = None
-        self._anchor: Pyramid | None = None  # an earlier frame, to which corners are compared
-        self._anchor_ids: I64 = np.zeros(0, np.int64)
-        self._anchor_uv = np.zeros((0, 2))
-        self._frame = 0
         self._next_id = 0
         self.ids: I64 = np.zeros(0, np.int64)  # (n,) increasing
         self.uv = np.zeros((0, 2))  # (n,2) px of the newest frame
         self.octave: U8 = np.zeros(0, np.uint8)  # (n,) of the frame in which the corner was found
+        # Of that frame: pixels (n,2), camera (n,4,4) in o, and templates (n,3,21,21).
+        self._first_uv, self._first_T_o_c = np.zeros((0, 2)), np.zeros((0, 4, 4))
+        self._templates: U8 = np.zeros((0, TEMPLATE_LEVELS, TEMPLATE, TEMPLATE), np.uint8)
 
-    def add(self, left: Pyramid) -> None:
-        """Follow the corners into a frame, and find new ones where few are left."""
+    def follow(self, left: Pyramid) -> None:
+        """Follow the corners into a frame by optical flow."""
         if self._last is not None and len(self.ids):
-            uv, good = self._followed(self._last, left, self.uv)
-            self.ids, self.uv, self.octave = self.ids[good], uv[good], self.octave[good]
+            size = {"winSize": (self._config.window_px, self._config.window_px), "maxLevel": 3}
+            found, ok, _ = cv2.calcOpticalFlowPyrLK(self._last[0], left[0], self.uv.astype(np.float32), None, **size)  # type: ignore[call-overload]
+            limit = np.array([left[0].shape[1], left[0].shape[0]]) - _BORDER_PX
+            inside = (found >= _BORDER_PX).all(axis=1) & (found < limit).all(axis=1)
+            self.uv = found.astype(np.float64)
+            self._keep((ok.ravel() == 1) & inside)
         self._last = left
-        self._frame += 1
-        is_anchor = self._frame % self._config.anchor_frames == 1
-        if is_anchor:
-            self._drop_sliding(left)
-        if len(self.ids) < self._config.replenish * self._config.corners:
-            found = features.detect(left, self.uv, self._detector)
-            n = min(len(found.uv), self._config.corners - len(self.ids))
-            self.uv = np.concatenate([self.uv, found.uv[:n]])
-            self.octave = np.concatenate([self.octave, found.octave[:n]])
-            self.ids = np.concatenate([self.ids, self._next_id + np.arange(n)])
-            self._next_id += n
-        if is_anchor:
-            self._anchor, self._anchor_ids, self._anchor_uv = left, self.ids.copy(), self.uv.copy()
+
+    def align(self, left: Pyramid, T_o_c: F64, depth_m: F64) -> None:
+        """Align the corners with their templates, and drop those that look otherwise now.
+
+        T_o_c: (4,4) the camera now, as predicted. depth_m: (n,) distances along its axis; 0 where not known.
+        """
+        n = len(self.ids)
+        found, ncc, uv = np.zeros(n, np.bool_), np.zeros(n), self.uv.copy()
+        config = self._align
+        alignment_kernels.align(
+            left, NO_GRID, self._templates, np.arange(n), self.octave, self._warps(T_o_c, depth_m), uv, 0, 0,
+            config.iterations, self._config.slide_px, config.min_ncc, found, ncc,
+        )  # fmt: skip
+        self.uv = uv
+        self._keep(found)
+
+    def replenish(self, left: Pyramid, T_o_c: F64) -> None:
+        """Find new corners where few are left."""
+        if len(self.ids) >= self._config.replenish * self._config.corners:
+            return
+        found = features.detect(left, self.uv, self._detector)
+        n = min(len(found.uv), self._config.corners - len(self.ids))
+        templates = np.zeros((n, TEMPLATE_LEVELS, TEMPLATE, TEMPLATE), np.uint8)
+        alignment_kernels.cut_templates(left, found.uv[:n], found.octave[:n], templates)
+        self.ids = np.concatenate([self.ids, self._next_id + np.arange(n)])
+        self.uv = np.concatenate([self.uv, found.uv[:n]])
+        self.octave = np.concatenate([self.octave, found.octave[:n]])
+        self._first_uv = np.concatenate([self._first_uv, found.uv[:n]])
+        self._first_T_o_c = np.concatenate([self._first_T_o_c, np.tile(T_o_c, (n, 1, 1))])
+        self._templates = np.concatenate([self._templates, templates])
+        self._next_id += n
 
     def drop(self, ids: I64) -> None:
         """Forget corners."""
-        keep = ~np.isin(self.ids, ids)
+        self._keep(~np.isin(self.ids, ids))
+
+    def _keep(self, keep: Bools) -> None:
+        if keep.all():
+            return
         self.ids, self.uv, self.octave = self.ids[keep], self.uv[keep], self.octave[keep]
+        self._first_uv, self._first_T_o_c = self._first_uv[keep], self._first_T_o_c[keep]
+        self._templates = self._templates[keep]
 
-    def _drop_sliding(self, left: Pyramid) -> None:
-        """Drop corners that the anchor finds elsewhere: they slide along edges or before what lies behind them."""
-        if self._anchor is None:
-            return
-        _, at, now = np.intersect1d(self._anchor_ids, self.ids, assume_unique=True, return_indices=True)
-        if not len(at):
-            return
-        uv, good = self._followed(self._anchor, left, self._anchor_uv[at])
-        good &= np.linalg.norm(uv - self.uv[now], axis=1) < self._config.slide_px
-        self.drop(self.ids[now[~good]])
+    def _warps(self, T_o_c: F64, depth_m: F64) -> F64:
+        """Derivatives (n,2,2) of the pixels now by those in the first frames, on surfaces that faced the camera there.
 
-    def _followed(self, before: Pyramid, after: Pyramid, uv: F64) -> tuple[F64, Bools]:
-        """Pixels (n,2) of corners (n,2) in a later image, and which of them are found, forward and backward."""
-        size = {"winSize": (self._config.window_px, self._config.window_px), "maxLevel": 3}
-        start = uv.astype(np.float32)
-        found, ok, _ = cv2.calcOpticalFlowPyrLK(before[0], after[0], start, None, **size)  # type: ignore[call-overload]
-        back, ok_back, _ = cv2.calcOpticalFlowPyrLK(after[0], before[0], found, start.copy(), **size)  # type: ignore[call-overload]
-        limit = np.array([after[0].shape[1], after[0].shape[0]]) - _BORDER_PX
-        inside = (found >= _BORDER_PX).all(axis=1) & (found < limit).all(axis=1)
-        same = np.linalg.norm(back - start, axis=1) < self._config.backward_px
-        return found.astype(np.float64), (ok.ravel() == 1) & (ok_back.ravel() == 1) & inside & same
+        Where the distance is not known, by rotation alone.
+        """
+        R = np.einsum("ji,njk->nik", T_o_c[:3, :3], self._first_T_o_c[:, :3, :3])  # first camera to that of now
+        ray = np.column_stack([(self._first_uv - self._centre) / self._focal, np.ones(len(R))])
+        turned = np.einsum("nij,nj->ni", R, ray)  # the landmark now, if the camera only turned
+        known = depth_m > 0.0
+        now = np.column_stack([(self.uv - self._centre) / self._focal, np.ones(len(R))])
+        there = now * depth_m[:, None] + (T_o_c[:3, 3] - self._first_T_o_c[:, :3, 3]) @ T_o_c[:3, :3]
+        first_m = np.einsum("ni,ni->n", there, R[:, :, 2])  # distance in the first camera
+        known &= first_m > 0.0
+        ratio = np.where(known, first_m / np.where(known, depth_m, 1.0), 1.0 / np.maximum(turned[:, 2], 1e-3))
+        at = np.where(known[:, None], now[:, :2], turned[:, :2] / np.maximum(turned[:, 2:], 1e-3))
+        slopes = ratio[:, None, None] * (R[:, :2, :2] - at[:, :, None] * R[:, 2, None, :2])
+        return np.ascontiguousarray(slopes * self._focal[:, None] / self._focal[None, :])

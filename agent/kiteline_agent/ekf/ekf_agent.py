@@ -51,7 +51,7 @@ class EkfAgent:
         self._slam = EkfSlam(camera, config.ekf, T_o_b)
         self._T_c_b = se3.inverse(camera.T_b_c)
         self._R_l_o = np.eye(3)
-        self._flow = CornerFlow(config.detector, config.ekf)
+        self._flow = CornerFlow(camera, config.detector, config.align, config.ekf)
         self._motion = OdometerMotion(camera.T_b_c, config.ekf, config.odometer.keep_s, config.odometer.max_gap_s)
         self._governor = Governor(config.governor, inertial=True)  # odometry bridges skipped frames as an IMU does
         self._keyframes = SharedKeyframes(camera, config, identity, channel, self._governor, self.work)
@@ -99,13 +99,15 @@ class EkfAgent:
         self.work.pyramid_px = self.work.detected_px = left.size
         self._frame_number += 1
         pyramid = build_pyramid(left, self._config.detector.levels)
-        self._flow.add(pyramid)
         if self._last is not None:
             self._slam.predict(self._motion.between(self._last.t_ns, frame.t_ns))
-        found = self._slam.update(self._flow.ids, self._flow.uv)
+        self._flow.follow(pyramid)
+        self._flow.align(pyramid, self._slam.state.T_o_c, self._slam.depths(self._flow.ids))
+        found = self._slam.update(self._flow.ids, self._flow.uv, self._flow.octave)
         self.work.alignments = 3 * len(self._flow.ids)
         self.work.posed_points = len(found.compatible)
         self._flow.drop(found.rejected)  # flow has slid off them
+        self._flow.replenish(pyramid, self._slam.state.T_o_c)
         events = [f"{len(found.entered)} landmarks entered"] if len(found.entered) else []
         events += self._missing(frame.t_ns)
         inliers, flow, T_o_c = len(found.compatible), self._flow, self._slam.state.T_o_c

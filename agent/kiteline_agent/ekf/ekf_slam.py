@@ -55,18 +55,22 @@ class EkfSlam:
         self.state.propagate(motion)
         self._way += float(np.linalg.norm(motion.T_c0_c1[:3, 3]))
 
-    def update(self, ids: I64, uv: F64) -> FrameUpdate:
-        """Correct the state by the pixels (n,2) of tracks (n,), ids increasing; new landmarks enter."""
+    def update(self, ids: I64, uv: F64, octave: NDArray[np.uint8] | None = None) -> FrameUpdate:
+        """Correct the state by the pixels (n,2) of tracks (n,), ids increasing; new landmarks enter.
+
+        octave: (n,) level of the pyramid at which each was found: its error is that of a pixel there; None: the finest.
+        """
         self._frame += 1
+        coarse = np.ones(len(ids)) if octave is None else (1 << octave.astype(np.int64)).astype(np.float64)
         xy = (uv - self._centre) / self._focal
         slots = np.array([self.slot_of.get(i, -1) for i in ids.tolist()], np.int64)
-        good, bad = self._update_landmarks(slots, xy)
+        good, bad = self._update_landmarks(slots, xy, coarse)
         fresh = np.flatnonzero(slots < 0)
         entered: I64 = np.zeros(0, np.int64)
         is_view = self._is_view_due()
         if is_view:
             if int(good.sum()) < self._config.in_view:
-                entered = self._enter(ids[fresh], xy[fresh])
+                entered = self._enter(ids[fresh], xy[fresh], coarse[fresh])
             self._add_view(ids[fresh], xy[fresh])
         return FrameUpdate(ids[good], ids[bad], entered, is_view)
 
@@ -89,8 +93,11 @@ class EkfSlam:
 
     # steps
 
-    def _update_landmarks(self, slots: I64, xy: F64) -> tuple[Bools, Bools]:
-        """Update by the sightings of landmarks; masks (n,) of the compatible and of the rejected ones."""
+    def _update_landmarks(self, slots: I64, xy: F64, coarse: F64) -> tuple[Bools, Bools]:
+        """Update by the sightings of landmarks; masks (n,) of the compatible and of the rejected ones.
+
+        coarse: (n,) factors of their deviations. Divided by them, all sightings have the same.
+        """
         good, bad = np.zeros(len(slots), np.bool_), np.zeros(len(slots), np.bool_)
         at = np.flatnonzero(slots >= 0)
         if not len(at):
@@ -98,6 +105,7 @@ class EkfSlam:
         found, ahead = landmark_update.innovation(self.state, slots[at], xy[at])
         bad[at[~ahead]] = True
         at = at[ahead]
+        found = landmark_update.divided(found, coarse[at])
         if len(at):
             fits = landmark_update.compatible(self.state, found, self._sigma, self._config)
             good[at[fits]] = True
@@ -120,8 +128,8 @@ class EkfSlam:
         used = self.state.view_used
         return not used.any() or self._way - float(self._view_way[used].max()) >= self._config.view_m
 
-    def _enter(self, ids: I64, xy: F64) -> I64:
-        """Let tracks enter that are seen under enough parallax; returns their ids."""
+    def _enter(self, ids: I64, xy: F64, coarse: F64) -> I64:
+        """Let tracks enter that are seen under enough parallax; returns their ids. coarse: see `_update_landmarks`."""
         config, state = self._config, self.state
         known, rows = self._tracks.find(ids)
         enough = self._tracks.seen[rows].sum(axis=1) >= config.least_rays - 1
@@ -146,7 +154,7 @@ class EkfSlam:
         for k in order.tolist():
             views = np.flatnonzero(seen[k, :-1])
             at = np.append(views, config.views)
-            new = initialise(state, views, points[k, at], self._sigma, config)
+            new = initialise(state, views, points[k, at], self._sigma * float(coarse[known[k]]), config)
             slot = self._free_slot() if new is not None else None
             if new is None or slot is None:
                 continue

@@ -38,6 +38,11 @@ def innovation(state: FilterState, slots: I64, xy: F64) -> tuple[Innovation, Boo
     return Innovation(slots[ahead], xy[ahead] - predicted, M), ahead
 
 
+def divided(found: Innovation, factor: F64) -> Innovation:
+    """The same sightings in units (m,) of their own."""
+    return Innovation(found.slots, found.residual / factor[:, None], found.M / factor[:, None, None])
+
+
 def compatible(state: FilterState, found: Innovation, sigma: float, config: EkfConfig) -> Bools:
     """Mask (m,) of matches that are jointly compatible with the state.
 

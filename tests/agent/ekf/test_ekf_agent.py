@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
-from kiteline_agent.config import AgentConfig
+from kiteline_agent.config import AgentConfig, AlignConfig
 from kiteline_agent.ekf.corner_flow import CornerFlow
 from kiteline_agent.ekf.ekf_agent import EkfAgent
 from kiteline_agent.ekf.odometer_motion import OdometerMotion
 from kiteline_agent.ekf_config import EkfConfig
 from kiteline_agent.exchange.no_base import NoBaseChannel
-from kiteline_agent.imaging.features import build_pyramid
+from kiteline_agent.imaging.features import DetectorConfig, build_pyramid
 from kiteline_agent.onboard import onboard_agent
 from kiteline_agent.runtime.controller import pose_sample
 from kiteline_agent.runtime.options import agent_config
 from kiteline_agent.step import Estimate, Identity, StepInput
 from kiteline_core.frame import UNMEASURED, Frame, OdometryBatch
 from kiteline_core.geometry import se3
-from kiteline_core.geometry.cameras import CameraModel, CameraRig
+from kiteline_core.geometry.cameras import CameraModel, CameraRig, RectifiedCamera
 from kiteline_core.ids import AgentId
 
 _PERIOD_NS = 50_000_000
@@ -139,15 +141,44 @@ def test_tracker_is_chosen_by_option() -> None:
     assert agent_config("", tracker="ekf").tracker == "ekf"
 
 
-def test_corner_that_the_anchor_finds_elsewhere_is_dropped() -> None:
+def _flow() -> tuple[CornerFlow, NDArray[np.uint8]]:
+    """Corners of an image of squares."""
     rng = np.random.default_rng(0)
     image = np.kron(rng.integers(0, 256, (60, 80)), np.ones((4, 4))).astype(np.uint8)
-    config = EkfConfig(anchor_frames=4)
-    flow = CornerFlow(AgentConfig().detector, config)
-    for k in range(5):
-        if k == 4:
-            slid = int(flow.ids[3])
-            flow.uv[3] += [1.5, 0.0]
-        flow.add(build_pyramid(image, 3))
-    assert slid not in flow.ids.tolist()
+    image = cv2.GaussianBlur(image, (5, 5), 1.0)
+    camera = RectifiedCamera(320, 240, 200.0, 200.0, 159.5, 119.5, 0.1, False, np.eye(4))
+    flow = CornerFlow(camera, DetectorConfig(levels=1), AlignConfig(), EkfConfig())
+    flow.replenish(build_pyramid(image, 3), np.eye(4))
     assert len(flow.ids) > 20
+    return flow, image
+
+
+def test_corner_is_brought_back_to_its_template_or_dropped() -> None:
+    flow, image = _flow()
+    uv, ids = flow.uv.copy(), flow.ids.copy()
+    flow.uv[3] += [1.2, -0.8]  # as flow drifts
+    flow.uv[5] += [40.0, 0.0]
+    flow.align(build_pyramid(image, 3), np.eye(4), np.zeros(len(ids)))
+    assert int(ids[5]) not in flow.ids.tolist()
+    _, at, now = np.intersect1d(ids, flow.ids, return_indices=True)
+    assert 3 in at.tolist()
+    assert np.abs(flow.uv[now] - uv[at]).max() < 0.05
+
+
+def test_template_follows_rotation_and_distance() -> None:
+    flow, image = _flow()
+    turn = se3.so3_exp(np.array([0.0, 0.0, 0.5]))  # about the optical axis
+    zoom = 1.3  # a wall at 4 m is now at 4 m / 1.3
+    T_o_c = se3.from_rt(turn, np.array([0.0, 0.0, 4.0 - 4.0 / zoom]))
+    linear = zoom * turn[:2, :2].T
+    centre = np.array([159.5, 119.5])
+    seen = cv2.warpAffine(image, np.column_stack([linear, centre - linear @ centre]), (320, 240))
+    expected = (flow.uv - centre) @ linear.T + centre
+    inside = np.flatnonzero((np.abs(expected - centre) < [120.0, 80.0]).all(axis=1))
+    ids = flow.ids[inside]
+    flow.drop(np.setdiff1d(flow.ids, ids))
+    flow.uv = expected[inside] + 0.5
+    flow.align(build_pyramid(seen, 3), T_o_c, np.full(len(ids), 4.0 / zoom))
+    _, at, now = np.intersect1d(ids, flow.ids, return_indices=True)
+    assert len(now) > 0.8 * len(ids) > 5
+    assert np.median(np.linalg.norm(flow.uv[now] - expected[inside][at], axis=1)) < 0.1
