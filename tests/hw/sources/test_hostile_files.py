@@ -99,7 +99,7 @@ def test_a_bomb_in_a_chunk_is_cut_at_what_it_claims(tmp_path: Path, bomb: bytes,
     assert list(log.messages()) == []
     assert rss_mib() - before < 100
     assert log.notes
-    assert time.process_time() - begin_s < 0.5 * slowness()  # each zero was read as a record: 7 s
+    assert time.process_time() - begin_s < 2.0 * slowness()  # each zero was read as a record: 7 s
 
 
 def test_lengths_that_lie_are_refused(tmp_path: Path) -> None:
