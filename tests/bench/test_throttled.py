@@ -36,6 +36,8 @@ def test_errors_are_the_papers(tmp_path: Path) -> None:
     short, _ = paper_errors(tmp_path / "live.tum", Trajectory(t_ns, truth), until_m=0.55)
     assert short.max_abs_m == pytest.approx(0.0, abs=1e-5)
     assert paper_errors(tmp_path / "none.tum", Trajectory(t_ns, truth)) == (NO_ERRORS, None)
+    (tmp_path / "empty.tum").touch()
+    assert paper_errors(tmp_path / "empty.tum", Trajectory(t_ns, truth)) == (NO_ERRORS, None)
 
 
 def test_a_part_that_cannot_be_flown_is_a_bar_that_is_not_met(tmp_path: Path) -> None:

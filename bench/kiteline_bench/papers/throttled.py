@@ -15,6 +15,7 @@ from kiteline_core.frame import Trajectory
 from kiteline_hw.ports import SourceError
 from kiteline_lab.evaluation import metrics, trajectories
 from kiteline_lab.evaluation.metrics import Matched, TrajectoryAlignment
+from kiteline_lab.evaluation.trajectories import TrajectoryError
 
 F64 = NDArray[np.float64]
 
@@ -95,7 +96,7 @@ def paper_errors(file: Path, truth: Trajectory, until_m: float = 0.0) -> tuple[E
         return NO_ERRORS, None
     try:
         found = metrics.match(trajectories.read(str(file)).trajectory, truth, TrajectoryAlignment.ORIGIN)
-    except (SourceError, ValueError):
+    except (SourceError, TrajectoryError, ValueError):
         return NO_ERRORS, None
     n = len(found.t_ns)
     if until_m > 0.0:
