@@ -105,9 +105,7 @@ class LoopConfig:
     min_gap: int = 12  # keyframes of one submap between two that are matched
     loop_gap: int = 30  # keyframes; landmarks observed again after so many count as a loop
     max_shared: int = 15  # landmarks that a candidate may share with the keyframe already
-    min_likeness: float = (
-        0.002  # similarity of places, 0..1: of unrelated images 0.01, of one from 0.5 m beside no more
-    )
+    min_likeness: float = 0.002  # similarity of places, 0..1: unrelated images 0.01, one from 0.5 m beside no more
     min_neighbour_ratio: float = 0.03  # in one map, of the similarity to the previous keyframe: drift leaves near views
     match: MatchConfig = field(default_factory=MatchConfig)
     ransac: RansacConfig = field(default_factory=RansacConfig)

@@ -184,10 +184,10 @@ class LoopDetector:
         at = sparse_map.number_of(keyframe)
         near = same[max(0, at - config.min_gap) : at + config.min_gap + 1]
         before = [k for k in near if k < keyframe][-1:]
-        enough = {True: config.min_likeness, False: config.min_likeness}  # in the same map, and in others
+        enough_same_map = config.min_likeness
         if before and keyframe in self._index and before[0] in self._index:
             usual = float(self._index.similarity(keyframe, before)[0])
-            enough[True] = max(config.min_likeness, config.min_neighbour_ratio * usual)
+            enough_same_map = max(enough_same_map, config.min_neighbour_ratio * usual)
         places = self._index.query(
             observations.descriptor, known | set(near) | {keyframe}, _QUERIED * config.candidates
         )  # fmt: skip
@@ -200,7 +200,7 @@ class LoopDetector:
             same_map = sparse_map.map_id(submap_of_keyframe(old)) == map_id
             if (
                 key in taken
-                or score < enough[same_map]
+                or score < (enough_same_map if same_map else config.min_likeness)
                 or left[same_map] == 0
                 or not self._sharing.allows(agent_of_keyframe(keyframe), agent_of_keyframe(old))
                 or self.is_kept_apart(submap_of_keyframe(keyframe), submap_of_keyframe(old))
