@@ -160,6 +160,7 @@ def test_tiles_are_read_where_the_base_has_the_vehicle_while_the_live_pose_follo
     estimate = SimpleNamespace(keyframe=KeyframeId(int(local_map.keyframe[4])), T_k_c=np.eye(4))
     camera = MagicMock(T_m_b=held, reference=estimate)
     camera.submaps.active, camera.pose.T_o_m, camera.motion.metric = SUBMAP, np.eye(4), True
+    camera.motion.awaits_scale = False
     camera.covariance.of_poses.return_value, camera.covariance.quality.return_value = (np.eye(6), np.eye(6)), 50
     report = PoseReport(AgentId(0), camera, corrections, MagicMock(), has_depth=True)
     outcome = MagicMock(tracked=True, inliers=50, T_o_n=None)

@@ -45,7 +45,7 @@ def test_wheels_of_a_flight_controller_reach_the_agent(recording: Path, tmp_path
     with LogReader(tmp_path / "log.mcap") as log:
         batches = [message.odometry() for message in log.messages(["/odometer"])]
         frames = [message.t_ns for message in log.messages(["/left/image"])]
-        assert len(batches) > 10
+        assert sum(len(batch.t_ns) for batch in batches) > 10
         for batch in batches:
             assert batch.velocity[:, 0] == pytest.approx(SPEED_M_S, abs=0.05)
             assert batch.velocity[:, 1] == pytest.approx(0.0, abs=1e-6)

@@ -87,10 +87,10 @@ def stop(program: subprocess.Popen[str], how: signal.Signals = signal.SIGTERM) -
 @pytest.mark.usefixtures("forked")
 def test_flying_in_real_time(recording: Path, tmp_path: Path) -> None:
     slow = tmp_path / "slow.mcap"
-    stretched(recording, slow, 2)  # meanwhile the base's workers load their modules, on the same cores
+    stretched(recording, slow, 4)  # meanwhile the base's workers load their modules, on the same cores
     begin_s = time.monotonic()
     report, outcome = fly(Options((str(slow),), tmp_path, realtime=True), quiet=True)
-    assert time.monotonic() - begin_s > 2.9  # frames are paced by their stamps
+    assert time.monotonic() - begin_s > 5.8  # frames are paced by their stamps
     agent = report["agents"][0]
     assert agent["tracked"] + agent["dropped"] == 30
     assert agent["tracked"] >= 20

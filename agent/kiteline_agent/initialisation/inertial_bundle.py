@@ -89,6 +89,8 @@ class InertialBundle:
                 return None
             self._terms.integrate(state)
             every = np.arange(6, STATE * self._keyframes + SHARED + TERMS)
+            if warm is None:  # what moves is left out before the lens may bend to it
+                state, _ = self._consistent(state, every[:-TERMS], self._config.iterations, inertial=True)
             state, system = self._consistent(state, every, self._config.iterations, inertial=True)
             return self._solution(state, system, every)
         except np.linalg.LinAlgError:

@@ -29,7 +29,7 @@ from tests.hw.processes import free_port
 CLOCK, FLU = MonotonicClock(), mounting("flu")
 
 
-def push_while(sink: MavlinkPoseSink, condition: Callable[[], bool], timeout_s: float = 15.0) -> None:
+def push_while(sink: MavlinkPoseSink, condition: Callable[[], bool], timeout_s: float = 60.0) -> None:
     deadline_s = time.monotonic() + timeout_s
     while condition():
         assert time.monotonic() < deadline_s, "nothing happened in time"
