@@ -25,6 +25,8 @@ def main(folder: Path) -> None:
     """Track all images of a folder."""
     pairs = [[cv2.imread(str(folder / side / p.name), cv2.IMREAD_GRAYSCALE) for side in ("left", "right")]
              for p in sorted((folder / "left").glob("*.png"))]  # fmt: skip
+    if not pairs:
+        sys.exit(f"{folder / 'left'} holds no PNG images")
     height, width = pairs[0][0].shape
     camera = CameraModel(width, height, FOCAL_PX, FOCAL_PX, (width - 1) / 2, (height - 1) / 2)
     T_left_right = np.eye(4)
@@ -39,4 +41,6 @@ def main(folder: Path) -> None:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 2 or sys.argv[1].startswith("-"):
+        sys.exit(__doc__)
     main(Path(sys.argv[1]))
