@@ -30,7 +30,7 @@ from kiteline_agent.runtime.options import (
     is_filter,
 )
 from kiteline_agent.runtime.rig_file import RigFile
-from kiteline_agent.runtime.warm import WARMING, warm
+from kiteline_agent.runtime.warm import warm
 from kiteline_agent.step import Identity, StepInput, StepOutput
 from kiteline_codec import warm as codec_warm
 from kiteline_codec.channel import CodedChannel, RecordChannel, settled
@@ -48,7 +48,6 @@ from kiteline_hw.logs.whole_file import LineFile
 from kiteline_hw.ports import FrameSource, SourceError, is_live
 from kiteline_hw.sim.links.link_model import LinkModel, LinkModelConfig
 from kiteline_hw.sources.open import open_source
-from kiteline_hw.system import kernel_cache
 from kiteline_hw.system.memory import release_memory, rss_mib
 from kiteline_hw.system.notices import Notices
 from kiteline_hw.system.vocabulary import shipped_vocabulary
@@ -80,8 +79,6 @@ class AgentRuntime:
         grid = "agent" if options.grid == "base" and isinstance(channel, NoBaseChannel) else options.grid
         config = config or agent_config(options.config, options.cpu_percent, options.rig, grid, options.tracker)
         self._rig_file = RigFile(options.rig) if options.rig else None
-        if whole_process:
-            kernel_cache.fill(WARMING)
         begin_ns = time.process_time_ns()
         codec_warm.warm()
         warm(config)

@@ -61,7 +61,7 @@ def fly_live(
         source = with_controller_imu(options, source)
         if not kernel_cache.filled():
             with starting():
-                kernel_cache.fill(WARMING, stop)
+                kernel_cache.fill(WARMING, stop, parent)
         if stop:
             return
         key = _key_of(options)

@@ -6,17 +6,17 @@ import os
 import signal
 
 from kiteline_agent.runtime.agent_runtime import PROGRESS_FRAMES, AgentRuntime, channel_with_spill, opened
-from kiteline_agent.runtime.options import (
-    AgentOptions,
-)
+from kiteline_agent.runtime.options import AgentOptions
+from kiteline_agent.runtime.warm import WARMING
 from kiteline_hw.lockstep.agent_end import AgentBarrier
 from kiteline_hw.lockstep.messages import Down, Phase
-from kiteline_hw.system import process
+from kiteline_hw.system import kernel_cache, process
 
 
 def fly_lockstep(options: AgentOptions, parent: process.Parent) -> None:
     """Fly in lock-step with the base; if the base ends, fly on alone."""
     source = opened(options)
+    kernel_cache.fill(WARMING, parent=parent)
     runtime = AgentRuntime(options, source, channel_with_spill(options), whole_process=True)
     parent.send_event("ready", frames=source.frame_count)
     line = AgentBarrier(options.link.removeprefix("lockstep:"), options.agent, parent)

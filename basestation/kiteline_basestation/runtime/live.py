@@ -47,7 +47,7 @@ def fly_live(options: BaseOptions, parent: process.Parent | None, stop: process.
         importlib.import_module("kiteline_basestation.web.status_page")  # what it needs and lacks is told at once
     if not kernel_cache.filled():
         with starting():
-            kernel_cache.fill(WARMING, stop)
+            kernel_cache.fill(WARMING, stop, parent)
     if stop:
         return True
     clock, closed = MonotonicClock(), list[bool]()

@@ -23,7 +23,7 @@ _COLLECT_S = 120.0  # s that an agent may take for one tick before it counts as 
 def fly_lockstep(options: BaseOptions, parent: process.Parent) -> None:
     """Serve the barrier until the flight ends. An agent whose process ends is left out."""
     return_large_arrays()
-    kernel_cache.fill(WARMING)
+    kernel_cache.fill(WARMING, parent=parent)
     base = BaseRuntime(options, coded_channels(options, link_traits(options.link)))
     report_restored(base.restore_maps(0), parent)
     server = LockstepServer(options.link.removeprefix("lockstep:"))

@@ -5,9 +5,9 @@ from __future__ import annotations
 from kiteline_hw.lockstep.messages import Down, Up
 from kiteline_hw.lockstep.zenoh_lockstep import LockstepClient
 from kiteline_hw.ports import LinkError
+from kiteline_hw.system.kernel_cache import COMPILE_S
 from kiteline_hw.system.process import Parent
 
-_BASE_START_S = 300.0  # s that a base may take to start: a slow computer compiles its kernels the first time
 _ANSWER_S = 120.0  # s that the base may take for one tick before it counts as lost
 
 
@@ -42,7 +42,8 @@ class AgentBarrier:
         self._client = self._connected()
 
     def _connected(self) -> LockstepClient:
-        return LockstepClient(self._endpoint, self._agent, connect_timeout_s=_BASE_START_S)
+        """Wait for a base as long as it may compile its kernels."""
+        return LockstepClient(self._endpoint, self._agent, connect_timeout_s=COMPILE_S)
 
     def close(self) -> None:
         """Disconnect."""

@@ -19,22 +19,27 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from kiteline_hw.system.process import StopSignal, print_lines
+from kiteline_hw.system.process import Parent, StopSignal, print_lines
 
+COMPILING = "compiling kernels, once for this version: about a minute, several on a small board"
+COMPILE_S = 900.0  # s that a slow board may take to compile all
 _KERNELS = "_kernels"  # suffix of kernel modules
 _RECORD = "kiteline-compiled"  # file that lists compiled modules, beside their kernels
 _POLL_S = 0.1  # s between two looks at the compiler
 _ROOM_BYTES = 32 << 20  # bytes that must be free: all kernels take 15 MB
-_TIMEOUT_S = 900.0  # s that a slow board may take to compile all
+_TELL_S = 10.0  # s between two words to the parent, which takes a long silence for a hang
 
 
-def fill(modules: Sequence[str], stop: StopSignal | None = None) -> bool:
+def fill(modules: Sequence[str], stop: StopSignal | None = None, parent: Parent | None = None) -> bool:
     """Run `kernel_compilation` on modules unless all loaded kernels are compiled; True if they are now.
 
-    If nothing can be written, that is said, and the caller compiles in its own process. stop: ends the compilation.
+    That it takes long is told to the parent, or on stderr without one. If nothing can be written, that is said, and
+    the caller compiles in its own process. stop: ends the compilation.
     """
     if filled():
         return True
+    if parent is None:
+        _say(COMPILING)
     if why := _no_room():
         _say(f"compiled kernels cannot be kept ({why}): they are compiled anew, for a minute; see `kiteline doctor`")
         return False
@@ -45,24 +50,24 @@ def fill(modules: Sequence[str], stop: StopSignal | None = None) -> bool:
         )  # fmt: skip
         with compiler:
             try:
-                if _ended(compiler, stop) and compiler.returncode == 0:
+                if _ended(compiler, stop, parent) and compiler.returncode == 0:
                     mark()
             finally:
                 compiler.kill()
     return filled()
 
 
-def _ended(compiler: subprocess.Popen[bytes], stop: StopSignal | None) -> bool:
+def _ended(compiler: subprocess.Popen[bytes], stop: StopSignal | None, parent: Parent | None) -> bool:
     """Wait for the compiler to end; False if a signal came first. Raises TimeoutExpired."""
-    if stop is None:
-        compiler.wait(_TIMEOUT_S)
-        return True
-    for _ in range(round(_TIMEOUT_S / _POLL_S)):
-        if compiler.poll() is not None:
+    for polls in range(round(COMPILE_S / _POLL_S)):
+        if parent is not None and polls % round(_TELL_S / _POLL_S) == 0:
+            parent.send_event("compiling")
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            compiler.wait(_POLL_S)
             return True
-        if stop.wait(_POLL_S):
+        if stop:
             return False
-    raise subprocess.TimeoutExpired(compiler.args, _TIMEOUT_S)
+    raise subprocess.TimeoutExpired(compiler.args, COMPILE_S)
 
 
 def filled() -> bool:

@@ -16,6 +16,7 @@ from kiteline_hw.links.kinds import link_traits
 from kiteline_hw.lockstep.messages import Down, Phase
 from kiteline_hw.lockstep.shared_core import SharedCore
 from kiteline_hw.logs.spill_file import SpillFile
+from kiteline_hw.system import kernel_cache, process
 from kiteline_lab.flights.outcome import FlightOutcome, poses_from_json
 from kiteline_lab.flights.plan import FlightPlan
 from kiteline_lab.flights.progress import Progress
@@ -43,11 +44,13 @@ def fly_in_process(plan: FlightPlan, mode: str) -> FlightOutcome:
             ours[spec.agent] = NoBaseChannel()
     percent = plan.agents[0].cpu_percent
     core = SharedCore(percent) if percent > 0.0 and plan.base is not None else None
+    if not plan.quiet and not kernel_cache.filled():
+        process.print_lines([kernel_cache.COMPILING])
     with contextlib.ExitStack() as stack:
         agents = {}
         for spec, source in zip(plan.agents, plan.sources, strict=True):
-            process = None if core is None else core.process()
-            agents[spec.agent] = AgentRuntime(spec, source, ours[spec.agent], whole_process=False, core=process)
+            of_core = None if core is None else core.process()
+            agents[spec.agent] = AgentRuntime(spec, source, ours[spec.agent], whole_process=False, core=of_core)
             stack.callback(agents[spec.agent].close)
         progress = stack.enter_context(Progress("flying", plan.frames, "frames")) if not plan.quiet else None
         outcome = FlightOutcome([None] * len(plan.agents))

@@ -12,7 +12,7 @@ from kiteline_agent.runtime.options import AgentOptions
 from kiteline_basestation.runtime.options import BaseOptions
 from kiteline_hw.links.kinds import is_link, link_forms
 from kiteline_hw.ports import LinkError
-from kiteline_hw.system import process
+from kiteline_hw.system import kernel_cache, process
 from kiteline_lab.flights.children import ChildProcesses, Event, ended_by
 from kiteline_lab.flights.outcome import FlightOutcome, poses_from_json
 from kiteline_lab.flights.plan import FlightPlan
@@ -84,6 +84,7 @@ class _Supervisor:
         self._kill_wanted = False  # the base that flies now is to be killed
         self._flying = {f"agent{spec.agent}" for spec in agents}
         self._base_up = True
+        self._compiles = False  # a child compiles kernels, and the user knows
         self._live = not base.link.startswith("lockstep:")
         self._over: set[str] = set()  # live agents that have flown their last frame
         self._errors: dict[str, str] = {}
@@ -111,6 +112,8 @@ class _Supervisor:
         match event.kind:
             case "ready" if agent is None and self._live:
                 self._start_agents()
+            case "compiling":
+                self._tell_of_compilation()
             case "progress" if agent is not None:
                 self._show(agent, event.values["frames"])
             case "result" if agent is not None:
@@ -143,6 +146,12 @@ class _Supervisor:
         self._frames[agent] = frames
         if self._progress is not None:
             self._progress.update(sum(self._frames))
+
+    def _tell_of_compilation(self) -> None:
+        """Say once for all children why nothing flies yet."""
+        if self._progress is not None and not self._compiles:
+            process.print_lines([kernel_cache.COMPILING])
+        self._compiles = True
 
     def _ended(self, event: Event, agent: int | None) -> None:
         code = event.values["code"]

@@ -11,6 +11,7 @@ import numba
 import pytest
 
 from kiteline_core.kernel_compiler import TRIED
+from kiteline_hw.system import kernel_cache
 
 KERNELS = """
 from numba import njit
@@ -23,28 +24,45 @@ WARM = "import tiny_kernels\n\ndef warm():\n    tiny_kernels.twice(1)\n"
 FLIGHT = """
 import sys, tiny_kernels
 from kiteline_hw.system import kernel_cache
-print(kernel_cache.filled(), kernel_cache.fill(sys.argv[1:]))
+
+class Parent:
+    def send_event(self, event):
+        print(event)
+
+parent = Parent() if sys.argv[2] == "child" else None
+print(kernel_cache.filled(), kernel_cache.fill(sys.argv[1:2], parent=parent))
 tiny_kernels.twice(1)
 print(sum(tiny_kernels.twice.stats.cache_misses.values()))
 """
 
 
-def fly(folder: Path, module: str) -> list[str]:
+def fly(folder: Path, module: str, kind: str = "alone") -> tuple[list[str], str]:
     paths = [str(folder), *sys.path]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths), "NUMBA_CACHE_DIR": str(folder / "cache")}
     done = subprocess.run(
-        [sys.executable, "-c", FLIGHT, module], env=environment, capture_output=True, text=True, check=True
+        [sys.executable, "-c", FLIGHT, module, kind],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=True,
     )
-    return done.stdout.split()
+    return done.stdout.split(), done.stderr
 
 
 def test_a_child_process_compiles_each_source_once(tmp_path: Path) -> None:
     (tmp_path / "tiny_kernels.py").write_text(KERNELS)
     (tmp_path / "tiny_warm.py").write_text(WARM)
-    assert fly(tmp_path, "tiny_warm") == ["False", "True", "0"]
-    assert fly(tmp_path, "no_such_module") == ["True", "True", "0"]
+    said = kernel_cache.COMPILING + "\n"
+    assert fly(tmp_path, "tiny_warm") == (["False", "True", "0"], said)
+    assert fly(tmp_path, "no_such_module") == (["True", "True", "0"], "")
     (tmp_path / "tiny_kernels.py").write_text(KERNELS + "\nOTHER = 1\n")
-    assert fly(tmp_path, "no_such_module") == ["False", "False", "1"]
+    assert fly(tmp_path, "no_such_module") == (["False", "False", "1"], said)
+
+
+def test_a_parent_is_told_of_the_compilation(tmp_path: Path) -> None:
+    (tmp_path / "tiny_kernels.py").write_text(KERNELS)
+    (tmp_path / "tiny_warm.py").write_text(WARM)
+    assert fly(tmp_path, "tiny_warm", "child") == (["compiling", "False", "True", "0"], "")
 
 
 FULL = """
