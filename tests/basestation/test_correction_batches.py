@@ -40,8 +40,10 @@ class Link(PlainChannel):
         super().__init__()
         self.missing: set[Key] = set()
         self.rate: int | None = None
+        self.asked = 0
 
     def arrived(self, key: Key) -> bool:
+        self.asked += 1
         return key not in self.missing
 
     def rate_bytes_s(self) -> int | None:
@@ -68,6 +70,21 @@ def test_the_next_batch_waits_until_the_last_value_of_this_one_has_arrived() -> 
     link.missing.clear()
     assert batches.room_bytes(link, SECOND_NS) is None
     assert numbers(batches.numbered([pose(2)], SECOND_NS)) == [2, 2]
+
+
+@pytest.mark.parametrize("late", [0, 250, 499])
+def test_a_step_looks_for_one_missing_value_of_a_batch_not_for_all(late: int) -> None:
+    """Of a large map, a batch holds hundreds of values, and steps are many while it is on its way."""
+    link, batches = Link(), CorrectionBatches(AGENT, PublishConfig())
+    records = batches.numbered([pose(k) for k in range(500)], 0)
+    link.missing = {messages.key(records[late])}
+    for _ in range(100):
+        assert batches.room_bytes(link, SECOND_NS) == 0
+    assert link.asked < 1000
+    link.missing = {messages.key(records[7])}
+    assert batches.room_bytes(link, SECOND_NS) == 0
+    link.missing.clear()
+    assert batches.room_bytes(link, SECOND_NS) is None
 
 
 def test_what_moves_nothing_has_no_number() -> None:

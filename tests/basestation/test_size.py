@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import time
+import tracemalloc
 from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import replace
@@ -28,6 +29,7 @@ from kiteline_basestation.merging.correction import full_bundle_window, keyframe
 from kiteline_basestation.merging.correction_jobs import FullBundle
 from kiteline_basestation.merging.loop_detector import LoopDetector
 from kiteline_basestation.refinement.bundle_window import bundle_window, local_keyframes
+from kiteline_basestation.refinement.culling import cull_weak_landmarks
 from kiteline_basestation.refinement.local_bundles import LocalBundles
 from kiteline_basestation.station import Station
 from kiteline_basestation.store.integrity import contradictions
@@ -65,6 +67,19 @@ def test_freed_runs_are_given_again_and_none_twice(lengths: list[int], draw: Any
             runs.free([(used.pop(b), b) for b in gone])
     runs.free([(n, b) for b, n in used.items()])
     assert runs.take(top) == 0 and runs.take() is None  # all of it is one run again
+
+
+def test_culling_takes_no_memory_in_proportion_to_the_map(
+    mapped: tuple[Any, Mapper], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flight, mapper = mapped
+    monkeypatch.setattr(mapper.map, "slots", 100_000_000)  # as of a map of 300,000 keyframes
+    tracemalloc.start()
+    try:
+        cull_weak_landmarks(mapper.map, flight.keyframes[25], mapper.config.cull, Publisher(mapper.map))
+        assert tracemalloc.get_traced_memory()[1] < 10_000_000
+    finally:
+        tracemalloc.stop()
 
 
 def test_pairs_of_keyframes_are_those_that_covisibility_tells(mapped: tuple[Any, Mapper]) -> None:

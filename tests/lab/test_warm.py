@@ -8,8 +8,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
-
 import kiteline_agent.runtime.warm as agent_warm
 import kiteline_basestation.runtime.warm as base_warm
 from kiteline_agent.config import AgentConfig
@@ -57,12 +55,10 @@ def test_flights_of_two_eyes_and_of_one_compile_nothing(recording: Path, tmp_pat
     assert named == set(lines), "write the lists anew: make kernels"
 
 
-def test_kernels_run_once_in_a_process_for_each_configuration(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_kernels_run_once_in_a_process_for_each_configuration() -> None:
     """A second flight in one process took half a second of CPU for them."""
-    for module, config in ((agent_warm, AgentConfig(tracker="ekf")), (base_warm, BaseConfig())):
-        run: list[object] = []
-        monkeypatch.setattr(module, "_warmed", set())
-        monkeypatch.setattr(module, "_run_all", lambda *given, run=run: run.append(given[0]))
-        for given in (None, config, config, None):
-            module.warm(given)
-        assert run == [None, config]
+    for warm, config in ((agent_warm.warm, AgentConfig(tracker="ekf")), (base_warm.warm, BaseConfig())):
+        warm(config)
+        before = warm.cache_info()
+        warm(config)
+        assert warm.cache_info() == before._replace(hits=before.hits + 1)

@@ -77,22 +77,23 @@ class RowAlignment:
     def add(
         self, left: tuple[NDArray[np.uint8], ...], right: tuple[NDArray[np.uint8], ...], uv: F64,
         octave: NDArray[np.uint8], disparity: F64,
-    ) -> bool:  # fmt: skip
-        """Measure rows at points (n,) of a keyframe. Returns whether it told something.
+    ) -> int:  # fmt: skip
+        """Measure rows at points (n,) of a keyframe. Returns at how many they are known; 0 if at too few to be used.
 
         left: rectified pyramid; right: raw. disparity: as measured.
         """
         config, grid = self._config, self._rectifier.right_grid
         if not config.on:
-            return False
+            return 0
         offset, found = np.zeros(len(uv)), np.zeros(len(uv), np.bool_)
         row_kernels.measure_rows(
             left, right, np.zeros((0, 0, 2), np.float32) if grid is None else grid, uv, octave, disparity,
             config.iterations, config.max_px, config.min_ncc, offset, found,
         )  # fmt: skip
-        if np.count_nonzero(found) < config.min_points:
-            return False
-        at = terms(self._normalised(uv[found] - np.stack([disparity[found], np.zeros(np.count_nonzero(found))], 1)))
+        count = int(np.count_nonzero(found))
+        if count < config.min_points:
+            return 0
+        at = terms(self._normalised(uv[found] - np.stack([disparity[found], np.zeros(count)], 1)))
         total = offset[found] + at @ self.applied_px
         sigma = config.sigma_px * (1 << octave[found]).astype(np.float64)
         weight: F64 = np.ones(len(total), np.float64)
@@ -104,7 +105,7 @@ class RowAlignment:
         self._information, self._vector, self._at = information, vector, at
         self._measured = self.known = True
         self._weigh()
-        return True
+        return count
 
     def apply(self) -> float:
         """Read the right image at its rows if the last points are significantly off. Returns their rms px, or 0."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -35,20 +37,12 @@ from kiteline_core.pose.pnp import solve_pnp
 WARMING = ("kiteline_codec.warm", "kiteline_agent.runtime.warm")  # modules whose `warm` runs all kernels of an agent
 
 
-_warmed: set[AgentConfig | None] = set()  # by this process
-
-
+@cache
 def warm(config: AgentConfig | None = None) -> None:
     """Run every kernel once, on the types that flights use; once in a process for each configuration.
 
     A filled cache makes this take a fraction of a second.
     """
-    if config not in _warmed:
-        _run_all(config)
-        _warmed.add(config)
-
-
-def _run_all(config: AgentConfig | None) -> None:
     if config is not None and config.tracker == "ekf":
         warm_filter()
         return

@@ -34,12 +34,13 @@ class CorrectionBatches:
         self._config = config
         self._number = 0
         self._members: dict[Key, None] = {}  # of the newest batch
+        self._missing: Key | None = None  # one that had not arrived at the last look: while it has not, no others count
         self._made_ns = 0
         self._overdue = False  # the newest batch does not arrive: later values join it, and wait for no other ones
 
     def room_bytes(self, channel: RecordChannel, now_ns: int) -> int | None:
         """Bytes of corrections that may be shared now: 0 while a batch is on its way, None without a limit."""
-        arrived = channel.arrived(self._key) and all(channel.arrived(key) for key in self._members)
+        arrived = channel.arrived(self._key) and self._all_arrived(channel)
         self._overdue = not arrived and now_ns - self._made_ns >= self._config.batch_wait_s * 1e9
         if self._overdue:
             return None  # the agent is out of reach: the values go to the store, and to the agent when it returns
@@ -47,6 +48,14 @@ class CorrectionBatches:
             return 0
         rate = channel.rate_bytes_s()
         return None if rate is None else round(rate * self._config.batch_s)
+
+    def _all_arrived(self, channel: RecordChannel) -> bool:
+        """True if all members have arrived. A batch holds hundreds, and this is asked in every step."""
+        missing = self._missing
+        if missing is not None and missing in self._members and not channel.arrived(missing):
+            return False
+        self._missing = next((key for key in reversed(self._members) if not channel.arrived(key)), None)
+        return self._missing is None
 
     def numbered(self, records: Sequence[Record], now_ns: int) -> list[Record]:
         """Records with the number of their batch, and the record of the batch; as they are if none moves the map."""

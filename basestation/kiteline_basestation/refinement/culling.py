@@ -27,12 +27,13 @@ def cull_weak_landmarks(sparse_map: SparseMap, keyframe: KeyframeId, config: Cul
     slots = sparse_map.slots_of(anchor)
     own = (table.kind[slots] == LANDMARK) & (table.root[slots] == slots) & (table.flags[slots] & CULLED == 0)
     landmarks = slots[own]
-    visible = np.zeros(sparse_map.slots, np.int32)
+    visible, first = np.zeros(len(slots), np.int32), int(sparse_map.keyframes.start[sparse_map.rows[anchor]])
     for later in same[number - config.landmark_age + 1 : number + 1]:
         if sparse_map.pose(later) is not None:
-            visible[predict_projections(sparse_map, landmarks, later)[0]] += 1
+            visible[predict_projections(sparse_map, landmarks, later)[0] - first] += 1
+    visible = visible[own]
     found = np.diff(sparse_map.observations(landmarks)[0]) - 1
-    weak = (visible[landmarks] >= config.min_visible) & (found < config.min_found * visible[landmarks])
+    weak = (visible >= config.min_visible) & (found < config.min_found * visible)
     cull_landmarks(sparse_map, landmarks[weak], publisher)
     return int(np.count_nonzero(weak))
 

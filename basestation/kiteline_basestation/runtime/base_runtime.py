@@ -78,7 +78,7 @@ class BaseRuntime:
         self.config = base_config(options.config)
         codec_warm.warm()
         vocabulary = load_vocabulary()
-        warm(self.config, vocabulary)
+        warm(self.config)
         if jobs is None and vocabulary is not None:
             warm_graphs()
         self.station = Station(self.config, open_channel, vocabulary)

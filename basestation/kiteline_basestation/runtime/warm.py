@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 
@@ -27,23 +28,14 @@ _FAR = 20  # points without stereo depth
 _STEP_M = 0.05  # m sideways between two keyframes
 
 
-_warmed: set[BaseConfig | None] = set()  # by this process
-
-
-def warm(config: BaseConfig | None = None, vocabulary: Vocabulary | None = None) -> None:
+@cache
+def warm(config: BaseConfig | None = None) -> None:
     """Run every kernel once, with the types of flights; once in a process for each configuration.
 
     Takes a fraction of a second if the kernel cache is filled.
     """
-    if config not in _warmed:
-        _run_all(config, vocabulary)
-        _warmed.add(config)
-
-
-def _run_all(config: BaseConfig | None, vocabulary: Vocabulary | None) -> None:
-    if vocabulary is None:
-        centres = np.random.default_rng(0).integers(0, 1 << 63, (nodes(4, 2), 4)).astype(np.uint64)
-        vocabulary = Vocabulary(4, 2, centres, np.ones(16, np.float32))
+    centres = np.random.default_rng(0).integers(0, 1 << 63, (nodes(4, 2), 4)).astype(np.uint64)
+    vocabulary = Vocabulary(4, 2, centres, np.ones(16, np.float32))
     agent, base = plain_pair()
     station = Station(config or BaseConfig(), lambda _: base, vocabulary)
     station.join(AgentId(0))

@@ -84,7 +84,7 @@ def measure(log: Path, report: Callable[[Sample], None], every: int = _EVERY, tr
     cv2.setNumThreads(1)
     codec_warm.warm()
     vocabulary = load_vocabulary()
-    warm(BaseConfig(), vocabulary)
+    warm(BaseConfig())
     if vocabulary is not None:
         warm_graphs()
     if trace:

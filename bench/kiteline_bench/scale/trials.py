@@ -262,7 +262,7 @@ def main(argv: list[str] | None = None) -> int:
     return_large_arrays()
     flight = record_flight(a.source, a.recorded)
     codec_warm.warm()
-    warm(BaseConfig(), shipped_vocabulary())
+    warm(BaseConfig())
     warm_graphs()
     print(json.dumps(asdict(large_map(flight, a.keyframes) if a.trial == "map" else day(flight, a.hours, a.flights))))
     return 0

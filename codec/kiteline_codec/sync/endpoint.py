@@ -330,14 +330,16 @@ class Endpoint:
     def poll(self, now_ns: int) -> bytes | None:
         """The next packet to send now, or None. Call until None."""
         c = self.config
-        self._throughput.busy(self._out.urgency() is not None, now_ns)
+        urgency = self._out.urgency()
+        self._throughput.busy(urgency is not None, now_ns)
         self.throughput_bytes_s = self._throughput.bytes_s(now_ns)
-        self._out.give_up(now_ns, self._round_trip, self._overtaken_below)
+        if self._out.give_up(now_ns, self._round_trip, self._overtaken_below, idle=urgency is None):
+            urgency = self._out.urgency()
         left = self._budget.left(now_ns) - c.overhead_bytes
         unheard = self._own_values.state is OwnState.UNHEARD
         waited_ns = now_ns - self._unanswered_since_ns
         answer = self._unanswered > 0 and (self._unanswered >= c.ack_packets or waited_ns >= c.ack_delay_ns)
-        if not unheard and self._window_open() and self._due(self._out.urgency(), answer, now_ns):
+        if not unheard and self._window_open() and self._due(urgency, answer, now_ns):
             if left < c.filled_bytes:
                 return None
             return self._packet(now_ns, values=True, digest=False)

@@ -379,10 +379,15 @@ class Outbox:
             if entry.code is None:
                 del self._entries[key]
 
-    def give_up(self, now_ns: int, round_trip: RoundTrip, overtaken_below: int) -> None:
-        """Queue again what packets carried that count as lost (`PacketsInFlight.give_up_late`)."""
-        for packet in self.packets.give_up_late(now_ns, round_trip, overtaken_below, last=self.urgency() is None):
+    def give_up(self, now_ns: int, round_trip: RoundTrip, overtaken_below: int, *, idle: bool) -> bool:
+        """Queue again what packets carried that count as lost (`PacketsInFlight.give_up_late`).
+
+        idle: nothing waits to be sent. Returns True if packets count as lost.
+        """
+        lost = self.packets.give_up_late(now_ns, round_trip, overtaken_below, last=idle)
+        for packet in lost:
             self._lose(packet)
+        return bool(lost)
 
     def _lose(self, packet: SentPacket) -> None:
         """Queue again what a packet carried."""

@@ -57,6 +57,16 @@ class SimConfig:
     floor: str = "flat"  # or ramp, wave, bare (without texture), indoors
     texture_bits: int = 11  # log2 of a texture's side; less only for tests
 
+    @property
+    def flight_seed(self) -> int:
+        """Seed of what is drawn for this agent's flight alone."""
+        return seed_of_agent(self.seed, self.agent)
+
+
+def seed_of_agent(seed: int, agent: int) -> int:
+    """A seed for each agent of a scene, different for all seeds below 2^19; the 27 bits of a frame's key hold it."""
+    return seed * 64 + agent % 64 + (agent // 64 << 25)
+
 
 def read_config(scene: str, **options: object) -> SimConfig:
     """The options of `SCENE[?key=value&…]`; `options`, fields of SimConfig, override the text.

@@ -16,7 +16,7 @@ from kiteline_core import odometry
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration, OdometryBatch, Trajectory
 from kiteline_core.geometry.cameras import CameraRig, Lens
 from kiteline_hw.ports import FrameSource, SourceError, SourceReport
-from kiteline_hw.sim.config import SimConfig, read_config
+from kiteline_hw.sim.config import SimConfig, read_config, seed_of_agent
 from kiteline_hw.sim.sensors import imu as inertial
 from kiteline_hw.sim.sensors import odometer, wear
 from kiteline_hw.sim.sensors.camera import LAMP_HZ, Shutter, SimCamera
@@ -88,7 +88,7 @@ class SimSource:
         self.path = self._choose_path()
         self.world = world if world is not None else build_world(config, self.rig.T_b_c)
         self._actors = make_actors(
-            self.world, self.path, self.rig.T_b_c, config.people, config.cars, config.seed * 64 + config.agent
+            self.world, self.path, self.rig.T_b_c, config.people, config.cars, config.flight_seed
         )
         seconds = self.path.duration_s if not config.seconds else min(config.seconds, self.path.duration_s)
         self.frame_count = int(seconds * 1e9) // FRAME_NS + (1 if not config.seconds else 0)
@@ -122,7 +122,7 @@ class SimSource:
         """All inertial samples of the flight."""
         stamps = np.arange(START_NS, int(self._stamps[-1]) + 1, IMU_NS, dtype=np.int64)
         calibration = ImuCalibration(rate_hz=1e9 / IMU_NS)
-        seed = self.config.seed * 64 + self.config.agent
+        seed = self.config.flight_seed
         wear = self.worn.imu if self.config.rig == "worn" else None
         return inertial.measure(self.path, stamps, START_NS, calibration, seed, wear=wear)
 
@@ -151,7 +151,7 @@ class SimSource:
         images: list[NDArray[np.uint8]] = []
         for side, camera in enumerate(cameras if self._has_partner[k] else cameras[:1]):
             gain = float(self._gains[k]) * (1.0, 0.97)[side]
-            key = (((c.seed * 64 + c.agent) << 36) + (2 * k + side) * 0xD1342543DE82) & ((1 << 63) - 1)
+            key = ((c.flight_seed << 36) + (2 * k + side) * 0xD1342543DE82) & ((1 << 63) - 1)
             images.append(camera.take_image(pose, velocity, rate, shutter, gain, noise, key, t_s))
         right = images[1] if len(images) > 1 else None
         return Frame(int(self._stamps[k]), images[0], right, cameras[0].depth() if c.depth else None)
@@ -202,16 +202,16 @@ class SimSource:
 
 def _worn_rig(config: SimConfig, rig: CameraRig) -> wear.WornRig:
     """The true rig for which `rig` is the calibration."""
-    seed = config.seed * 64 + config.agent
+    seed = config.flight_seed
     good = perturb(rig, np.random.default_rng([seed, 41]), config.miscalibration)
     chosen = wear.selected(config.wear, wear.WearConfig()) if config.rig == "worn" else wear.NO_WEAR
-    own_seed = seed if config.rig_seed < 0 else config.rig_seed * 64 + config.agent
+    own_seed = seed if config.rig_seed < 0 else seed_of_agent(config.rig_seed, config.agent)
     return wear.draw(rig, good, ImuCalibration(rate_hz=1e9 / IMU_NS), own_seed, chosen)
 
 
 def _gains(frames: int, config: SimConfig) -> F64:
     """Grey values per unit of radiance: slow drift of the exposure, and steps up or down."""
-    rng = np.random.default_rng([config.seed * 64 + config.agent, 29])
+    rng = np.random.default_rng([config.flight_seed, 29])
     phase = rng.uniform(0, 2 * np.pi, 2)
     t = np.arange(frames) * FRAME_NS * 1e-9
     drift = 0.10 * np.sin(2 * np.pi * t / 11.0 + phase[0]) + 0.05 * np.sin(2 * np.pi * t / 3.7 + phase[1])

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from kiteline_core.frame import Frame, ImuBatch
+from kiteline_core.ids import MAX_AGENTS
 from kiteline_hw.ports import SourceError
+from kiteline_hw.sim.config import SimConfig
 from kiteline_hw.sim.source import START_NS, open_sim
 
 SMALL: dict[str, Any] = {"scale": 0.2, "texture_bits": 8, "seconds": 0.5}
@@ -94,3 +96,11 @@ def test_options_in_the_scene_text() -> None:
 def test_errors_name_what_was_expected(text: str, words: str) -> None:
     with pytest.raises(SourceError, match=words):
         open_sim(text, texture_bits=6)
+
+
+def test_every_agent_of_every_seed_draws_its_own_noise() -> None:
+    """Agent 64 of a seed drew what agent 0 of the next one did."""
+    seeds = [SimConfig(seed=seed, agent=agent).flight_seed for seed in range(9) for agent in range(MAX_AGENTS)]
+    assert len(set(seeds)) == len(seeds)
+    assert max(seeds) < 1 << 27  # the key of a frame's noise keeps so many bits
+    assert SimConfig(seed=3, agent=5).flight_seed == 197  # flights of up to 64 agents are as they were

@@ -14,51 +14,13 @@ from mcap_ros2.decoder import DecoderFactory
 from kiteline_hw.logs.mcap_file import McapFile
 from kiteline_hw.sources.mcap_messages import read_frame_id, read_imu, read_pose, read_stamp
 from kiteline_hw.sources.ros2_samples import fast_decoder
+from tests.hw.sources.ros2_schemas import LEAVES, ROS2
 
-PARTS = """
-================================================================================
-MSG: std_msgs/Header
-# Standard metadata
-builtin_interfaces/Time stamp
-string frame_id
-================================================================================
-MSG: builtin_interfaces/Time
-int32 sec
-uint32 nanosec
-================================================================================
-MSG: geometry_msgs/Quaternion
-float64 x
-float64 y
-float64 z
-float64 w
-================================================================================
-MSG: geometry_msgs/Vector3
-float64 x
-float64 y
-float64 z
-================================================================================
-MSG: geometry_msgs/Point
-float64 x
-float64 y
-float64 z
-================================================================================
-MSG: geometry_msgs/Pose
-Point position
-Quaternion orientation
-"""
-IMU = """std_msgs/Header header
-geometry_msgs/Quaternion orientation
-float64[9] orientation_covariance # row major
-geometry_msgs/Vector3 angular_velocity
-float64[9] angular_velocity_covariance
-geometry_msgs/Vector3 linear_acceleration
-float64[9] linear_acceleration_covariance
-"""
-POSE = "std_msgs/Header header\ngeometry_msgs/Pose pose\n"
+IMU, POSE = "sensor_msgs/msg/Imu", "geometry_msgs/msg/PoseStamped"
 
 
-def schema(name: str, text: str) -> Schema:
-    return Schema(id=1, name=name, encoding="ros2msg", data=(text + PARTS).encode())
+def schema(name: str, text: str = "") -> Schema:
+    return Schema(id=1, name=name, encoding="ros2msg", data=((text or ROS2[name]) + LEAVES).encode())
 
 
 def message(frame: str, values: list[float], order: str = "<") -> bytes:
@@ -68,35 +30,35 @@ def message(frame: str, values: list[float], order: str = "<") -> bytes:
     return (b"\0\1" if order == "<" else b"\0\0") + b"\0\0" + head + struct.pack(f"{order}{len(values)}d", *values)
 
 
-def both(name: str, text: str, data: bytes) -> list[object]:
-    slow = DecoderFactory().decoder_for("cdr", schema(name, text))
+def both(message_type: Schema, data: bytes) -> list[object]:
+    slow = DecoderFactory().decoder_for("cdr", message_type)
     assert slow is not None
-    return [slow(data), fast_decoder(schema(name, text), slow)(data)]
+    return [slow(data), fast_decoder(message_type, slow)(data)]
 
 
 @given(st.text(max_size=12).filter(lambda t: "\0" not in t), st.floats(-1e3, 1e3), st.sampled_from("<>"))
 def test_samples_are_those_of_the_general_decoder(frame: str, first: float, order: str) -> None:
     data = message(frame, [first + i for i in range(37)], order)
-    slow, fast = both("sensor_msgs/msg/Imu", IMU, data)
+    slow, fast = both(schema(IMU), data)
     assert read_imu(fast, 0) == read_imu(slow, 0)
     assert read_frame_id(fast) == read_frame_id(slow)
     data = message(frame, [first + i for i in range(7)], order)
-    slow, fast = both("geometry_msgs/msg/PoseStamped", POSE, data)
+    slow, fast = both(schema(POSE), data)
     assert (read_pose(fast) == read_pose(slow)).all()
     assert read_stamp(fast, 0) == read_stamp(slow, 0) == 1_700_000_000_999_999_999
 
 
 def test_a_schema_that_differs_is_read_as_it_says() -> None:
     """Ten covariances in place of nine: the floats after them lie elsewhere."""
-    text = IMU.replace("float64[9] orientation_covariance", "float64[10] orientation_covariance")
-    slow, fast = both("sensor_msgs/msg/Imu", text, message("imu", [float(i) for i in range(38)]))
+    text = ROS2[IMU].replace("float64[9] orientation_covariance", "float64[10] orientation_covariance")
+    slow, fast = both(schema(IMU, text), message("imu", [float(i) for i in range(38)]))
     assert type(slow) is type(fast)
     assert read_imu(fast, 0)[0][1][:3] == (14.0, 15.0, 16.0)
 
 
 @given(st.integers(0, 340))
 def test_a_cut_message_is_refused(size: int) -> None:
-    decode = fast_decoder(schema("sensor_msgs/msg/Imu", IMU), bytes)
+    decode = fast_decoder(schema(IMU), bytes)
     whole = message("body", [1.0] * 37)
     if size < len(whole):
         try:

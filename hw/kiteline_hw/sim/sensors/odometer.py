@@ -24,10 +24,10 @@ def measure(
     samples of a longer flight with the same seed begin with those of a shorter one.
     """
     motion = path.motion(flight_s(t_ns, start_ns))
-    rng = np.random.default_rng([config.seed * 64 + config.agent, 53])
+    rng = np.random.default_rng([config.flight_seed, 53])
     draws = rng.standard_normal((len(t_ns), 6))
     velocity = np.einsum("nji,nj->ni", motion.T_w_b[:, :3, :3], motion.velocity)
-    slip = _slips(len(t_ns), config.odometry, config.odometry_slip, config.seed * 64 + config.agent)
+    slip = _slips(len(t_ns), config.odometry, config.odometry_slip, config.flight_seed)
     velocity = config.odometry_scale * slip[:, None] * velocity + config.odometry_noise * draws[:, :3]
     rate = motion.rate + config.odometry_turn_noise * draws[:, 3:]
     velocity_cov = np.tile(_covariance(config.odometry_noise), (len(t_ns), 1, 1))
