@@ -16,6 +16,8 @@ class CornerTracksConfig:
     backward_px: float = 0.5  # px between a corner and its image followed back
     drift_px: float = 2.0  # px between flow over frames and flow from the last keyframe
     keyframe_s: float = 0.24  # time between two keyframes: short enough for flow, long enough for parallax
+    keyframes: int = 45  # of a window, whose cost grows with their square; of more, every second old one is left out
+    thinned_s: float = 0.6  # longest time between two keyframes after one was left out
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +47,7 @@ class InertialStartConfig:
     """When a monocular camera with an IMU knows its scale, and begins a map in metres."""
 
     min_span_s: float = 2.4  # before which a window tells no scale
-    max_span_s: float = 11.0  # longest window; older keyframes are dropped
+    max_span_s: float = 24.0  # longest window; older keyframes are dropped
     attempt_s: float = 0.45  # time between two solutions: each costs as much as some frames
     attempt_share: float = 0.09  # the same over the window's length: long windows cost more
     landmarks: int = 220  # of the window, with the longest tracks: errors of few add up to a wrong turn and motion

@@ -126,6 +126,26 @@ def _bend(found: WindowSolution, truth: F64) -> float:
     return float(np.linalg.norm(q - p @ (u @ vt).T))
 
 
+@pytest.mark.parametrize("factor", [0.55, 1.8])
+def test_a_warm_start_of_another_size_ends_at_the_scale_that_a_vibrating_imu_tells(factor: float) -> None:
+    """Inverse depths are not linear in the scale: steps along it were rejected, and the solver crept or stopped."""
+    corners, samples, _ = window(3, keyframes=14)
+    noise = WindowNoise(accel=12.0)
+    args = (corners, samples, CALIBRATION, T_B_C, FOCAL, 9.81, PRIOR, CONFIG, noise)
+    solver = InertialBundle(*args)
+    right = solver.solve()
+    assert right is not None
+    xyz, _ = solver.landmarks_of(right.state)
+    camera = right.state.p + right.state.R @ T_B_C[:3, 3]
+    away = (factor - 1.0) * (camera - camera[0])
+    wrong = replace(right.state, p=right.state.p + away, v=factor * right.state.v)
+    found = InertialBundle(*args).solve(WarmStart(wrong, camera[0] + factor * (xyz - camera[0])))
+    assert found is not None and found.converged
+    assert found.cost < right.cost + 0.5
+    ratio = np.linalg.norm(found.state.p - found.state.p[0]) / np.linalg.norm(right.state.p - right.state.p[0])
+    assert abs(np.log(ratio)) < 0.5 * right.scale_sigma
+
+
 def test_a_noisier_model_of_the_imu_knows_the_scale_less_well() -> None:
     corners, samples, _ = window(1)
     found = [

@@ -82,8 +82,13 @@ class CornerTracks:
         return True
 
     def drop_before(self, t_ns: int) -> None:
-        """Forget keyframes that are older than this."""
-        self.keyframes = [k for k in self.keyframes if k.t_ns >= t_ns]
+        """Forget keyframes that are older than this; of too many, the oldest that lie close to their neighbours."""
+        kept, config = [k for k in self.keyframes if k.t_ns >= t_ns], self._config
+        while len(kept) > config.keyframes:
+            apart_s = [(after.t_ns - before.t_ns) * 1e-9 for before, after in zip(kept, kept[2:], strict=False)]
+            close = [k for k, s in enumerate(apart_s, 1) if s < config.thinned_s]
+            del kept[close[0] if close else 0]
+        self.keyframes = kept
 
     def flow_px(self) -> float:
         """Median motion of corners since the oldest keyframe that has half of the newest one's; inf without one."""

@@ -31,6 +31,7 @@ I64 = NDArray[np.int64]
 
 _MAX_DAMPING = 1e4
 _PLACE_ITERATIONS = 4  # of landmarks alone
+_MOST_GROWTH = 0.5  # of all lengths in one step
 _ROUNDS = 2  # in which corners are left out, each followed by another solution
 
 
@@ -76,7 +77,7 @@ class InertialBundle:
         self._lens_info = lens_prior(config, focal_px) if lens_info is None else lens_info
         self._converged = False
         self._keyframes, self._landmarks = observations.seen.shape
-        self._origin, self._axes = np.zeros((self._landmarks, 3)), np.zeros((self._landmarks, 3, 3))
+        self._axes = np.zeros((self._landmarks, 3, 3))  # of the landmarks, see WindowState
         self._error = np.zeros((0, 0))  # (K,P) of observations in deviations
         self._used = np.ones(self._landmarks, np.bool_)  # the other landmarks move, or their corners slide along edges
         self._projected: tuple[WindowState, tuple[F64, F64, F64, F64]] | None = None  # the last state's projections
@@ -113,7 +114,7 @@ class InertialBundle:
 
     def landmarks_of(self, state: WindowState) -> tuple[F64, I64]:
         """Landmarks (P,3) in w, and the keyframe (P,) that saw each one first."""
-        return self._origin + self._rays(state) / state.rho[:, None], np.argmax(self._obs.seen, axis=0)
+        return state.origin + self._rays(state) / state.rho[:, None], np.argmax(self._obs.seen, axis=0)
 
     def _rays(self, state: WindowState) -> F64:
         """(P,3) from the landmarks' origins to the landmarks, in w, times rho."""
@@ -128,6 +129,7 @@ class InertialBundle:
         state = WindowState(
             np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3)), np.zeros((n, 3)), np.tile(self._prior.bias[3:], (n, 1)),
             self._prior.bias[:3].copy(), np.zeros(3), np.zeros((self._landmarks, 2)), np.zeros(self._landmarks),
+            np.zeros((self._landmarks, 3)),
         )  # fmt: skip
         self._terms.integrate(state)
         rotation = [np.eye(3)]
@@ -151,7 +153,7 @@ class InertialBundle:
             R, p, v, bias = [*R, T[:3, :3]], [*p, T[:3, 3]], [*v, velocity], [*bias, bias[-1]]
         state = replace(old, R=np.array(R), p=np.array(p), v=np.array(v), accel_bias=np.array(bias))
         state = self._anchored(state)
-        depth = np.einsum("pi,pi->p", warm.xyz - self._origin, self._axes[:, :, 2])
+        depth = np.einsum("pi,pi->p", warm.xyz - state.origin, self._axes[:, :, 2])
         known = np.isfinite(depth) & (depth > 0.1)
         usual = float(np.median(depth[known])) if known.any() else self._config.first_depth_m
         return replace(state, rho=1.0 / np.where(known, depth, usual))
@@ -167,16 +169,17 @@ class InertialBundle:
             return None
         camera = state.p + state.R @ self._t_bc
         p = found.scale * (camera - camera[0]) + camera[0] - state.R @ self._t_bc
-        self._origin = found.scale * (self._origin - camera[0]) + camera[0]
-        return replace(state, p=p, v=found.velocities, gravity=found.gravity, rho=state.rho / found.scale)
+        origin = found.scale * (state.origin - camera[0]) + camera[0]
+        rho = state.rho / found.scale
+        return replace(state, p=p, v=found.velocities, gravity=found.gravity, rho=rho, origin=origin)
 
     def _anchored(self, state: WindowState) -> WindowState:
         """The state with each landmark on the ray of the keyframe that saw it first, at its depth there."""
         first = np.argmax(self._obs.seen, axis=0)
         camera = state.p + state.R @ self._t_bc
-        self._axes, self._origin = (state.R @ self._r_bc)[first], camera[first]
+        self._axes = (state.R @ self._r_bc)[first]
         shown = self._obs.xy[first, np.arange(self._landmarks)]
-        return replace(state, m=lens_correction.true_place(shown, state.lens))
+        return replace(state, m=lens_correction.true_place(shown, state.lens), origin=camera[first])
 
     def _consistent(
         self, state: WindowState, unknown: I64, iterations: int, *, inertial: bool
@@ -249,7 +252,7 @@ class InertialBundle:
             [last + np.arange(9), STATE * n + np.arange(3), last + np.arange(9, 12), STATE * n + 3 + np.arange(2)]
         )
         camera = state.p[-1] + state.R[-1] @ self._t_bc
-        scaled = (self._rays(state) + state.rho[:, None] * (self._origin - camera)) @ (state.R[-1] @ self._r_bc)
+        scaled = (self._rays(state) + state.rho[:, None] * (state.origin - camera)) @ (state.R[-1] @ self._r_bc)
         fits = self._error[self._obs.seen & self._used]
         fits = fits[fits < 3.0]
         reprojection_px = float(np.sqrt(np.mean(fits**2))) * self._config.sigma_px if len(fits) else np.inf
@@ -267,7 +270,7 @@ class InertialBundle:
         """Landmarks in the body (K,P,3) times rho, depth times rho (K,P), pixels over focal (K,P,2), error there."""
         if self._projected is not None and self._projected[0] is state:
             return self._projected[1]
-        to = self._origin[None] - state.p[:, None]
+        to = state.origin[None] - state.p[:, None]
         y = (self._rays(state)[None] + state.rho[None, :, None] * to) @ state.R
         q = (y - state.rho[None, :, None] * self._t_bc) @ self._r_bc
         z = np.maximum(q[..., 2], 1e-3)
@@ -303,7 +306,7 @@ class InertialBundle:
         seen = lens + TERMS  # unknowns that the observations depend on
         hpk, reduced, rest = np.zeros((self._landmarks, 3, seen)), np.zeros((seen, seen)), np.zeros(seen)
         add_observations(
-            xy, error, weight, self._sigma, y, z, self._r_bc, state.R, state.p, self._t_bc, state.rho, self._origin,
+            xy, error, weight, self._sigma, y, z, self._r_bc, state.R, state.p, self._t_bc, state.rho, state.origin,
             self._axes, hpp, bp, hpk, reduced, rest,
         )  # fmt: skip
         reduced[:lens, lens:] = reduced[lens:, :lens].T
@@ -332,12 +335,36 @@ class InertialBundle:
             gravity = self._length * gravity / np.linalg.norm(gravity)
         lens = step[STATE * n + SHARED :]
         landmark = -(system.inv @ system.bp[..., None])[..., 0] - system.iw @ np.append(x[:, :6].ravel(), lens)
+        # A map that grows is the same to the camera, but a linear step of inverse depths is not: the growth in the step
+        # is applied exactly, and the rest of the step to the grown map.
+        dp, dv = x[:, 3:6], x[:, 6:9]
+        grown = self._growth(state, dp) if gravity.any() else 0.0
+        along, origin = self._grown(state, grown)
+        landmark -= along
+        away = state.p - state.p[0] + (state.R - state.R[0]) @ self._t_bc  # cameras from the first one
+        p = state.p + dp + grown * (dp - grown * away)
+        v = state.v + dv + grown * (dv - grown * state.v)
         return WindowState(
-            R, state.p + x[:, 3:6], state.v + x[:, 6:9], state.accel_bias + x[:, 9:],
+            R, p, v, state.accel_bias + x[:, 9:],
             state.gyro_bias + shared[:3], gravity,
-            state.m + landmark[:, :2], np.maximum(state.rho + landmark[:, 2], 1e-4),
+            state.m + landmark[:, :2], np.maximum((state.rho + landmark[:, 2]) / (1.0 + grown), 1e-4), origin,
             state.lens + lens,
         )  # fmt: skip
+
+    def _growth(self, state: WindowState, step: F64) -> float:
+        """Share by which a step (K,3) of the positions lengthens all lengths."""
+        spread = state.p - state.p.mean(axis=0)
+        square = float((spread**2).sum())
+        found = float((spread * step).sum()) / square if square > 0.0 else 0.0
+        return float(np.clip(found, -_MOST_GROWTH, _MOST_GROWTH))
+
+    def _grown(self, state: WindowState, share: float) -> tuple[F64, F64]:
+        """Change (P,3) of (m, rho) at the old origins, to first order, and new origins (P,3), if lengths grow so."""
+        first = state.p[0] + state.R[0] @ self._t_bc  # the first camera, which stays
+        away = share * (state.origin - first + self._rays(state) / state.rho[:, None])
+        moved = np.einsum("pij,pi->pj", self._axes, away) * state.rho[:, None]
+        change = np.column_stack([moved[:, :2] - state.m * moved[:, 2:], -state.rho * moved[:, 2]])
+        return change, state.origin + share * (state.origin - first)
 
 
 def lens_prior(config: InertialBundleConfig, focal_px: float) -> F64:

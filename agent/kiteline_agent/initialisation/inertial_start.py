@@ -18,7 +18,8 @@ from kiteline_agent.initialisation.inertial_bundle import InertialBundle, lens_p
 from kiteline_agent.initialisation.inertial_window import WarmStart, WindowSolution
 from kiteline_agent.initialisation.landmark_realignment import realigned
 from kiteline_agent.initialisation.metric_restart import MetricPoints, metric_points_at
-from kiteline_agent.initialisation.window_noise import MOST, WindowNoise
+from kiteline_agent.initialisation.vibration_levels import Vibration, vibration
+from kiteline_agent.initialisation.window_noise import LEAST, MOST, WindowNoise
 from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry.cameras import RectifiedCamera
@@ -85,6 +86,7 @@ class InertialStart:
         self._buffer = SampleBuffer(start.max_span_s + 1.0, config.inertial.max_gap_s)
         self._before: _Window | None = None
         self._noise: WindowNoise | None = None  # as the windows so far show it
+        self._vibration: Vibration | None = None  # of the newest window
         self._lens_info = lens_prior(start.bundle, camera.fx)  # of what is left of the lens's errors
         self._tried_ns: int | None = None
         self._last_samples_ns: int | None = None  # stamp of the last frame with samples
@@ -100,7 +102,7 @@ class InertialStart:
         """A map is tracked: begin anew after it."""
         self._tracks.clear()
         self._before = self._tried_ns = None
-        self._noise = None
+        self._noise = self._vibration = None
 
     def add(self, ctx: FrameContext, prior: BiasPrior | None, offset_s: float) -> InertialMap | None:
         """Follow the corners into a frame whose samples were taken in. Returns a map once its scale is known.
@@ -135,8 +137,8 @@ class InertialStart:
         columns = _covering(all_corners, config.landmarks, config.landmarks_each)
         observations = all_corners.part(columns)
         before, stamps = self._before, tuple(k.t_ns for k in keyframes)
-        if self._noise is None:
-            self._noise = self._measured_noise()
+        self._measure_vibration(intervals)
+        assert self._noise is not None
         warm = None if before is None else _warm(before, stamps, observations)
         found = None if warm is None else self._solve(observations, intervals, prior, warm)
         if found is None or not self._fits(found.solution):
@@ -174,7 +176,9 @@ class InertialStart:
         duration_s = (stamps[-1] - stamps[0]) * 1e-9
         self._lens_info = np.asarray(np.linalg.inv(solution.lens_cov), np.float64)
         lens = solution.state.lens
-        return InertialMap(points, solution, cov, solution.scale_sigma, duration_s, noise.accel, lens)
+        assert self._vibration is not None
+        accel_noise = noise.accel * max(self._vibration.level_now, 1.0)
+        return InertialMap(points, solution, cov, solution.scale_sigma, duration_s, accel_noise, lens)
 
     def _solve(
         self, corners: CornerObservations, intervals: list[Samples], prior: BiasPrior, warm: WarmStart | None
@@ -206,13 +210,23 @@ class InertialStart:
         now = solution.evidence.updated(before, config.noise_prior, least)
         return now, solution.scale_sigma * max(now.accel / before.accel, now.walk / before.walk)
 
+    def _measure_vibration(self, intervals: list[Samples]) -> None:
+        """Measure the vibration of a window; the noise found so far is that of the mean over the window before."""
+        before, self._vibration = self._vibration, vibration(intervals)
+        if self._noise is None:
+            self._noise = self._measured_noise()
+        elif before is not None and before.density > 0.0:
+            accel = self._noise.accel * self._vibration.density / before.density
+            self._noise = replace(self._noise, accel=float(np.clip(accel, LEAST, MOST)))
+
     def _measured_noise(self) -> WindowNoise:
         """The noise of single samples: more than that of intervals, since much of it is vibration and motion.
 
         From too much noise its true size is found, which from too little is taken for motion.
         """
         bundle, calibration = self._config.inertial_start.bundle, self._calibration
-        gyro, accel = self._buffer.density / bundle.imu_inflation
+        assert self._vibration is not None
+        gyro, accel = self._buffer.density[0] / bundle.imu_inflation, self._vibration.density / bundle.imu_inflation
         return WindowNoise(
             float(np.clip(gyro / calibration.gyro_noise, 1.0, MOST)),
             float(np.clip(accel / calibration.accel_noise, 1.0, MOST)),

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from kiteline_agent.inertial.preintegration import BiasPrior, Preintegrated, Samples, preintegrate
 from kiteline_agent.inertial_start_config import InertialBundleConfig
 from kiteline_agent.initialisation.inertial_window import WindowState, tangent
+from kiteline_agent.initialisation.vibration_levels import vibration
 from kiteline_agent.initialisation.window_noise import NoiseEvidence, WindowNoise
 from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry import se3
@@ -37,6 +38,12 @@ class InertialTerms:
             gyro_noise=noise.gyro * config.imu_inflation * calibration.gyro_noise,
             accel_noise=noise.accel * config.imu_inflation * calibration.accel_noise,
         )
+        told = config.imu_inflation * calibration.accel_noise  # no interval has less, unless the window shows it
+        least = min(noise.accel, 1.0) * told
+        self._calibrations = [
+            replace(self._calibration, accel_noise=max(float(level) * self._calibration.accel_noise, least))
+            for level in vibration(intervals).levels
+        ]
         self._walk = noise.walk * float(np.hypot(calibration.accel_walk, config.accel_walk))
         self._length = gravity_m_s2
         self._prior = prior
@@ -52,8 +59,8 @@ class InertialTerms:
         """Integrate the samples with the state's biases."""
         self._known = None
         self.motions = [
-            self.preintegrate(samples, np.concatenate([state.gyro_bias, bias]))
-            for samples, bias in zip(self.intervals, state.accel_bias, strict=False)
+            preintegrate(samples, np.concatenate([state.gyro_bias, bias]), calibration)
+            for samples, bias, calibration in zip(self.intervals, state.accel_bias, self._calibrations, strict=False)
         ]
         self._info = [np.asarray(np.linalg.inv(m.cov + _FLOOR)) for m in self.motions]
 

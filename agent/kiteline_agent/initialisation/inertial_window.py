@@ -18,7 +18,7 @@ class WindowState:
     """Unknowns of the window, in the body frame of its first keyframe, w.
 
     R: (K,3,3) R_w_b. p: (K,3) m. v: (K,3) m/s. accel_bias: (K,3) m/s^2. gyro_bias: (3,) rad/s. gravity: (3,) m/s^2.
-    m: (P,2) and rho: (P,) 1/m: landmark at origin + axes @ (m, 1) / rho. lens: (8,) see lens_correction.
+    m: (P,2) and rho: (P,) 1/m: landmark at origin (P,3) m + axes @ (m, 1) / rho. lens: (8,) see lens_correction.
     """
 
     R: F64
@@ -29,6 +29,7 @@ class WindowState:
     gravity: F64
     m: F64
     rho: F64
+    origin: F64
     lens: F64 = field(default_factory=lambda: np.zeros(TERMS))
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 F64 = NDArray[np.float64]
 
 MOST = 25.0  # largest factor on a deviation
-_LEAST = 0.2
+LEAST = 0.2  # and the smallest
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,12 +32,12 @@ class NoiseEvidence:
     chi2: F64
     expected: F64
 
-    def updated(self, noise: WindowNoise, prior: float, least_accel: float = _LEAST) -> WindowNoise:
+    def updated(self, noise: WindowNoise, prior: float, least_accel: float = LEAST) -> WindowNoise:
         """The factors that explain these errors. prior: weight of 1, which is expected, in degrees of freedom.
 
         least_accel: smallest factor of the accelerometer's white noise that is believed.
         """
         before = np.array([noise.gyro, noise.accel, noise.walk])
         found = np.sqrt((before**2 * self.chi2 + prior) / (self.expected + prior))
-        gyro, accel, walk = (float(x) for x in np.clip(found, _LEAST, MOST))
+        gyro, accel, walk = (float(x) for x in np.clip(found, LEAST, MOST))
         return WindowNoise(gyro, max(accel, least_accel), walk)

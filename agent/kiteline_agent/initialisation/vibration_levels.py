@@ -1,0 +1,57 @@
+"""How much an accelerometer vibrates over a window, and in each of its intervals."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_agent.inertial import imu_kernels
+from kiteline_agent.inertial.preintegration import Samples
+
+F64 = NDArray[np.float64]
+
+_FEWEST = 12  # second differences that tell the noise of an interval, to a fifth
+_EVEN, _GAP = 1.5, 2.5  # as in SampleBuffer: steps that are compared
+_LEAST, _MOST = 0.1, 4.0  # motors are off, and a landing
+_BESIDE = 2  # intervals before and after, half a second each, over which levels are averaged: rotors beat
+_NEWEST = 2  # intervals that tell the vibration now
+
+
+@dataclass(frozen=True, slots=True)
+class Vibration:
+    """Noise of single samples of the accelerometer. density: root mean square over a window, m/s^2 per sqrt(Hz).
+
+    levels: (K-1,) deviation of the noise about each interval over that mean.
+    """
+
+    density: float
+    levels: F64
+
+    @property
+    def level_now(self) -> float:
+        """That of the newest intervals."""
+        return float(np.sqrt(np.mean(self.levels[-_NEWEST:] ** 2)))
+
+
+def vibration(intervals: Sequence[Samples]) -> Vibration:
+    """The vibration over K - 1 intervals, by second differences as in SampleBuffer. With few samples a level is 1."""
+    usual_s = float(np.median(np.concatenate([np.diff(samples.t_s) for samples in intervals])))
+    variance, sums = np.full(len(intervals), np.nan), np.empty((2, 2))
+    for k, samples in enumerate(intervals):
+        values = np.concatenate([samples.gyro, samples.accel], axis=1)[1:-1]  # the ends are interpolated
+        stamps = np.round(1e9 * samples.t_s[1:-1]).astype(np.int64)
+        count, pairs = imu_kernels.second_differences(stamps, values, 1e9 * usual_s, _EVEN, _GAP, sums)
+        if count >= _FEWEST:
+            by_pairs = sums[1, 1] / pairs if pairs >= _FEWEST else np.inf
+            variance[k] = min(sums[0, 1] / count, by_pairs)
+    known = np.isfinite(variance)
+    mean = float(variance[known].mean()) if known.any() else 0.0
+    if mean == 0.0:
+        return Vibration(0.0, np.ones(len(intervals)))
+    even = np.pad(np.where(known, variance, mean) / mean, _BESIDE, mode="edge")
+    around = np.convolve(even, np.full(2 * _BESIDE + 1, 1.0 / (2 * _BESIDE + 1)), mode="valid")
+    levels = np.clip(np.sqrt(around), _LEAST, _MOST)
+    return Vibration(float(np.sqrt(mean * usual_s)), levels)
