@@ -70,7 +70,8 @@ class Estimate(_InOdometryFrame):
     tracked: T_m_b is measured from at least 15 image inliers, or (bridged) dead reckoning for at most 1 s.
     T_m_b: (4,4) body in the submap frame, or None. T_o_b: (4,4) body in the odometry frame, always continuous.
     keyframe, T_k_c: camera relative to a keyframe. T_w_b: (4,4) in the world once the base has placed the submap;
-    before that in the gravity-aligned submap, if it is tilted.
+    before that in the gravity-aligned submap, if it is tilted, and in the submap itself once the agent moved its map:
+    with what moves the map applied in small steps.
     quality: probability in percent, at least 1, that the pose is good (CovarianceConfig) relative to the start of the
     flight; -1: nothing measures the motion. A later submap counts as placed by odometry until it is recognised.
     cov_m: (6,6) of T_m_b relative to the start of its submap, [translation in m, rotation about the body's axes],

@@ -10,14 +10,15 @@ from kiteline_agent.covariance.pose_covariance import PoseCovariance
 from kiteline_agent.exchange.corrections import Corrections
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.relocalisation.map_cache import MapCache
-from kiteline_codec.schema import KeyframeHeader, KeyframePose
+from kiteline_codec.schema import KeyframeHeader, KeyframePose, RefinedLandmarks, SubmapPlacement
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
-from kiteline_core.ids import NO_KEYFRAME, KeyframeId
+from kiteline_core.ids import NO_KEYFRAME, KeyframeId, SubmapId
 
 CAMERA = RectifiedCamera(752, 480, 400.0, 400.0, 370.0, 240.0, 0.11, True, np.eye(4))
 CONFIG = AgentConfig()
 STEP_M, SHARE = 1.0, 0.97  # between keyframes, as told; and what is left of it with the offset that was found
+TICK_NS = 50_000_000
 OFFSET_PX = np.array([1.0, 0.0, 0.0, 0.0, 0.0])
 
 
@@ -78,13 +79,74 @@ def test_poses_below_keyframes_that_moved_here_wait_for_those_between() -> None:
     assert flight.told(k4=4.02)  # both sides agree on all others
 
 
-def test_what_the_base_set_before_returns_with_what_it_sets_next() -> None:
+def test_poses_that_the_base_computed_before_it_knew_the_offset_do_not_undo_it() -> None:
     flight = _Flight(4)
     assert flight.told(k1=1.03, k2=2.06, k3=3.09)
     flight.find_offset()
-    assert flight.x_m == pytest.approx([0.0, 0.9991, 1.9982, 2.9973])
+    moved = [0.0, 0.9991, 1.9982, 2.9973]
+    assert flight.x_m == pytest.approx(moved)
+    flight.told(k1=1.031, k2=2.062, k3=3.093)
+    assert flight.x_m == pytest.approx([0.0, *(x + 0.001 * k for k, x in enumerate(moved[1:], 1))], abs=1e-4)
+
+
+def test_poses_of_a_base_that_knows_the_offset_are_taken_as_they_are() -> None:
+    flight = _Flight(4)
+    assert flight.told(k1=1.03, k2=2.06, k3=3.09)
+    flight.find_offset()
+    assert flight.told(k1=0.98, k2=1.96, k3=2.94)
+    assert flight.x_m == [0.0, 0.98, 1.96, 2.94]
+
+
+def test_what_the_base_set_before_stays_where_the_offset_moved_it_if_the_base_sets_a_part() -> None:
+    flight = _Flight(4)
+    assert flight.told(k1=1.03, k2=2.06, k3=3.09)
+    flight.find_offset()
     assert flight.told(k3=3.13)
-    assert flight.x_m == [0.0, 1.03, 2.06, 3.13]
+    assert flight.x_m == pytest.approx([0.0, 0.9991, 1.9982, 3.13 - 0.09 * 1.03])
+
+
+def test_landmarks_told_before_the_offset_was_found_are_corrected_by_it() -> None:
+    flight = _Flight(2)
+    flight.map.share(KeyframeId(1), 30)
+    rho = np.full(30, 0.27)
+    flight.corrections.take([RefinedLandmarks(KeyframeId(1), np.arange(30), rho, np.zeros((30, 2)))], [])
+    before = flight.map.rho[1, 0]
+    flight.find_offset()
+    assert flight.told(k1=1.06)
+    assert before != pytest.approx(0.27)
+    assert flight.map.rho[1, :30] == pytest.approx(0.27 - OFFSET_PX[0] / CAMERA.bf)
+
+
+@pytest.mark.parametrize("placed", [False, True])
+def test_live_poses_follow_an_offset_without_a_jump_whether_or_not_a_base_is_there(*, placed: bool) -> None:
+    """Keyframe and camera at 3 m move back by 90 mm at once; live poses do so in 33 frames."""
+    flight = _Flight(1)
+    if placed:
+        flight.corrections.take([SubmapPlacement(SubmapId(0), np.eye(4))], [])
+    live = [_live(flight, 0.0, 0)]
+    flight.corrections.move_on_board(SubmapId(0), np.eye(4))
+    live += [_live(flight, 0.09, n * TICK_NS) for n in range(1, 60)]
+    assert live[0] in (None, 3.0)  # in the submap, without a placement
+    steps = np.diff([3.0, *live[1:]])
+    assert steps.min() >= -0.003
+    assert steps.max() <= 1e-9
+    assert live[35] == pytest.approx(2.91)
+    assert np.ptp(live[35:]) < 1e-9
+
+
+def test_a_placement_that_comes_later_changes_the_frame_and_nothing_else() -> None:
+    flight = _Flight(1)
+    flight.corrections.move_on_board(SubmapId(0), np.eye(4))
+    before = _live(flight, 0.09, TICK_NS)
+    flight.corrections.take([SubmapPlacement(SubmapId(0), _at(7.0))], [])
+    assert before is not None
+    assert _live(flight, 0.09, 2 * TICK_NS) == pytest.approx(7.0 + before, abs=0.003)
+
+
+def _live(flight: _Flight, back_m: float, t_ns: int) -> float | None:
+    """x of the live pose of a vehicle at 3 m in o, whose map moved it back."""
+    T_w_b = flight.corrections.in_world(SubmapId(0), _at(3.0 - back_m), _at(back_m), t_ns, metric=True)
+    return None if T_w_b is None else float(T_w_b[0, 3])
 
 
 def test_keyframes_made_since_are_where_the_base_composes_them_if_their_parents_are() -> None:
@@ -92,9 +154,9 @@ def test_keyframes_made_since_are_where_the_base_composes_them_if_their_parents_
     flight.find_offset()
     flight.add(3, SHARE)
     flight.add(4, SHARE)
-    assert not flight.told(k4=4.0)
+    assert not flight.told(k4=3.9)
     assert flight.told(k1=0.98, k2=1.96)
-    assert flight.x_m == pytest.approx([0.0, 0.98, 1.96, 2.93, 4.0])
+    assert flight.x_m == pytest.approx([0.0, 0.98, 1.96, 2.93, 3.9])
 
 
 def test_without_an_offset_a_part_may_move() -> None:

@@ -267,8 +267,10 @@ class PoseCovariance:
         """
         m, errors = self._map, np.zeros(SHAPES)
         errors[:DISPARITY_SHAPES] = self._at_edge * offset
+        slots = np.flatnonzero(m.keyframe >> SEQUENCE_BITS == m.active)
         m.held.note_motion(m.active, m.keyframe, m.parent, m.T_m_k)
-        for slot in np.flatnonzero(m.keyframe >> SEQUENCE_BITS == m.active):
+        m.held.offsets.add(offset, m.keyframe[slots], -self._shift_k[slots] @ errors)
+        for slot in slots:
             m.T_m_k[slot] = se3.orthonormalise(se3.exp(-self._shift_k[slot] @ errors) @ m.T_m_k[slot])
         m.relate_to_parents()
         self._evidence = CalibrationEvidence(self._good_variance)

@@ -64,6 +64,7 @@ class Corrections:
         self._S_w_m: dict[SubmapId, F64] = {}
         self._recognised: set[SubmapId] = set()  # submaps whose placement rests on a merge at the base
         self._continued: SubmapId | None = None  # submap that began in a tracked frame
+        self._own_world: SubmapId | None = None  # submap that is w until it is placed: the agent moved it
         self._upright: GravityAlignment | None = None  # of the submap that began in motion
         self._most_tiles = most_tiles
         self.tiles: dict[tuple[int, int], GridTile] = {}
@@ -114,8 +115,10 @@ class Corrections:
         """Take over the corrections that wait, if they matter in the last frame. Returns whether the map moved."""
         if not (self._map.due and self._map.held.fit(self._map.keyframe, self._map.parent)):
             return False
+        m = self._map
+        m.held.adapt(m.keyframe, m.parent, m.T_m_k, m.camera.bf, m.least_rho)
         slots = self._slots_of_active()
-        poses = self._map.T_m_k[slots]
+        poses = m.T_m_k[slots]
         if anchor is not None and self._map.holds_landmarks:
             before = self._map.save()
             self._map.try_corrections(anchor.keyframes)
@@ -140,6 +143,7 @@ class Corrections:
     def _place(self, record: SubmapPlacement) -> bool:
         if not record.recognised and self._contradicts_gravity(record.submap, record.S_w_m):
             return False  # sent before the base knew of gravity; the upright placement follows
+        self._leave_own_world(record.submap, record.S_w_m)
         self._S_w_m[record.submap] = record.S_w_m
         self._scale_sigma[record.submap] = record.scale_sigma
         if record.recognised:
@@ -181,7 +185,24 @@ class Corrections:
         held = self._S_w_m.get(alignment.submap)
         recognised = alignment.submap in self._recognised
         if held is None or (not recognised and self._contradicts_gravity(alignment.submap, held)):
+            self._leave_own_world(alignment.submap, alignment.T_l_m)
             self._S_w_m[alignment.submap] = alignment.T_l_m
+
+    def move_on_board(self, submap: SubmapId, T_o_m: F64) -> None:
+        """The agent is about to move the map of a submap that lies at T_o_m (4,4): live poses follow without a jump.
+
+        With a base or without. Until the submap is placed, live poses stay in its frame.
+        """
+        if submap not in self._S_w_m and self._smoothing.held is None:
+            self._S_w_m[submap], self._own_world = np.eye(4), submap
+            self._smoothing.begin(se3.inverse(T_o_m))
+        self._smoothing.hasten()
+
+    def _leave_own_world(self, submap: SubmapId, S_w_m: F64) -> None:
+        """A submap that was w is placed (4,4): live poses change their frame at once."""
+        if submap == self._own_world:
+            self._smoothing.change_world(S_w_m)
+            self._own_world = None
 
     def _contradicts_gravity(self, submap: SubmapId, S_w_m: F64) -> bool:
         """True if a placement tilts a submap whose vertical the agent knows."""

@@ -19,6 +19,7 @@ class Smoothing:
         self._T_w_o: F64 | None = None  # as reported
         self._goal: F64 | None = None  # as corrected, at the last call
         self._t_ns = 0
+        self._hasty = False  # part of what is left is no correction of the base
 
     @property
     def on(self) -> bool:
@@ -33,6 +34,22 @@ class Smoothing:
     def snap(self) -> None:
         """Report the next corrected pose at once."""
         self._goal = None
+
+    def begin(self, T_w_o: F64) -> None:
+        """Corrections move the pose from here (4,4), if none was reported yet."""
+        if self._T_w_o is None:
+            self._T_w_o = self._goal = T_w_o
+
+    def change_world(self, S_n_w: F64) -> None:
+        """Poses are in frame n from now on, where w lies at S_n_w (4,4)."""
+        if self._T_w_o is not None:
+            self._T_w_o = sim3.normalise(S_n_w @ self._T_w_o)
+        if self._goal is not None:
+            self._goal = sim3.normalise(S_n_w @ self._goal)
+
+    def hasten(self) -> None:
+        """Follow faster until all that is left has been applied: the agent itself found what moved its map."""
+        self._hasty = True
 
     def hold(self, t_ns: int) -> None:
         """The held pose is reported once more: nothing moved until this time."""
@@ -58,6 +75,7 @@ class Smoothing:
             self._T_w_o = T_w_o
             return T_w_o
         if np.array_equal(self._T_w_o, T_w_o):
+            self._hasty = False
             return T_w_o
         if float(np.linalg.norm(_shift(before, T_w_o, here_o))) > limits.snap_m:
             self._T_w_o = T_w_o
@@ -70,11 +88,13 @@ class Smoothing:
         shift_share = turn_share = 1.0  # of what is left of the correction, applied in this time
         if limits.max_m_s > 0.0 and distance > 0.0:
             least = 0.0 if by_share else limits.max_m_s / distance
+            if self._hasty:
+                least = max(least, limits.onboard_m / (dt_s * distance))
             shift_share = min(1.0, max(least, 1.0 / limits.time_s) * dt_s)
         if limits.max_rad_s > 0.0 and angle > 0.0:
             turn_share = min(1.0, limits.max_rad_s * dt_s / angle)
         if shift_share >= 1.0 and turn_share >= 1.0:
-            self._T_w_o = T_w_o
+            self._T_w_o, self._hasty = T_w_o, False
             return T_w_o
         R = se3.so3_exp(turn_share * rotation) @ R_held
         at = se3.transform(held, here_o[None])[0] + shift_share * left

@@ -127,6 +127,7 @@ class DisparityAlignment:
             return False
         self._base_sigma_px = np.inf if sigma_px is None else sigma_px
         self._map.set_disparity_offset(offset)
+        self._map.held.offsets.base_knows_all()
         self.expected_cov = self._expected_cov()
         return True
 

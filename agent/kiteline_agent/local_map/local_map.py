@@ -344,7 +344,7 @@ class LocalMap:
             self._add_fresh(slot, index, rho, bearing)
             return bool(len(index))
         if len(index):
-            self.held.landmarks[record.keyframe] = index, rho, bearing
+            self.held.set_landmarks(record.keyframe, index, rho, bearing)
             turned = np.hypot(*(bearing - self.bearing[slot, index]).T) * self.camera.fx
             nearer = np.abs(rho - self.rho[slot, index]) * self.camera.bf
             px = np.maximum(turned, nearer)[~self._is_fresh(slot, index)]
@@ -379,8 +379,12 @@ class LocalMap:
         at = disparity_offset.terms(self.bearing[self.measured])
         change = at @ (offset - self.disparity_offset) / self.camera.bf
         self.disparity_offset = np.array(offset)
-        least = self.camera.fx / (self.camera.bf * self._config.max_far_ratio)
-        self.rho[self.measured] = np.maximum(self.rho[self.measured] - change, least)
+        self.rho[self.measured] = np.maximum(self.rho[self.measured] - change, self.least_rho)
+
+    @property
+    def least_rho(self) -> float:
+        """Smallest inverse depth, 1/m, that stereo measures."""
+        return self.camera.fx / (self.camera.bf * self._config.max_far_ratio)
 
     def relate_to_parents(self) -> None:
         """Set the poses of keyframes relative to their parents from those in the submap."""
