@@ -24,8 +24,6 @@ from kiteline_core.errors import INPUT_FAULTS
 from kiteline_core.geometry import sim3
 from kiteline_core.ids import (
     BOOT_BITS,
-    KEYPOINT_BITS,
-    SEQUENCE_BITS,
     SUBMAP_BITS,
     SubmapId,
     agent_of_submap,
@@ -107,13 +105,13 @@ class MapManager:
     # -- verbs: arguments and the time in ns -> JSON value, changes ----------------------------------------------------
 
     def _list(self, given: Mapping[str, Json], now_ns: int) -> tuple[Json, MergeResult]:
-        points = self._landmark_counts()
+        points = self._map.live_by_submap()
         maps = sorted({self._map.map_id(s) for s in self._map.submaps if s not in self._intake.deleted})
         return {"maps": [self._overview(map_id, points) for map_id in maps]}, NOTHING
 
     def _get(self, given: Mapping[str, Json], now_ns: int) -> tuple[Json, MergeResult]:
         map_id = self._named_map(given, "map")
-        out = self._overview(map_id, self._landmark_counts())
+        out = self._overview(map_id, self._map.live_by_submap())
         for submap, entry in zip(self._map.submaps_of_map(map_id), out["submaps"], strict=True):
             entry["T_map_m"] = numbers_of(sim3.inverse(self._map.submap_pose(map_id)) @ self._map.submap_pose(submap))
             entry["poses"] = [
@@ -133,7 +131,7 @@ class MapManager:
         self._names.pop(map_id, None)
         if name:
             self._names[map_id] = name
-        return self._overview(map_id, self._landmark_counts()), NOTHING
+        return self._overview(map_id, self._map.live_by_submap()), NOTHING
 
     def _merge(self, given: Mapping[str, Json], now_ns: int) -> tuple[Json, MergeResult]:
         merger = self._required_merger()
@@ -158,7 +156,7 @@ class MapManager:
             raise _Refused(f"{submap_name(other)} is in metres: it is merged without a scale")
         into_pose, other_pose = self._map.submap_pose(into), self._map.submap_pose(other)
         changes = merger.merge(other, into, sim3.normalise(into_pose @ S @ sim3.inverse(other_pose)))
-        return {"merged": True, **self._overview(into, self._landmark_counts())}, changes
+        return {"merged": True, **self._overview(into, self._map.live_by_submap())}, changes
 
     def _split(self, given: Mapping[str, Json], now_ns: int) -> tuple[Json, MergeResult]:
         merger = self._required_merger()
@@ -167,7 +165,7 @@ class MapManager:
         changes = merger.split(submap)
         if changes is None:
             raise _Refused(f"{submap_name(submap)} was not merged into another map: there is nothing to be undone")
-        points = self._landmark_counts()
+        points = self._map.live_by_submap()
         return {"maps": [self._overview(m, points) for m in (map_id, self._map.map_id(submap))]}, changes
 
     def _delete(self, given: Mapping[str, Json], now_ns: int) -> tuple[Json, MergeResult]:
@@ -203,13 +201,7 @@ class MapManager:
     def _named_map(self, given: Mapping[str, Json], key: str) -> SubmapId:
         return self._map.map_id(self._named_submap(given, key))
 
-    def _landmark_counts(self) -> dict[int, int]:
-        """Number of live landmarks by submap."""
-        anchors = self._map.landmark_ids(self._map.live_landmarks()) >> (SEQUENCE_BITS + KEYPOINT_BITS)
-        submaps, counts = np.unique(anchors, return_counts=True)
-        return dict(zip(submaps.tolist(), counts.tolist(), strict=True))
-
-    def _overview(self, map_id: SubmapId, points: Mapping[int, int]) -> Json:
+    def _overview(self, map_id: SubmapId, points: Mapping[SubmapId, int]) -> Json:
         submaps: list[dict[str, Json]] = []
         for submap in self._map.submaps_of_map(map_id):
             keyframes = self._map.submaps[submap]

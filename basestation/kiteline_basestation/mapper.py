@@ -243,7 +243,7 @@ class Mapper:
             **asdict(self.counts),
             "keyframes": len(self.map),
             "points": self.map.count_live(),
-            "observations": int(np.count_nonzero(self.map.keypoints.usable[: self.map.slots])),
+            "observations": int(self.map.keyframes.usable[: self.map.height].sum()),
             "map_bytes": self.map.nbytes(),
             "agents": agents,
             "submaps_placed": len(self.placements),

@@ -23,6 +23,7 @@ from kiteline_basestation.job_kinds import run_job
 from kiteline_basestation.jobs import Job, JobDone
 from kiteline_basestation.management import Command
 from kiteline_basestation.map.free_runs import FreeRuns
+from kiteline_basestation.map.map_tables import CULLED, LANDMARK
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.mapper import Mapper, MapperInput
 from kiteline_basestation.merging.correction import full_bundle_window, keyframes_of, move_keyframes, part_spans
@@ -162,6 +163,74 @@ def test_keyframes_after_a_moved_one_move_along_and_those_before_stay(mapped: tu
     sent = [r.keyframe for _, records in publisher.collect() for r in records if isinstance(r, KeyframePose)]
     assert sent == [k for k in keyframes if chosen <= k < held]
     move_keyframes(sparse_map, submap, before, publisher, PublishConfig())
+
+
+def chain(length: int) -> tuple[SparseMap, list[KeyframeId]]:
+    """Keyframes in a row, each composed from the one before."""
+    sparse_map, keyframes = SparseMap(), [keyframe_id(submap_id(0, 0, 0), i) for i in range(length)]
+    for i, (parent, keyframe) in enumerate(pairwise([NO_KEYFRAME, *keyframes])):
+        T_p_k = se3.exp(np.array([0.1, 0.0, 0.0, 0.0, 0.0, 0.001])) if i else np.eye(4)
+        sparse_map.add_keyframe(keyframe, i, parent, T_p_k, 0)
+    return sparse_map, keyframes
+
+
+def test_keyframes_without_refined_poses_are_moved_in_linear_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """2000 of them took 3 s, and 20,000 would have taken minutes: each one carried along all behind it."""
+    sparse_map, keyframes = chain(300)
+    targets = {
+        k: sparse_map.world_pose(k) @ se3.exp(np.array([0.01, 0.0, 0.0, 0.0, 0.0, 0.001])) for k in keyframes[1:]
+    }
+    updated: list[int] = []
+    update = sparse_map._update_world_pose
+    monkeypatch.setattr(sparse_map, "_update_world_pose", lambda row: (updated.append(row), update(row)))
+    move_keyframes(sparse_map, submap_id(0, 0, 0), targets, Publisher(sparse_map), PublishConfig())
+    assert len(updated) <= 2 * len(keyframes)
+    assert all(np.allclose(sparse_map.world_pose(k), T, atol=0.01) for k, T in targets.items())
+
+
+def test_keyframes_carried_along_to_their_targets_stay_composed_and_are_not_sent() -> None:
+    sparse_map, keyframes = chain(30)
+    step = se3.exp(np.array([0.2, 0.1, 0.0, 0.0, 0.0, 0.3]))
+    targets = {k: step @ sparse_map.world_pose(k) for k in keyframes[10:]}
+    targets[keyframes[20]] = targets[keyframes[20]] @ step
+    publisher = Publisher(sparse_map)
+    move_keyframes(sparse_map, submap_id(0, 0, 0), targets, publisher, PublishConfig())
+    sent = [r.keyframe for _, records in publisher.collect() for r in records if isinstance(r, KeyframePose)]
+    assert sent == [keyframes[n] for n in (10, 20, 21)]
+    assert all(np.allclose(sparse_map.world_pose(k), T, atol=1e-9) for k, T in targets.items())
+
+
+def test_counts_of_landmarks_and_observations_follow_the_map(make_flight: MakeFlight) -> None:
+    """They are kept by keyframe: the page of a map of 20,000 keyframes counted seven million keypoints each time."""
+    flight, mapper = make_flight(keyframes=30), Mapper(WITHOUT_GRID)
+    feed(mapper, [flight])
+    sparse_map, table = mapper.map, mapper.map.keypoints
+    height = len(sparse_map.keyframes.id)
+
+    def check() -> None:
+        live = sparse_map.live_landmarks()
+        assert sparse_map.count_live() == len(live) == sum(sparse_map.live_by_submap().values())
+        assert np.array_equal(sparse_map.keyframes.live, np.bincount(table.row[live], minlength=height))
+        assert sparse_map.keyframes.usable.sum() == np.count_nonzero(table.usable[: sparse_map.slots])
+
+    check()
+    roots = sparse_map.live_landmarks()
+    fused = [
+        sparse_map.slots_of(k)[(table.kind[s := sparse_map.slots_of(k)] == LANDMARK) & (table.root[s] != s)]
+        for k in flight.keyframes
+    ]
+    again = np.concatenate(fused)
+    assert len(again) > 0
+    sparse_map.unfuse(again)
+    check()
+    sparse_map.fuse(int(roots[5]), int(roots[2]))
+    sparse_map.set_flags(roots[7:9], CULLED)
+    check()
+    sparse_map.cull_keyframe(flight.keyframes[4])
+    check()
+    sparse_map.forget([submap_of_keyframe(flight.keyframes[0])])
+    check()
+    assert sparse_map.count_live() == 0
 
 
 def test_many_corrections_are_sent_newest_first_a_batch_at_a_time(mapped: tuple[Any, Mapper]) -> None:

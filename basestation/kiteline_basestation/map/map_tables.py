@@ -34,6 +34,8 @@ class KeyframeTable:
     start: I32  # first slot of its keypoints
     count: I32  # number of keypoints
     filled: I32  # number of keypoints that have arrived
+    usable: I32  # number of keypoints that are usable
+    live: I32  # number of root landmarks that are not culled
     culled: U8  # 1: its observations are not used any more
     camera: F64  # (n,5) fx fy cx cy bf in px and px*m
     scale: F64  # (n,) length in w of one unit of the submap; 1 unless the submap is monocular
@@ -133,7 +135,7 @@ def empty_keyframes() -> KeyframeTable:
     """A keyframe table without rows."""
     i64, u8, i32 = np.zeros(0, np.int64), np.zeros(0, np.uint8), np.zeros(0, np.int32)
     t = np.zeros((0, 4, 4))
-    return KeyframeTable(i64, i64, i64, t, t, t, u8, i32, i32, i32, u8, np.zeros((0, 5)), np.zeros(0))
+    return KeyframeTable(i64, i64, i64, t, t, t, u8, i32, i32, i32, i32, i32, u8, np.zeros((0, 5)), np.zeros(0))
 
 
 def empty_keypoints() -> KeypointTable:

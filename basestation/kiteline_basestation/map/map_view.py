@@ -178,17 +178,28 @@ class MapView:
 
     def live_landmarks(self) -> I32:
         """Slots of all root landmarks that are not culled, in order of id."""
+        here = np.arange(self.slots, dtype=np.int32)
+        return self.sorted_by_id(here[self.is_live(here)])
+
+    def is_live(self, slots: I32) -> Bool:
+        """Whether slots (n,) are root landmarks that are not culled."""
         table = self.keypoints
-        n = self.slots
-        here = np.arange(n, dtype=np.int32)
-        live = (table.kind[:n] == LANDMARK) & (table.root[:n] == here) & (table.flags[:n] & CULLED == 0)
-        return self.sorted_by_id(here[live])
+        is_root = (table.kind[slots] == LANDMARK) & (table.root[slots] == slots)
+        return np.asarray(is_root & (table.flags[slots] & CULLED == 0))
+
+    def live_in(self, row: int) -> int:
+        """Number of root landmarks of a keyframe that are not culled."""
+        start = int(self.keyframes.start[row])
+        slots = np.arange(start, start + int(self.keyframes.count[row]), dtype=np.int32)
+        return int(np.count_nonzero(self.is_live(slots)))
 
     def count_live(self) -> int:
         """Number of root landmarks that are not culled."""
-        table, n = self.keypoints, self.slots
-        is_root = table.root[:n] == np.arange(n, dtype=np.int32)
-        return int(np.count_nonzero(is_root & (table.kind[:n] == LANDMARK) & (table.flags[:n] & CULLED == 0)))
+        return int(self.keyframes.live[: self.height].sum())
+
+    def live_by_submap(self) -> dict[SubmapId, int]:
+        """Number of root landmarks that are not culled, by submap."""
+        return {submap: int(self.keyframes.live[self.rows_of(submap)].sum()) for submap in self.submaps}
 
     def observations(self, landmarks: I32) -> tuple[I32, I32]:
         """Valid observations of landmarks (n,), in order of keyframe id, one per keyframe.

@@ -165,8 +165,8 @@ class SparseMap(RigValues):
 
     # -- values of the base ------------------------------------------------------------------------------------------
 
-    def set_pose(self, keyframe: KeyframeId, T_m_k: F64) -> None:
-        """Set the refined pose (4,4) of a keyframe; descendants without a refined pose move along."""
+    def set_pose(self, keyframe: KeyframeId, T_m_k: F64, *, carry: bool = True) -> None:
+        """Set the refined pose (4,4) of a keyframe. carry: descendants without a refined pose move along."""
         row = self.rows[keyframe]
         had = self.keyframes.pose_source[row]
         self.keyframes.T_m_k[row] = T_m_k
@@ -174,12 +174,20 @@ class SparseMap(RigValues):
         self.keyframes.pose_source[row] = REFINED_POSE
         if had == NO_POSE:
             self._refresh_usable(row)
-        self._compose_children(keyframe)
+        if carry:
+            self._compose_children(keyframe)
 
-    def set_world_pose(self, keyframe: KeyframeId, T_w_k: F64) -> None:
-        """Set the refined pose (4,4) of a keyframe, given in w; its submap does not move."""
-        S_w_m = self.submap_poses.get(submap_of_keyframe(keyframe))
-        self.set_pose(keyframe, T_w_k if S_w_m is None else se3.orthonormalise(sim3.place(sim3.inverse(S_w_m), T_w_k)))
+    def set_world_pose(self, keyframe: KeyframeId, T_w_k: F64, *, carry: bool = True) -> None:
+        """Set the refined pose (4,4) of a keyframe, given in w; its submap does not move. carry: as for `set_pose`."""
+        if (S_w_m := self.submap_poses.get(submap_of_keyframe(keyframe))) is not None:
+            T_w_k = se3.orthonormalise(sim3.place(sim3.inverse(S_w_m), T_w_k))
+        self.set_pose(keyframe, T_w_k, carry=carry)
+
+    def compose(self, keyframe: KeyframeId) -> None:
+        """Compose the pose of a keyframe without a refined one from its parent's pose; its children stay."""
+        table, row = self.keyframes, self.rows[keyframe]
+        table.T_m_k[row] = table.T_m_k[self.rows[KeyframeId(int(table.parent[row]))]] @ table.T_p_k[row]
+        self._update_world_pose(row)
 
     def move_submap(self, submap: SubmapId, S_w_m: F64) -> None:
         """Set S_w_m (4,4) of a submap; its keyframes and landmarks move along."""
@@ -223,6 +231,7 @@ class SparseMap(RigValues):
         """
         table = self.keypoints
         one = np.array([child], np.int32)
+        self.keyframes.live[table.row[child]] -= self.is_live(one)[0]
         moved = np.empty(kernels.count(one, table.first, table.next), np.int32)
         kernels.fuse(child, parent, table.root, table.first, table.next, moved)
         landmarks = moved[table.kind[moved] == LANDMARK]
@@ -233,6 +242,8 @@ class SparseMap(RigValues):
         """Undo `fuse`: each landmark (n,) is a root again, with the observations that name it."""
         table = self.keypoints
         kernels.link(landmarks, landmarks, table.root, table.first, table.next)
+        for row in np.unique(table.row[landmarks]).tolist():
+            self.keyframes.live[row] = self.live_in(row)
         linked = (table.kind[: self.slots] == OBSERVATION) & (table.root[: self.slots] >= 0)
         slots = np.flatnonzero(linked).astype(np.int32)
         self._link_observations(slots[np.isin(self.find_landmarks(table.landmark[slots]), landmarks)])
@@ -251,6 +262,8 @@ class SparseMap(RigValues):
             fused, left = outside[is_landmark], outside[~is_landmark]
             kernels.link(left, np.full(len(left), -1, np.int32), table.root, table.first, table.next)
             kernels.link(fused, fused, table.root, table.first, table.next)  # they are roots again
+            for row in np.unique(table.row[fused]).tolist():
+                self.keyframes.live[row] = self.live_in(row)
             clear(table, here)
             for links in (table.root, table.first, table.next, table.landmark):
                 links[here] = -1
@@ -338,6 +351,8 @@ class SparseMap(RigValues):
         open_ = self.keyframes.culled[row] == 0 and self.keyframes.pose_source[row] != NO_POSE
         here = table.kind[mine] != EMPTY
         table.usable[mine] = here & (table.flags[mine] & REMOVED == 0) & open_
+        self.keyframes.usable[row] = np.count_nonzero(table.usable[mine])
+        self.keyframes.live[row] = self.live_in(row)
         filled = int(np.count_nonzero(here))
         submap = submap_of_keyframe(KeyframeId(int(self.keyframes.id[row])))
         self.keypoints_of[submap] = self.keypoints_of.get(submap, 0) + filled - int(self.keyframes.filled[row])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import compress
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,7 +89,9 @@ def move_keyframes(
     """
     table, rows_by_id = sparse_map.keyframes, sparse_map.rows
     goal = dict(targets)
-    changed = [k for k, T in targets.items() if not np.array_equal(T, table.T_w_k[rows_by_id[k]])]
+    here = table.T_w_k[[rows_by_id[k] for k in targets]]
+    differ = (np.array(list(targets.values())).reshape(-1, 4, 4) != here).any(axis=(1, 2))
+    changed = list(compress(targets, differ.tolist()))
     for keyframe in _carried(sparse_map, changed, targets):
         parent = KeyframeId(int(table.parent[rows_by_id[keyframe]]))
         above, old = table.T_w_k[rows_by_id[parent]], table.T_w_k[rows_by_id[keyframe]]
@@ -110,12 +113,19 @@ def move_keyframes(
     if not moving:
         return has_moved
     rows, new = np.array([rows_by_id[k] for k in moving]), np.stack([goal[k] for k in moving])
-    composed = table.pose_source[rows] != REFINED_POSE  # these are carried along as their parents are set
-    for i in np.flatnonzero(_differ(table.T_w_k[rows], new, publish) | composed).tolist():
-        if composed[i] and not _differ(table.T_w_k[rows[i : i + 1]], new[i : i + 1], publish)[0]:
-            continue
-        sparse_map.set_world_pose(moving[i], new[i])
-        publisher.mark_changed(KeyframePose.KIND, moving[i])
+    composed = table.pose_source[rows] != REFINED_POSE  # these are carried along as their parents move
+    moved: set[KeyframeId] = set()
+    for i in np.flatnonzero(_differ(table.T_w_k[rows], new, publish) | composed).tolist():  # parents first
+        keyframe, row = moving[i], rows[i]
+        if composed[i]:
+            if KeyframeId(int(table.parent[row])) in moved:
+                sparse_map.compose(keyframe)
+                moved.add(keyframe)
+            if not _differ(table.T_w_k[rows[i : i + 1]], new[i : i + 1], publish)[0]:
+                continue
+        sparse_map.set_world_pose(keyframe, new[i], carry=False)
+        moved.add(keyframe)
+        publisher.mark_changed(KeyframePose.KIND, keyframe)
     return has_moved
 
 

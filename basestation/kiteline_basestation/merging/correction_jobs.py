@@ -143,7 +143,8 @@ class CorrectionJobs:
         """Start pose graphs that are due, then full bundles of maps without a pending graph."""
         sizes = self._sizes()
         self._deleted.intersection_update(self._map.submaps)
-        grown = self._schedule.next(sizes, [p for p in sizes if self.is_busy(self._map.map_id(p[0]))], now_ns)
+        busy = {*self.graphs_due, *self.bundles_due}
+        grown = self._schedule.next(sizes, [p for p in sizes if self._map.map_id(p[0]) in busy], now_ns)
         if grown is not None:
             map_id = self._map.map_id(grown[0])
             self._bundles_due[map_id] = None if self.fits(map_id) else grown

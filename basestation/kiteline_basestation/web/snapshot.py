@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from kiteline_basestation.grid.grid_view import GridView
 from kiteline_basestation.grid.placed_map import placed_map
+from kiteline_basestation.map.map_tables import NO_POSE
 from kiteline_basestation.mapper import Mapper
 from kiteline_basestation.station import Station
 from kiteline_codec.channel import CodedChannel
-from kiteline_core.ids import KEYPOINT_BITS, SEQUENCE_BITS, AgentId, SubmapId, agent_of_submap
+from kiteline_core.ids import AgentId, agent_of_submap
 
 F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]
@@ -106,23 +107,20 @@ def take_snapshot(
 
 def _path(mapper: Mapper, agent: AgentId) -> F64:
     """Positions (k,3) in w of an agent's keyframes in placed submaps, in order of id."""
-    parts = [np.zeros((0, 3))]
+    parts, table = [np.zeros((0, 3))], mapper.map.keyframes
     for submap in sorted(mapper.placements):
         if agent_of_submap(submap) == agent:
-            poses = [mapper.map.pose(keyframe) for keyframe in mapper.map.submaps.get(submap, [])]
-            known = np.array([pose for pose in poses if pose is not None]).reshape(-1, 4, 4)
+            rows = mapper.map.rows_of(submap)
+            rows = rows[table.pose_source[rows] != NO_POSE]
             S_w_m = mapper.placements[submap]
-            parts.append(known[:, :3, 3] @ S_w_m[:3, :3].T + S_w_m[:3, 3])
+            parts.append(table.T_m_k[rows, :3, 3] @ S_w_m[:3, :3].T + S_w_m[:3, 3])
     return np.concatenate(parts)
 
 
 def _landmarks_by_agent(mapper: Mapper) -> dict[AgentId, int]:
     """Number of root landmarks of each agent."""
-    submaps, count = np.unique(
-        mapper.map.landmark_ids(mapper.map.live_landmarks()) >> (SEQUENCE_BITS + KEYPOINT_BITS), return_counts=True
-    )
     out: dict[AgentId, int] = {}
-    for submap, n in zip(submaps.tolist(), count.tolist(), strict=True):
-        agent = agent_of_submap(SubmapId(submap))
-        out[agent] = out.get(agent, 0) + n
+    for submap, count in mapper.map.live_by_submap().items():
+        agent = agent_of_submap(submap)
+        out[agent] = out.get(agent, 0) + count
     return out
