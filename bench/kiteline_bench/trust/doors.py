@@ -75,6 +75,7 @@ def doors(folder: Path) -> list[Door]:
         return written
 
     mapper = Mapper(BaseConfig())
+    sensors = (_SENSOR.encode(), b"[" * 4000, b"{a: " * 4000)
     return [
         Door("question", lambda data, draw: _ask(mapper, data, draw), _questions()),
         Door("saved map", lambda data, draw: unpack(data), (_packed(),)),
@@ -86,8 +87,8 @@ def doors(folder: Path) -> list[Door]:
         Door("rig", lambda data, draw: rig_from_json(_json(data)), (rig,)),
         Door("image", lambda data, draw: decode_grey(EncodedImage(data, "png")), tuple(images.values())),
         Door("depth image", lambda data, draw: decode_depth(EncodedImage(data, "png/1000")), tuple(images.values())),
-        Door("calibration", by_file("c.yaml", lambda path: read_calibration(str(path))), (_SENSOR.encode(),)),
-        Door("sensor file", by_file("s.yaml", lambda path: read_yaml(path, "a sensor")), (_SENSOR.encode(),)),
+        Door("calibration", by_file("c.yaml", lambda path: read_calibration(str(path))), sensors),
+        Door("sensor file", by_file("s.yaml", lambda path: read_yaml(path, "a sensor")), sensors),
         Door("EuRoC's listing", by_file("flight/mav0/cam0/data.csv", lambda _: _frames(euroc, flight.parent.parent)),
              (b"1,1.png\n2,1.png\n",)),
         Door("TUM's listing", by_file("rgbd/rgb.txt", lambda _: _frames(tum, table)), (b"1.0 rgb/1.png\n",)),

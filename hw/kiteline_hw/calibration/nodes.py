@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import reprlib
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,6 +18,7 @@ from kiteline_hw.ports import SourceError
 F64 = NDArray[np.float64]
 
 _MOST_BYTES = 1 << 16  # calibration files are a few kB
+_MOST_NESTED = 16  # brackets in brackets: calibrations have two; a YAML reader takes time by the square of them
 _MOST_ROWS = 1000  # of a matrix
 _MOST_PX = 100_000  # of an image's side
 
@@ -114,6 +116,8 @@ def read_nodes(path: Path) -> Node:
     # OpenCV's head "%YAML:1.0" is no YAML.
     lines = data.decode("utf-8", "replace").splitlines()
     text = "\n".join("" if line.startswith("%") else line for line in lines)
+    if _nested(text) > _MOST_NESTED:
+        raise SourceError(f"{path}: lists nested more than {_MOST_NESTED} deep: expected a calibration file")
     try:
         value = yaml.load(text, Loader=yaml.BaseLoader)  # all scalars stay texts, tags are ignored
     except (yaml.YAMLError, ValueError, TypeError, *INPUT_FAULTS) as error:
@@ -121,6 +125,15 @@ def read_nodes(path: Path) -> Node:
     if not isinstance(value, dict):
         raise SourceError(f"{path}: expected a calibration file in YAML: keys with values")
     return Node(path, "", value)
+
+
+def _nested(text: str) -> int:
+    """How deep brackets stand in brackets, at most; those in texts count as well."""
+    most = depth = 0
+    for bracket in re.findall(r"[][{}]", text):
+        depth = depth + 1 if bracket in "[{" else max(0, depth - 1)
+        most = max(most, depth)
+    return most
 
 
 def _number(value: object) -> float:
