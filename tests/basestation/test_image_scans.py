@@ -84,9 +84,13 @@ def test_an_image_gives_the_scan_that_the_agent_would_make() -> None:
     seen = segmenter.segment(stripes.measure_begun(), stripes.pair, UP)
     ours, theirs = result.seen.scan, seen.scan
     assert ours.camera_height_m == pytest.approx(theirs.camera_height_m, abs=0.03)
-    both = np.isfinite(ours.obstacle_m) & np.isfinite(theirs.obstacle_m)
-    assert both.mean() > 0.5 and np.median(np.abs(ours.obstacle_m[both] - theirs.obstacle_m[both])) < 0.02
-    assert np.median(np.abs(ours.obstacle_m[both] * np.cos(ours.azimuths_rad[both]) - WALL_M)) < 0.1
+    assert abs(len(ours) - len(theirs)) <= 2  # columns at the sides, of which little is seen
+    _, a, b = np.intersect1d(ours.azimuths_rad.round(6), theirs.azimuths_rad.round(6), return_indices=True)
+    both = np.isfinite(ours.obstacle_m[a]) & np.isfinite(theirs.obstacle_m[b])
+    assert both.mean() > 0.5
+    a, b = a[both], b[both]
+    assert np.median(np.abs(ours.obstacle_m[a] - theirs.obstacle_m[b])) < 0.02
+    assert np.median(np.abs(ours.obstacle_m[a] * np.cos(ours.azimuths_rad[a]) - WALL_M)) < 0.1
 
 
 def result_of(job: Job, obstacle_m: float = 4.0, lowest_m: float = HEIGHT_M) -> JobDone:

@@ -16,6 +16,16 @@ _LEAST_ENERGY = 300.0  # grey levels^2 of a surface's gradients: 0.06 px for an 
 _MOST_STEP_PX = 0.4  # px of a refinement: more is another surface
 _NEVER = 1 << 30  # pixels
 _OUTLIERS = 0.15  # share of a surface's pixels that are outliers
+_FALL_M = 0.12  # below the ground, at least, of a pixel that shows that it falls: a step
+_FALL_SIGMAS = 3.0  # the same in standard deviations of its height
+_FALL_BINS = 2  # before the ray on which a fall is seen: matched blocks carry an edge on by half their rows
+_STEP_M = 0.06  # by which ground falls within _STEP_OVER_M, beyond a slope of _STEP_SLOPE: a step, no ramp
+_STEP_SLOPE = 0.15
+_STEP_OVER_M = 0.8
+_STEP_PIXELS = 8  # that tell a height on either side of it
+_NOTHING, _WALL, _FALL = 0, 1, 2  # before which ground ends
+_LEAST_BINS = 3  # of disparity over which ground is seen, at least: less is a wall's foot
+_OPEN_SIGMAS = 2.0  # standard deviations by which ground that ends before no obstacle ends earlier
 
 
 @njit
@@ -36,12 +46,13 @@ def mark_texture(image, least, reach, out):  # type: ignore[no-untyped-def]
 @njit
 def label_points(  # type: ignore[no-untyped-def]
     x, z, column, textured, ground, seen, bf, sigma_px, ground_m, sigmas, most_m, bands, slab_m, labels, grounds,
-    obstacles, sums, in_band, slab, slab_sums,
+    obstacles, falls, heights, sums, in_band, slab, slab_sums,
 ):  # fmt: skip
     """Label pixels (h,w), and count them by column and bin (n, bins): ground, obstacles, their band, and the slab.
 
     ground: (bins+1,) slope -z/x of the ground at the borders of bins; seen: (bins,) whether it was seen there.
     most_m: heights beyond are not ground, however uncertain. bands: (b,) heights. sums: of disparities of obstacles.
+    falls: pixels below the ground, where their rays pass through it. heights: sums of z of ground.
     in_band: (n, bins, b-1). slab, slab_sums: within slab_m of the camera's height. Labels and counts are zero before.
     Returns how many pixels lie on the ground that was seen, and how many below it.
     """
@@ -69,6 +80,7 @@ def label_points(  # type: ignore[no-untyped-def]
                 if seen[j] and textured[v, u] and abs(height) <= most_m:
                     labels[v, u] = GROUND
                     grounds[c, j] += 1
+                    heights[c, j] += z[v, u]
             elif height > 0.0:
                 labels[v, u] = OBSTACLE
                 if bands[0] <= height < bands[last]:
@@ -78,8 +90,14 @@ def label_points(  # type: ignore[no-untyped-def]
                     obstacles[c, j] += 1
                     sums[c, j] += d
                     in_band[c, j, b] += 1
-            elif height < -limit - _LOWER_M:
-                under += seen[j]
+            elif height < -limit:
+                if height < -max(_FALL_M, _FALL_SIGMAS * sigma):
+                    at = j
+                    while at < bins - 1 and ground[at + 1] * x[v, u] < -z[v, u]:
+                        at += 1
+                    falls[c, at] += 1
+                if height < -limit - _LOWER_M:
+                    under += seen[j]
     return on, under
 
 
@@ -210,16 +228,57 @@ def refine_surfaces(left, right, rotation, camera, bf, offset, x, z, column, lab
 
 
 @njit
-def _longest_ground(grounds, obstacles, least, begin_m, end_m, lowest, bf, sigma_px, gap_m):  # type: ignore[no-untyped-def]
+def _is_fall(grounds, falls, at, least):  # type: ignore[no-untyped-def]
+    """True if as many pixels as lie on the ground of a bin, and at least so many, lie below it, or right behind it."""
+    for i in range(max(at - _FALL_BINS, 0), at + 1):
+        below, on = 0, 0
+        for k in range(max(i - 1, 0), min(i + 2, len(grounds))):
+            below += falls[k]
+            on += grounds[k]
+        if below >= least and below >= on:
+            return True
+    return False
+
+
+@njit
+def _is_step(grounds, heights, at, bf):  # type: ignore[no-untyped-def]
+    """True if ground in a bin lies lower than nearer ground by more than a ramp would; heights: sums of z."""
+    bins = len(grounds)
+    n, low = 0, 0.0
+    for i in range(max(at - 1, 0), at + 1):
+        n += grounds[i]
+        low += heights[i]
+    if n < _STEP_PIXELS:
+        return False
+    low /= n
+    far = bf / ((at + 0.5) * BIN_PX)
+    for k in range(at + 2, bins - 1):
+        apart = far - bf / ((k + 0.5) * BIN_PX)
+        if apart > _STEP_OVER_M:
+            return False
+        m, high = 0, 0.0
+        for i in range(k - 1, k + 2):
+            m += grounds[i]
+            high += heights[i]
+        if m >= _STEP_PIXELS and high / m - low > _STEP_M + _STEP_SLOPE * apart:
+            return True
+    return False
+
+
+@njit
+def _longest_ground(  # type: ignore[no-untyped-def]
+    grounds, heights, obstacles, falls, least, least_falls, begin_m, end_m, lowest, bf, sigma_px, gap_m
+):
     """From where and up to where ground was seen in counts (bins,), between two ranges; 0, 0 if it was not.
 
-    And whether it ended before an obstacle. The longest part with gaps of at most gap_m, or three deviations of the
-    range, and without `least` pixels of obstacles (bins,) at the same range: those stand there, or hang above.
-    bf: px m along the column.
+    And whether it ended before a _WALL, a _FALL or _NOTHING, and whether it began behind a fall. The longest part with
+    gaps of at most gap_m, or two deviations of the range, and without `least` pixels of obstacles (bins,) at the same
+    range: those stand there, or hang above. Nor is a step within it, nor `least_falls` pixels below it. bf: px m along
+    the column.
     """
     bins = len(grounds)
     half = int(_PX / BIN_PX)
-    best_from, best, start, last, ended = 0.0, 0.0, 0.0, 0.0, False
+    best_from, best, start, last, ended, fell, behind = 0.0, 0.0, 0.0, 0.0, _NOTHING, False, False
     for j in range(bins - 1, lowest - 1, -1):
         near, far = bf / ((j + 1) * BIN_PX), bf / ((j if j else 0.5) * BIN_PX)
         if near < begin_m:
@@ -227,25 +286,30 @@ def _longest_ground(grounds, obstacles, least, begin_m, end_m, lowest, bf, sigma
         above = 0
         for i in range(max(j - half, 0), min(j + half + 1, bins)):
             above += obstacles[i]
-        if above >= least:
-            ended, last = ended or (last > 0.0 and last == best), 0.0
+        falling = _is_fall(grounds, falls, j, least_falls) or (last > 0.0 and _is_step(grounds, heights, j, bf))
+        if above >= least or falling:
+            if last > 0.0 and last == best:
+                ended = _FALL if falling else _WALL
+            last, fell = 0.0, fell or falling
             continue
         if grounds[j] < 2:
             continue
         if near >= end_m:
             break
-        if last == 0.0 or near - last > max(gap_m, 3.0 * near * sigma_px / ((j + 1) * BIN_PX)):
+        if last == 0.0 or near - last > max(gap_m, 2.0 * near * sigma_px / ((j + 1) * BIN_PX)):
             start = near
         last = far
         if last - start > best - best_from:
-            best_from, best, ended = start, last, False
-    return best_from, min(best, end_m), ended
+            best_from, best, ended, behind = start, last, _NOTHING, fell
+    if best > 0.0 and bf / BIN_PX * (1.0 / best_from - 1.0 / best) < _LEAST_BINS - 0.5:
+        return 0.0, 0.0, ended, False
+    return best_from, min(best, end_m), ended, behind
 
 
 @njit
 def collect_scan(  # type: ignore[no-untyped-def]
-    grounds, obstacles, least, surface, bands, limits, height, azimuth, bf, lowest, sigma_px, gap_m, free_from, free,
-    obstacle, clear,
+    grounds, heights, obstacles, falls, least, surface, bands, limits, height, azimuth, bf, lowest, sigma_px, gap_m,
+    free_from, free, obstacle, clear,
 ):  # fmt: skip
     """Ranges (n,) in m of a column scan from ground and obstacles counted over (n, bins) and surfaces (n,2).
 
@@ -262,24 +326,45 @@ def collect_scan(  # type: ignore[no-untyped-def]
             clear[c] = bf / surface[c, 1] * along
             if abs(surface[c, 1] - surface[c, 0]) < _SAME_PX:
                 clear[c] = obstacle[c]  # the same surface: the obstacle's mean is that of more pixels
-        free_from[c], free[c], _ = _longest_ground(
-            grounds[c], obstacles[c], _NEVER, 0.0, obstacle[c], lowest, bf * along, sigma_px, gap_m
-        )
+        free_from[c], free[c], ended, behind = _longest_ground(
+            grounds[c], heights[c], obstacles[c], falls[c], _NEVER, least, 0.0, obstacle[c], lowest, bf * along,
+            sigma_px, gap_m,
+        )  # fmt: skip
+        deviation = obstacle[c] * sigma_px / surface[c, 0] if obstacle[c] < np.inf else 0.0
+        if free[c] > 0.0 and ended == _NOTHING and obstacle[c] - free[c] < max(gap_m, 3.0 * deviation):
+            free[c] = obstacle[c]  # up to its foot
+        elif free[c] > 0.0:
+            free[c] = _open_end(free[c], bf * along, sigma_px)
+        if behind:
+            free_from[c] = _open_start(free_from[c], limits[0] / height, bf * along, sigma_px)
         if obstacle[c] < np.inf:
-            deviation = obstacle[c] * sigma_px / surface[c, 0]
-            if free[c] > 0.0 and obstacle[c] - free[c] < max(gap_m, 3.0 * deviation):
-                free[c] = obstacle[c]  # up to its foot
             top = 0
             while bands[c] >> (top + 1):
                 top += 1
-            if height <= limits[top]:
-                continue
-            over = obstacle[c] / (1.0 - limits[top] / height)
-            begin, end, ended = _longest_ground(
-                grounds[c], obstacles[c], least, max(obstacle[c] + 3.0 * deviation, over), np.inf, lowest, bf * along,
-                sigma_px, gap_m,
-            )  # fmt: skip
-            if not ended:  # what else stands there is not in the scan
-                end -= 2.0 * end * end / (bf * along) * sigma_px
-            if end - begin > free[c] - free_from[c]:  # seen over a low obstacle
-                free_from[c], free[c] = begin, end
+            if height > limits[top]:
+                over = obstacle[c] / (1.0 - limits[top] / height)
+                begin, end, ended, _ = _longest_ground(
+                    grounds[c], heights[c], obstacles[c], falls[c], least, least,
+                    max(obstacle[c] + 3.0 * deviation, over), np.inf, lowest, bf * along, sigma_px, gap_m,
+                )  # fmt: skip
+                if ended != _WALL:  # what else stands there is not in the scan
+                    end = _open_end(end, bf * along, sigma_px)
+                if end - begin > free[c] - free_from[c]:  # seen over a low obstacle
+                    free_from[c], free[c] = begin, end
+        if free[c] <= free_from[c]:
+            free_from[c], free[c] = 0.0, 0.0
+
+
+@njit
+def _open_end(end, bf, sigma_px):  # type: ignore[no-untyped-def]
+    """A range up to which ground was seen, less the deviation of its last pixels: a pit may begin there."""
+    return bf / (bf / end + _OPEN_SIGMAS * sigma_px) if end > 0.0 else 0.0
+
+
+@njit
+def _open_start(start, low, bf, sigma_px):  # type: ignore[no-untyped-def]
+    """A range from which ground was seen behind a fall, later by the deviation of its first pixels.
+
+    low: part of it before it in which a grid takes rays for so low that cells are free.
+    """
+    return bf / max(bf / start - _OPEN_SIGMAS * sigma_px, BIN_PX) / (1.0 - min(low, 0.5))

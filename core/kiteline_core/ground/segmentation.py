@@ -119,7 +119,8 @@ class GroundSegmenter:
         self._column, self._known = np.empty((h, w), np.int16), np.empty((n, 2), np.int32)
         self.labels = np.zeros((h, w), np.uint8)
         self._textured = np.ones((h, w), np.bool_)
-        self._counts, self._sums = np.empty((4, n, bins), np.int32), np.empty((n, bins))
+        self._counts, self._sums = np.empty((5, n, bins), np.int32), np.empty((n, bins))
+        self._ground_heights = np.empty((n, bins))
         self._slab_sums = np.empty((n, bins))
         self._surface, self._surface_sums = np.empty((n, 2)), np.empty((n, 2, 5))
         self._upright = np.empty((n, bins), np.bool_)
@@ -305,17 +306,19 @@ class GroundSegmenter:
         if ground is not None:
             profile_kernels.sample_spline(ground.coefficients, ground.low_px, ground.high_px, borders, slope)
             seen = (borders[:-1] >= ground.low_px - _BEYOND_PX) & (borders[1:] <= ground.high_px * _NEARER)
+            seen[: _beyond_fall(slope, seen, self.bf, config.curve_slope)] = False
             height_m = ground.height_m
         elif expected is not None:
             slope, height_m = borders * (expected.height_m / self.bf), expected.height_m
-        grounds, obstacles, slab = self._counts[1:]
+        grounds, obstacles, falls, slab = self._counts[1:]
         self.labels.fill(label_kernels.UNKNOWN)
-        for counts in (self._counts[1:], self._sums, self._in_band, self._slab_sums, self._surface_sums):
+        summed = self._sums, self._ground_heights, self._in_band, self._slab_sums, self._surface_sums
+        for counts in (self._counts[1:], *summed):
             counts.fill(0)
         on, under = label_kernels.label_points(
             self.x, self.z, self._column, self._textured, slope, seen, self.bf, self.sigma_px, config.ground_m,
             config.ground_sigmas, config.ground_most_m, self._bands, config.slab_m, self.labels, grounds, obstacles,
-            self._sums, self._in_band, slab, self._slab_sums,
+            falls, self._ground_heights, self._sums, self._in_band, slab, self._slab_sums,
         )  # fmt: skip
         if ground is not None and under > _UNDER * on:
             return self._scan(None, view, expected)[0], True
@@ -331,8 +334,8 @@ class GroundSegmenter:
             )  # fmt: skip
         free_from, free, obstacle, clear = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
         label_kernels.collect_scan(
-            grounds, obstacles, config.column_pixels, surface, bands, self._bands, height_m, self._azimuths, self.bf,
-            lowest, self.sigma_px, _GAP_M, free_from, free, obstacle, clear,
+            grounds, self._ground_heights, obstacles, falls, config.column_pixels, surface, bands, self._bands,
+            height_m, self._azimuths, self.bf, lowest, self.sigma_px, _GAP_M, free_from, free, obstacle, clear,
         )  # fmt: skip
         # A column beside a nearer obstacle shows some of it: what is free there ends where that begins.
         padded = np.concatenate([[np.inf], obstacle, [np.inf]])
@@ -363,3 +366,13 @@ def _near_height(n: F64, d: F64, slope: F64) -> float:
     by_height = np.argsort(heights, kind="stable")
     counts = np.cumsum(n[near][by_height])
     return float(heights[by_height[int(np.searchsorted(counts, 0.5 * counts[-1]))]])
+
+
+def _beyond_fall(slope: F64, seen: NDArray[np.bool_], bf: float, steepest: float) -> int:
+    """Number of bins, the farthest, that lie beyond ground that falls steeply; 0 if none does.
+
+    slope: (bins+1,) -z/x at the borders of bins. seen: (bins,). steepest: m a m.
+    """
+    ahead = bf / np.maximum(np.arange(len(slope)) * level_kernels.BIN_PX, 0.5 * level_kernels.BIN_PX)
+    steep = np.flatnonzero(seen & (np.diff(slope * ahead) < steepest * np.diff(ahead)))
+    return int(steep[-1]) + 1 if len(steep) else 0

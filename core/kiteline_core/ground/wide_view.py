@@ -22,6 +22,7 @@ F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]
 Fixed = tuple[NDArray[np.int16], NDArray[np.uint16]]  # OpenCV's fastest maps
 
+_ROWS_SEEN = 1  # of a disparity image above and below a pixel: ground in the rest of a block is alike in both eyes
 _STEP_PX = 8  # of the full image: whole pixels of any disparity image
 
 
@@ -114,7 +115,7 @@ class WideView:
         view = DisparityCamera.of(self.camera)
         rows, columns = 2 * view.height, view.columns * view.width
         small = np.asarray(middle[:rows, :columns].reshape(view.height, 2, view.width, view.columns).all((1, 3)))
-        around = np.ones((2 * self._reach + 1, 2 * self._reach + 1), np.uint8)
+        around = np.ones((2 * _ROWS_SEEN + 1, 2 * self._reach + 1), np.uint8)
         eroded = cv2.erode(np.asarray(small, np.uint8), around, borderType=cv2.BORDER_CONSTANT, borderValue=1)
         return np.asarray(eroded > 0)
 

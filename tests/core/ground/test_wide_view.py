@@ -101,9 +101,9 @@ def test_what_either_eye_did_not_see_is_masked_with_its_border(disparity_px: flo
     left, right, some = kept(view, disparity_px)
     inside = np.ones(len(left), np.bool_)
     for side, uv in zip(rectifier.raw_sides, (left, right), strict=True):
-        # All that a matched block reaches must be seen: three of its pixels to each side, of two and four px. Nothing
-        # is read beyond the view.
-        for corner in ([-6.0, -12.0], [6.0, -12.0], [-6.0, 12.0], [6.0, 12.0]):
+        # What a matched block reaches to the sides must be seen, three pixels of two px, and half a row of four above
+        # and below. Nothing is read beyond the view.
+        for corner in ([-6.0, -2.0], [6.0, -2.0], [-6.0, 2.0], [6.0, 2.0]):
             first, last = [-SIDE, LOWER], [WIDTH + SIDE - 1.0, HEIGHT + LOWER - 1.0]
             raw, _ = raw_pixels(side, np.clip(uv + corner, first, last))
             inside &= ((raw >= 0.0) & (raw <= [WIDTH - 1.0, HEIGHT - 1.0])).all(1)
