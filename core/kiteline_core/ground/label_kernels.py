@@ -19,6 +19,7 @@ _OUTLIERS = 0.15  # share of a surface's pixels that are outliers
 _FALL_M = 0.12  # below the ground, at least, of a pixel that shows that it falls: a step
 _FALL_SIGMAS = 3.0  # the same in standard deviations of its height
 _FALL_BINS = 2  # before the ray on which a fall is seen: matched blocks carry an edge on by half their rows
+_SOME_FALL = 3  # pixels below the ground, nearer than it is seen, that tell that it begins there
 _STEP_M = 0.06  # by which ground falls within _STEP_OVER_M, beyond a slope of _STEP_SLOPE: a step, no ramp
 _STEP_SLOPE = 0.15
 _STEP_OVER_M = 0.8
@@ -271,15 +272,16 @@ def _longest_ground(  # type: ignore[no-untyped-def]
 ):
     """From where and up to where ground was seen in counts (bins,), between two ranges; 0, 0 if it was not.
 
-    And whether it ended before a _WALL, a _FALL or _NOTHING, and whether it began behind a fall. The longest part with
+    And whether it ended before a _WALL, a _FALL or _NOTHING, and whether ground fell before it. The longest part with
     gaps of at most gap_m, or two deviations of the range, and without `least` pixels of obstacles (bins,) at the same
     range: those stand there, or hang above. Nor is a step within it, nor `least_falls` pixels below it. bf: px m along
     the column.
     """
     bins = len(grounds)
     half = int(_PX / BIN_PX)
-    best_from, best, start, last, ended, fell, behind = 0.0, 0.0, 0.0, 0.0, _NOTHING, False, False
+    best_from, best, start, last, ended, fell, behind = 0.0, 0.0, 0.0, 0.0, _NOTHING, 0, False
     for j in range(bins - 1, lowest - 1, -1):
+        fell += falls[j]
         near, far = bf / ((j + 1) * BIN_PX), bf / ((j if j else 0.5) * BIN_PX)
         if near < begin_m:
             continue
@@ -290,7 +292,7 @@ def _longest_ground(  # type: ignore[no-untyped-def]
         if above >= least or falling:
             if last > 0.0 and last == best:
                 ended = _FALL if falling else _WALL
-            last, fell = 0.0, fell or falling
+            last = 0.0
             continue
         if grounds[j] < 2:
             continue
@@ -300,7 +302,7 @@ def _longest_ground(  # type: ignore[no-untyped-def]
             start = near
         last = far
         if last - start > best - best_from:
-            best_from, best, ended, behind = start, last, _NOTHING, fell
+            best_from, best, ended, behind = start, last, _NOTHING, fell >= _SOME_FALL
     if best > 0.0 and bf / BIN_PX * (1.0 / best_from - 1.0 / best) < _LEAST_BINS - 0.5:
         return 0.0, 0.0, ended, False
     return best_from, min(best, end_m), ended, behind
