@@ -23,3 +23,10 @@ def test_an_answer_of_another_program_is_told_in_a_line(
     monkeypatch.setattr(maps, "default_path", lambda: Path("no keys"))
     with pytest.raises(LinkError, match="answers"):
         maps.main(asked_for)
+
+
+def test_options_may_follow_the_verb() -> None:
+    given = maps.parser().parse_args(["--base", "a", "--json", "get", "hangar", "--base", "b", "--key", "k"])
+    assert (given.base, given.key, given.json) == ("b", Path("k"), True)
+    given = maps.parser().parse_args(["--base", "a", "--key", "k", "list"])
+    assert (given.base, given.key, given.json) == ("a", Path("k"), False)

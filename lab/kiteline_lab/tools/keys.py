@@ -7,7 +7,16 @@ from pathlib import Path
 
 from kiteline_codec.transport.seal import fingerprint
 from kiteline_core.ids import MAX_AGENTS
-from kiteline_hw.system.key_store import MAPS, default_path, new_code, new_key, new_maps_key, pair, read_file
+from kiteline_hw.system.key_store import (
+    MAPS,
+    default_path,
+    first_keys,
+    new_code,
+    new_key,
+    new_maps_key,
+    pair,
+    read_file,
+)
 
 
 def parser() -> argparse.ArgumentParser:
@@ -18,14 +27,22 @@ def parser() -> argparse.ArgumentParser:
         epilog="`kiteline keys pair 3` at the base shows a code; type it at agent 3: `kiteline keys pair 3 CODE`.",
     )
     p.add_argument("--file", metavar="F", type=Path, default=None, help=f"default: {default_path()}")
+    anywhere = argparse.ArgumentParser(add_help=False)  # the same after the command
+    anywhere.add_argument(
+        "--file", metavar="F", type=Path, default=argparse.SUPPRESS, help=f"default: {default_path()}"
+    )
     commands = p.add_subparsers(dest="command", required=True)
-    paired = commands.add_parser("pair", help="pair an agent with a base: without CODE at the base, with it there")
-    paired.add_argument("agent", metavar="AGENT", type=int, help=f"number of the agent, 0 to {MAX_AGENTS - 1}")
+    paired = commands.add_parser(
+        "pair", help="pair an agent with a base: without CODE at the base, with it there", parents=[anywhere]
+    )
+    paired.add_argument("agent", metavar="AGENT", help=f"number of the agent, 0 to {MAX_AGENTS - 1}")
     paired.add_argument("code", metavar="CODE", nargs="?", default="", help="as the base shows it")
-    new = commands.add_parser("new", help="make a key for an agent, or for the right to change maps")
+    new = commands.add_parser(
+        "new", help="make a key for an agent, or for the right to change maps", parents=[anywhere]
+    )
     new.add_argument("agent", metavar="AGENT", help=f"number of the agent, 0 to {MAX_AGENTS - 1}, or {MAPS}")
     new.add_argument("--replace", action="store_true", help="replace the key it has; the old one is void then")
-    show = commands.add_parser("show", help="list agents with the fingerprints of their keys")
+    show = commands.add_parser("show", help="list agents with the fingerprints of their keys", parents=[anywhere])
     show.add_argument("--secret", metavar="AGENT", default=None, help="print this agent's line of the file")
     return p
 
@@ -36,7 +53,7 @@ def main(argv: list[str]) -> int:
     a = p.parse_args(argv)
     path = a.file or default_path()
     if a.command == "pair":
-        _pair(path, a.agent, a.code, f"--file {a.file} " if a.file else "")
+        _pair(path, _agent(p, a.agent), a.code)
         return 0
     if a.command == "new":
         if a.agent == MAPS:
@@ -59,9 +76,11 @@ def main(argv: list[str]) -> int:
     return 0
 
 
-def _pair(path: Path, agent: int, code: str, file: str) -> None:
-    """Store the key of a code, or of a new code that is shown."""
+def _pair(path: Path, agent: int, code: str) -> None:
+    """Store the key of a code, or of a new code that is shown: then this is the base, whose file has all keys."""
     shown = code or new_code()
+    if not code:
+        first_keys(path)
     key = pair(path, agent, shown)
     print(f"agent {agent}  {fingerprint(key)}  in {path}")
     if not code:
@@ -70,7 +89,7 @@ def _pair(path: Path, agent: int, code: str, file: str) -> None:
 
 
 def _agent(p: argparse.ArgumentParser, text: str) -> int:
-    if not text.isdecimal():
+    if not text.isdecimal() or int(text) >= MAX_AGENTS:
         p.error(f"{text!r} is no agent's number, 0 to {MAX_AGENTS - 1}, and not {MAPS}")
     return int(text)
 

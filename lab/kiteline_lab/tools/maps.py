@@ -29,23 +29,24 @@ def parser() -> argparse.ArgumentParser:
         description="Manage the maps of a running base. MAP is an id (AGENT.BOOT.NUMBER) or a name.",
         epilog="Other programs send the same queries over Zenoh: docs/how-to/manage-maps.md.",
     )
-    p.add_argument("--base", metavar="ENDPOINT", default=_DEFAULT, help="where the base listens (default: %(default)s)")
-    p.add_argument("--key", metavar="FILE", type=Path, default=None,
-                   help=f"keys with the right to change maps (default: {default_path()}, if there is one)")  # fmt: skip
-    p.add_argument("--json", action="store_true", help="print the reply as JSON")
+    _add_options(p, endpoint=_DEFAULT, key=None, as_json=False)
+    anywhere = argparse.ArgumentParser(add_help=False)  # the same after the verb, where they override those before it
+    _add_options(anywhere, endpoint=argparse.SUPPRESS, key=argparse.SUPPRESS, as_json=argparse.SUPPRESS)
     verbs = p.add_subparsers(dest="verb", required=True, metavar="VERB")
-    verbs.add_parser("list", help="all maps")
+    verbs.add_parser("list", help="all maps", parents=[anywhere])
     one = {
         "get": "one map, with the poses of its keyframes",
         "split": "take a submap out of the map into which it was merged, for good",
         "delete": "delete a map",
     }
     for verb, what in one.items():
-        verbs.add_parser(verb, help=what).add_argument("map", metavar="MAP")
-    name = verbs.add_parser("name", help="give a map a name")
+        verbs.add_parser(verb, help=what, parents=[anywhere]).add_argument("map", metavar="MAP")
+    name = verbs.add_parser("name", help="give a map a name", parents=[anywhere])
     name.add_argument("map", metavar="MAP")
     name.add_argument("name", metavar="NAME", help='"" removes the name')
-    merge = verbs.add_parser("merge", help="merge a map into another, where they overlap or at --at")
+    merge = verbs.add_parser(
+        "merge", help="merge a map into another, where they overlap or at --at", parents=[anywhere]
+    )
     merge.add_argument("map", metavar="MAP")
     merge.add_argument("into", metavar="INTO")
     merge.add_argument("--at", metavar="N", type=float, nargs=16, help="T_into_map, 16 numbers in rows")
@@ -58,6 +59,14 @@ def parser() -> argparse.ArgumentParser:
         verbs.add_parser(verb, help=what).add_argument("store", metavar="STORE", type=Path)
     verbs.choices["backup"].add_argument("out", metavar="DIR", type=Path, help="a folder without a store")
     return p
+
+
+def _add_options(p: argparse.ArgumentParser, endpoint: str, key: Path | str | None, as_json: bool | str) -> None:
+    """Add the options of all questions, with these defaults."""
+    p.add_argument("--base", metavar="ENDPOINT", default=endpoint, help=f"where the base listens (default: {_DEFAULT})")
+    p.add_argument("--key", metavar="FILE", type=Path, default=key,
+                   help=f"keys with the right to change maps (default: {default_path()}, if there is one)")  # fmt: skip
+    p.add_argument("--json", action="store_true", default=as_json, help="print the reply as JSON")
 
 
 def query(a: argparse.Namespace) -> dict[str, Any]:
