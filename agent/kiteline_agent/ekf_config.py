@@ -13,6 +13,7 @@ class EkfConfig:
     views: int = 10  # past camera poses in the state, whose rays give new landmarks
     view_m: float = 0.15  # m between two of them: nearer ones add no parallax indoors
     sigma_px: float = 1.0  # deviation of a tracked pixel: templates err by a tenth, but alike over frames
+    walk_px: float = 0.4  # px per sqrt(px of parallax): templates err by 0.6 % of the parallax, alike over frames
     gate: float = 10.6  # squared deviations of a pixel beyond which a match is wrong: 0.5 % of right ones
     seeds: int = 6  # matches with which a compatible set is begun before the largest set is taken
     agree: float = 0.6  # share of the matches in a set at which no other set is tried
@@ -20,8 +21,10 @@ class EkfConfig:
     least_rays: int = 4  # sightings from which a landmark is positioned
     ray_px: float = 10.0  # px from the point that two views give beyond which a third one's ray is a wrong match
     parallax_rad: float = 0.05  # rad: three degrees between its first and its last ray, at least
-    depth_share: float = 0.1  # deviation of its distance over that distance, at most: beyond, it is not Gaussian
+    depth_share: float = 0.05  # deviation of its distance over that distance, at most: at 0.1 lengths come out 3 % long
     residual_gate: float = 2.0  # chi-square over its degrees of freedom above which its rays do not meet
+    ended: int = 6  # tracks lost before they were landmarks that correct the views at one frame at most
+    ended_rays: int = 5  # of their sightings that do: seven equations each, the cost of as many landmarks in view
     entries: int = 6  # landmarks that enter at one frame at most
     in_view: int = 45  # landmarks in view from which no more enter: the state is kept for what is seen next
     misses: int = 4  # rejected matches in excess of the good ones after which a landmark is dropped

@@ -9,8 +9,17 @@ from numpy.typing import NDArray
 
 from kiteline_agent.ekf import landmark_update
 from kiteline_agent.ekf.filter_state import FilterState, Motion
-from kiteline_agent.ekf.ray_initialisation import initialise, largest_parallax, supporting_views
+from kiteline_agent.ekf.ray_initialisation import (
+    Track,
+    distance_share,
+    largest_parallax,
+    linearised,
+    new_landmark,
+    rays_meet,
+    supporting_views,
+)
 from kiteline_agent.ekf.ray_tracks import RayTracks
+from kiteline_agent.ekf.ray_update import update_by_rays
 from kiteline_agent.ekf_config import EkfConfig
 from kiteline_core.geometry.cameras import RectifiedCamera
 
@@ -38,6 +47,7 @@ class EkfSlam:
         self._focal = np.array([camera.fx, camera.fy])
         self._centre = np.array([camera.cx, camera.cy])
         self._sigma = config.sigma_px / camera.fx
+        self._walk = config.walk_px**2 / camera.fx
         self.state = FilterState(camera.T_b_c if T_o_b is None else T_o_b @ camera.T_b_c, config)
         self.slot_of: dict[int, int] = {}  # landmark's slot by the id of its track
         self._ids = np.full(config.landmarks, -1, np.int64)
@@ -69,9 +79,10 @@ class EkfSlam:
         entered: I64 = np.zeros(0, np.int64)
         is_view = self._is_view_due()
         if is_view:
-            if int(good.sum()) < self._config.in_view:
-                entered = self._enter(ids[fresh], xy[fresh], coarse[fresh])
-            self._add_view(ids[fresh], xy[fresh])
+            ended = self._take_ended(ids)
+            if int(good.sum()) < self._config.in_view:  # else the landmarks tell enough
+                entered = self._enter(ids[fresh], xy[fresh], coarse[fresh], ended)
+            self._add_view(ids[fresh], xy[fresh], coarse[fresh])
         return FrameUpdate(ids[good], ids[bad], entered, is_view)
 
     def landmark(self, track: int) -> F64 | None:
@@ -128,14 +139,38 @@ class EkfSlam:
         used = self.state.view_used
         return not used.any() or self._way - float(self._view_way[used].max()) >= self._config.view_m
 
-    def _enter(self, ids: I64, xy: F64, coarse: F64) -> I64:
-        """Let tracks enter that are seen under enough parallax; returns their ids. coarse: see `_update_landmarks`."""
+    def _enter(self, ids: I64, xy: F64, coarse: F64, ended: list[Track]) -> I64:
+        """Correct the state by new landmarks and ended tracks, and let the former in; returns their ids.
+
+        ids, xy, coarse: (n,), (n,2), (n,) tracks that are no landmarks, see `update`.
+        """
+        state = self.state
+        fitting = [(int(ids[k]), track) for k, track in self._positioned(ids, xy, coarse) if self._may_enter(track)]
+        new = fitting[: self._config.entries]
+        update_by_rays(state, [track for _, track in new] + ended)
+        entered = []
+        for k, track in new:
+            rays = linearised(state, track, state.T_o_c, state.view_T_o_c)
+            slot = self._free_slot() if rays is not None else None
+            if rays is None or slot is None:
+                continue
+            state.add_landmark(slot, *new_landmark(state, rays), walk=self._walk * (track.sigma / self._sigma) ** 2)
+            self.slot_of[k] = slot
+            self._ids[slot], self._good[slot], self._bad[slot] = k, 0, 0
+            self._updated_at[slot] = self._seen_at[slot] = self._frame
+            entered.append(k)
+        out = np.array(sorted(entered), np.int64)
+        self._tracks.drop(np.array([k for k, _ in new], np.int64))
+        return out
+
+    def _positioned(self, ids: I64, xy: F64, coarse: F64) -> list[tuple[int, Track]]:
+        """Places in `ids` of tracks whose rays meet under enough parallax, widest first, with what agrees of each."""
         config, state = self._config, self.state
         known, rows = self._tracks.find(ids)
         enough = self._tracks.seen[rows].sum(axis=1) >= config.least_rays - 1
         known, rows = known[enough], rows[enough]
         if not len(known):
-            return np.zeros(0, np.int64)
+            return []
         poses = np.concatenate([state.view_T_o_c, state.T_o_c[None]])
         points = np.concatenate([self._tracks.xy[rows], xy[known][:, None]], axis=1)
         seen = np.concatenate([self._tracks.seen[rows], np.ones((len(rows), 1), np.bool_)], axis=1)
@@ -143,30 +178,42 @@ class EkfSlam:
         rays /= np.linalg.norm(rays, axis=2, keepdims=True)
         wide = np.flatnonzero(largest_parallax(rays, seen) > config.parallax_rad)
         if not len(wide):
-            return np.zeros(0, np.int64)
+            return []
         known, points, rays = known[wide], points[wide], rays[wide]
         seen = supporting_views(poses[:, :3, 3], rays, seen[wide], config.ray_px / float(self._focal[0]))
         parallax = largest_parallax(rays, seen)
         order = np.argsort(-parallax, kind="stable")
         enough = (parallax > config.parallax_rad) & (seen.sum(axis=1) >= config.least_rays)
-        order = order[enough[order]][: config.entries]
-        entered = []
-        for k in order.tolist():
+        out = []
+        for k in order[enough[order]][: config.entries].tolist():
             views = np.flatnonzero(seen[k, :-1])
-            at = np.append(views, config.views)
-            new = initialise(state, views, points[k, at], self._sigma * float(coarse[known[k]]), config)
-            slot = self._free_slot() if new is not None else None
-            if new is None or slot is None:
-                continue
-            state.add_landmark(slot, new.point, new.across, new.cov)
-            track = int(ids[known[k]])
-            self.slot_of[track] = slot
-            self._ids[slot], self._good[slot], self._bad[slot] = track, 0, 0
-            self._updated_at[slot] = self._seen_at[slot] = self._frame
-            entered.append(track)
-        out = np.array(sorted(entered), np.int64)
-        self._tracks.drop(out)
+            sightings = points[k, np.append(views, config.views)]
+            out.append((int(known[k]), Track(views, sightings, self._sigma * float(coarse[known[k]]))))
         return out
+
+    def _may_enter(self, track: Track) -> bool:
+        """True if the rays of a track meet, and tell its distance."""
+        state, config = self.state, self._config
+        rays = linearised(state, track, state.T_o_c, state.view_T_o_c)
+        if rays is None or not rays_meet(state, rays, config.residual_gate):
+            return False
+        return distance_share(state, rays) <= config.depth_share
+
+    def _take_ended(self, ids: I64) -> list[Track]:
+        """Take out tracks that are followed no more; those that were seen often enough. ids: (n,) followed ones."""
+        tracks, config = self._tracks, self._config
+        ended = np.flatnonzero(~np.isin(tracks.ids, ids))
+        out = []
+        for row in ended[tracks.seen[ended].sum(axis=1) >= config.least_rays].tolist():
+            views = np.flatnonzero(tracks.seen[row])
+            views = views[np.argsort(self._view_way[views], kind="stable")]
+            views = views[np.unique(np.linspace(0, len(views) - 1, config.ended_rays).round().astype(np.int64))]
+            track = Track(views, tracks.xy[row, views], self._sigma * float(tracks.coarse[row]))
+            rays = linearised(self.state, track, self.state.T_o_c, self.state.view_T_o_c)
+            if rays is not None and rays_meet(self.state, rays, config.residual_gate):
+                out.append(track)
+        tracks.drop(tracks.ids[ended])
+        return out[: config.ended]
 
     def _free_slot(self) -> int | None:
         """A free slot; if there is none, that of the least seen landmark out of view, if any."""
@@ -180,8 +227,8 @@ class EkfSlam:
         self.forget(int(self._ids[slot]))
         return slot
 
-    def _add_view(self, ids: I64, xy: F64) -> None:
-        """Keep the camera's pose and what it sees of tracks without a landmark."""
+    def _add_view(self, ids: I64, xy: F64, coarse: F64) -> None:
+        """Keep the camera's pose and what it sees of tracks without a landmark. coarse: see `update`."""
         left = np.array([int(i) not in self.slot_of for i in ids.tolist()], np.bool_)
         free = np.flatnonzero(~self.state.view_used)
         view = int(free[0]) if len(free) else self._view_to_drop()
@@ -190,7 +237,7 @@ class EkfSlam:
             self._tracks.drop_view(view)
         self.state.add_view(view)
         self._view_way[view] = self._way
-        self._tracks.add(view, ids[left], xy[left])
+        self._tracks.add(view, ids[left], xy[left], coarse[left])
 
     def _view_to_drop(self) -> int:
         """The view without which the others lie most evenly over the logarithm of the way since."""

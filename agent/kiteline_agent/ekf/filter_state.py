@@ -49,6 +49,7 @@ class FilterState:
         self.view_used: Bools = np.zeros(config.views, np.bool_)
         self.points = np.zeros((config.landmarks, 3))  # (n,3) landmarks in o
         self.used: Bools = np.zeros(config.landmarks, np.bool_)
+        self._walk = np.zeros(config.landmarks)  # rad: what their pixels drift by, see `add_landmark`
         self._first = _VIEWS + 6 * config.views
         self.P = np.zeros((self._first + 3 * config.landmarks,) * 2)
         self.P[SCALE, SCALE] = config.scale_sigma**2
@@ -103,19 +104,39 @@ class FilterState:
         count = (n - self._first) // 3
         noise[:, self._first :] = np.cross(self.points[None, :count], turned.T[:, None]).reshape(6, -1)
         kernels.add_rows(self.P, n, noise, 1.0)
+        # Errors of a landmark's template change with the view: as if it moved by pixels.
+        distance = np.linalg.norm(self.points[:count] - p1, axis=1)
+        diagonal = np.arange(self._first, n)
+        way = float(np.linalg.norm(motion.T_c0_c1[:3, 3]))
+        self.P[diagonal, diagonal] += np.repeat(self._walk[:count] * way * distance, 3)
 
     def correct(self, change: F64) -> None:
         """Apply a correction (size,) in the coordinates of the error."""
         turn = se3.so3_exp(change[3:6])
         self.T_o_c = _corrected(self.T_o_c, change[:6])
         self.scale *= float(np.exp(change[SCALE]))
-        for view in np.flatnonzero(self.view_used):
-            row = self.view_row(int(view))
+        for view in self.used_views.tolist():
+            row = self.view_row(view)
             self.view_T_o_c[view] = _corrected(self.view_T_o_c[view], change[row : row + 6])
         count = (self._size - self._first) // 3
         used = self.used[:count]
         moved = change[self._first : self._size].reshape(-1, 3) @ _jacobian(change[3:6]).T
         self.points[:count][used] = (self.points[:count] @ turn.T + moved)[used]
+
+    @property
+    def used_views(self) -> I64:
+        """Past views (n,), increasing."""
+        return np.flatnonzero(self.view_used)
+
+    def corrected_views(self, columns: I64, change: F64) -> tuple[F64, F64]:
+        """Camera (4,4) and past views (views,4,4) after a change (k,) of columns (k,): six each, the camera first."""
+        whole = np.zeros(self._first)
+        whole[columns] = change
+        views = self.view_T_o_c.copy()
+        for view in self.used_views.tolist():
+            row = self.view_row(view)
+            views[view] = _corrected(views[view], whole[row : row + 6])
+        return _corrected(self.T_o_c, whole[:6]), views
 
     def update(self, rows: F64, L: F64, white: F64) -> None:
         """Kalman update. rows: (m,size) H P, replaced. L: (m,m), L L^T = H P H^T + R. white: L^-1 residual."""
@@ -142,8 +163,10 @@ class FilterState:
         self._clear(self.view_row(view), 6)
         self.view_used[view] = False
 
-    def add_landmark(self, slot: int, point: F64, across: F64, cov: F64) -> None:
-        """Add a landmark in a free slot. across: (3,size) covariance with the state; cov: (3,3)."""
+    def add_landmark(self, slot: int, point: F64, across: F64, cov: F64, walk: float) -> None:
+        """Add a landmark in a free slot. across: (3,size) covariance with the state; cov: (3,3). walk: rad^2 by which
+        the variance of its direction grows for each rad of parallax.
+        """
         first = self._first + 3 * slot
         before = self._size
         self._size = max(self._size, first + 3)
@@ -153,12 +176,12 @@ class FilterState:
             row[first : first + 3] = cov[k]
             kernels.set_row(self.P, self._size, first + k, row)
         self.points[slot] = point
-        self.used[slot] = True
+        self.used[slot], self._walk[slot] = True, walk
 
     def drop_landmark(self, slot: int) -> None:
         """Forget a landmark."""
         self._clear(self._first + 3 * slot, 3)
-        self.used[slot] = False
+        self.used[slot], self._walk[slot] = False, 0.0
         self.points[slot] = 0.0
 
     def _clear(self, first: int, count: int) -> None:

@@ -1,19 +1,20 @@
 """Delayed initialisation of landmarks: the point nearest to its rays, with its covariance, tested before it enters.
 
 Source: "Monocular EKF-SLAM with delayed landmark initialisation" (the analytical initialisation). The covariance is
-that of the linearised pixels given the poses in the state; what the rays say beyond the point tests them.
+that of the linearised pixels given the poses in the state; what the rays say beyond the point tests them, and corrects
+the poses from which they were seen.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_agent.ekf.filter_state import FilterState
 from kiteline_agent.ekf.ray_kernels import position_by_rays
-from kiteline_agent.ekf_config import EkfConfig
 from kiteline_core.geometry import se3
 
 F64 = NDArray[np.float64]
@@ -21,8 +22,7 @@ I64 = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
 
-@dataclass(frozen=True, slots=True)
-class NewLandmark:
+class NewLandmark(NamedTuple):
     """A landmark that may enter. across: (3,size) covariance with the state. cov: (3,3)."""
 
     point: F64
@@ -81,51 +81,86 @@ def project(xy: F64, T_o_c: F64, point: F64) -> tuple[F64, F64, F64]:
     return xy - ahead, jacobian, z
 
 
-def initialise(state: FilterState, views: I64, xy: F64, sigma: float, config: EkfConfig) -> NewLandmark | None:
-    """Position a landmark by its rays; None if they do not meet, or do not tell its distance.
-
-    views: (v,) past views that saw it. xy: (v+1,2) x/z, y/z in them, then in the camera now. sigma: deviation of these.
+@dataclass(frozen=True, slots=True)
+class Track:
+    """Sightings of one track. views: (v,) past views. xy: (v,2) x/z, y/z in them, or (v+1,2) with the camera of now at
+    the end. sigma: deviation of these.
     """
-    poses = np.concatenate([state.view_T_o_c[views], state.T_o_c[None]])
+
+    views: I64
+    xy: F64
+    sigma: float
+
+
+@dataclass(frozen=True, slots=True)
+class Rays:
+    """A track's rays, linearised and split by the point where they meet, in deviations of a sighting.
+
+    0 = by_point error of the point + by_state error of the state + white noise, and told = H error of the state + white
+    noise, where the point is eliminated. point: (3,). columns: (k,) of the state. by_point: (3,3). by_state: (3,k). H:
+    (m,k). told: (m,).
+    """
+
+    point: F64
+    columns: I64
+    by_point: F64
+    by_state: F64
+    H: F64
+    told: F64
+
+
+def linearised(state: FilterState, track: Track, T_o_c: F64, view_T_o_c: F64) -> Rays | None:
+    """The rays of a track with the camera now at T_o_c (4,4) and past views (n,4,4); None if they do not meet ahead."""
+    views, is_seen_now = track.views, len(track.xy) > len(track.views)
+    poses = np.concatenate([view_T_o_c[views], T_o_c[None]]) if is_seen_now else view_T_o_c[views]
     point = np.empty(3)
-    if not position_by_rays(xy, poses, point):
+    if not position_by_rays(track.xy, poses, point):
         return None
-    residual, by_point, z = project(xy, poses, point)
+    residual, by_point, z = project(track.xy, poses, point)
     if not (z > 1e-3).all():
         return None
     # by_point (xi_l - xi_pi - [l]x (xi_R - xi_Ri)); of the camera now, the rotations cancel.
     turned = by_point @ se3.skew(point)
-    index = [np.arange(6)]
-    by_state = np.zeros((len(xy), 2, 6 + 6 * len(views)))
-    by_state[-1, :, :3] = -by_point[-1]
+    columns = [np.arange(6)]
+    by_state = np.zeros((len(poses), 2, 6 + 6 * len(views)))
+    if is_seen_now:
+        by_state[-1, :, :3] = -by_point[-1]
     for k, view in enumerate(views):
-        index.append(state.view_row(int(view)) + np.arange(6))
+        columns.append(state.view_row(int(view)) + np.arange(6))
         at = 6 + 6 * k
         by_state[k, :, at : at + 3] = -by_point[k]
         by_state[k, :, at + 3 : at + 6] = turned[k]
         by_state[k, :, 3:6] = -turned[k]
-    q, r = np.linalg.qr(by_point.reshape(-1, 3), mode="complete")
-    if np.abs(np.diagonal(r)).min() < 1e-9:
+    q, r = np.linalg.qr(by_point.reshape(-1, 3) / track.sigma, mode="complete")
+    if np.abs(np.diagonal(r)).min() * track.sigma < 1e-9:
         return None
-    rows = np.concatenate(index)
-    P = state.rows(rows)
-    flat = q.T @ by_state.reshape(-1, by_state.shape[2])
-    error = q.T @ residual.ravel()
-    block = P[:, rows]
-    rest, beyond = flat[3:], error[3:]
-    spread = rest @ block @ rest.T + sigma * sigma * np.eye(len(rest))
-    if beyond @ np.linalg.solve(spread, beyond) > config.residual_gate * len(rest):
-        return None
-    inverse = np.linalg.inv(r[:3])
-    gain = -inverse @ flat[:3]
-    cov = gain @ block @ gain.T + sigma * sigma * inverse @ inverse.T
-    # The distance from the camera is judged without what moves camera and landmark alike.
-    to_point = point - state.T_o_c[:3, 3]
+    flat = q.T @ by_state.reshape(-1, by_state.shape[2]) / track.sigma
+    return Rays(point, np.concatenate(columns), r[:3], flat[:3], flat[3:], (q.T @ residual.ravel())[3:] / track.sigma)
+
+
+def rays_meet(state: FilterState, rays: Rays, gate: float) -> bool:
+    """True if rays meet as well as the state's covariance allows, by chi-square over degrees of freedom."""
+    spread = rays.H @ state.rows(rays.columns)[:, rays.columns] @ rays.H.T + np.eye(len(rays.H))
+    return bool(rays.told @ np.linalg.solve(spread, rays.told) <= gate * len(rays.H))
+
+
+def new_landmark(state: FilterState, rays: Rays) -> NewLandmark:
+    """The landmark of rays."""
+    P = state.rows(rays.columns)
+    inverse = np.linalg.inv(rays.by_point)
+    gain = -inverse @ rays.by_state
+    cov = gain @ P[:, rays.columns] @ gain.T + inverse @ inverse.T
+    return NewLandmark(rays.point, gain @ P, 0.5 * (cov + cov.T))
+
+
+def distance_share(state: FilterState, rays: Rays) -> float:
+    """Deviation of the distance from the camera over that distance, without what moves camera and landmark alike."""
+    block = state.rows(rays.columns)[:, rays.columns]
+    inverse = np.linalg.inv(rays.by_point)
+    relative = -inverse @ rays.by_state
+    relative[:, :3] -= np.eye(3)
+    to_point = rays.point - state.T_o_c[:3, 3]
     distance = float(np.linalg.norm(to_point))
     ray = to_point / distance
-    relative = gain.copy()
-    relative[:, :3] -= np.eye(3)
-    depth_var = ray @ (relative @ block @ relative.T + sigma * sigma * inverse @ inverse.T) @ ray
-    if depth_var > (config.depth_share * distance) ** 2:
-        return None
-    return NewLandmark(point, gain @ P, 0.5 * (cov + cov.T))
+    variance = ray @ (relative @ block @ relative.T + inverse @ inverse.T) @ ray
+    return float(np.sqrt(variance)) / distance

@@ -17,17 +17,20 @@ class RayTracks:
         self._views = views
         self.ids: I64 = np.zeros(0, np.int64)  # (n,) increasing
         self.xy = np.zeros((0, views, 2))  # x/z, y/z in the view
+        self.coarse = np.zeros(0)  # (n,) size of a track's pixels in those of the finest level
         self.seen: Bools = np.zeros((0, views), np.bool_)
 
-    def add(self, view: int, ids: I64, xy: F64) -> None:
-        """Add what the newest view saw. ids: (m,) increasing. xy: (m,2)."""
+    def add(self, view: int, ids: I64, xy: F64, coarse: F64) -> None:
+        """Add what the newest view saw. ids: (m,) increasing. xy: (m,2). coarse: (m,)."""
         new = np.setdiff1d(ids, self.ids, assume_unique=True)
         every = np.concatenate([self.ids, new])
         order = np.argsort(every, kind="stable")
         self.ids = every[order]
         self.xy = np.concatenate([self.xy, np.zeros((len(new), self._views, 2))])[order]
         self.seen = np.concatenate([self.seen, np.zeros((len(new), self._views), np.bool_)])[order]
+        self.coarse = np.concatenate([self.coarse, np.ones(len(new))])[order]
         at = np.searchsorted(self.ids, ids)
+        self.coarse[at] = coarse
         self.xy[at, view] = xy
         self.seen[at, view] = True
 
@@ -51,3 +54,4 @@ class RayTracks:
     def _keep(self, keep: Bools) -> None:
         if not keep.all():
             self.ids, self.xy, self.seen = self.ids[keep], self.xy[keep], self.seen[keep]
+            self.coarse = self.coarse[keep]

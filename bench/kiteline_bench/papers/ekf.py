@@ -40,8 +40,8 @@ class Flown:
 
 
 def filter_config(model: vehicle.VehicleModel) -> EkfConfig:
-    """A configuration that knows the noise of a model, but none of its faults."""
-    return EkfConfig(sigma_px=model.sigma_px, scale_sigma=model.scale_sigma)
+    """A configuration that knows the noise of a model, but none of its faults. Errors of its pixels are white."""
+    return EkfConfig(sigma_px=model.sigma_px, scale_sigma=model.scale_sigma, walk_px=0.0)
 
 
 def fly(model: vehicle.VehicleModel, seed: int, config: EkfConfig | None = None) -> Flown:

@@ -6,10 +6,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_agent.ekf.filter_state import FilterState
-from kiteline_agent.ekf.ray_initialisation import initialise, project, supporting_views
+from kiteline_agent.ekf.ray_initialisation import (
+    Rays,
+    Track,
+    distance_share,
+    linearised,
+    new_landmark,
+    project,
+    rays_meet,
+    supporting_views,
+)
 from kiteline_agent.ekf.ray_kernels import position_by_rays
+from kiteline_agent.ekf.ray_update import update_by_rays
 from kiteline_agent.ekf_config import EkfConfig
 from kiteline_bench.papers import simulated_vehicle as vehicle
+from kiteline_core.geometry import se3
 
 F64 = NDArray[np.float64]
 
@@ -72,8 +83,10 @@ def test_wrong_match_does_not_support_the_point() -> None:
     assert supporting_views(cameras[:, :3, 3], rays[None], seen, 0.02)[0].tolist() == [True, True, False, True, True]
 
 
-def _drawn(model: vehicle.VehicleModel, rng: np.random.Generator) -> tuple[FilterState, F64]:
-    """A state whose five views and pose drifted by odometry, and the sightings of the point in them."""
+def _drawn(
+    model: vehicle.VehicleModel, rng: np.random.Generator, points: F64 = _POINT[None]
+) -> tuple[FilterState, list[Track]]:
+    """A state whose four views and pose drifted by odometry, and the tracks of points (n,3) that all five saw."""
     cam = vehicle.camera()
     poses = vehicle.loop(model.planar)
     state = FilterState(cam.T_b_c, EkfConfig(scale_sigma=model.scale_sigma))
@@ -83,30 +96,76 @@ def _drawn(model: vehicle.VehicleModel, rng: np.random.Generator) -> tuple[Filte
         if k > 0:
             state.propagate(vehicle.odometry(model, poses[k - 1], poses[k], scale, k, cam.T_b_c, rng)[1])
         if k % 3 == 0:
-            seen.append(_seen(poses[k : k + 1] @ cam.T_b_c)[0])
+            seen.append([_seen(poses[k : k + 1] @ cam.T_b_c, point)[0] for point in points])
             if k < 12:
                 state.add_view(k // 3)
-    return state, np.array(seen) + _SIGMA * rng.standard_normal((5, 2))
+    sightings = np.array(seen).swapaxes(0, 1) + _SIGMA * rng.standard_normal((len(points), 5, 2))
+    return state, [Track(np.arange(4), xy, _SIGMA) for xy in sightings]
+
+
+def _rays(state: FilterState, track: Track) -> Rays:
+    rays = linearised(state, track, state.T_o_c, state.view_T_o_c)
+    assert rays is not None
+    return rays
 
 
 def test_errors_of_new_landmarks_are_as_their_covariance_says() -> None:
     """Mean normalised error of landmarks by poses that drift, over 150 draws."""
-    model, config = vehicle.VehicleModel(planar=False, turn_noise=0.003), EkfConfig(depth_share=1.0, residual_gate=9.0)
-    rng, nees = np.random.default_rng(0), []
+    model, rng, nees = vehicle.VehicleModel(planar=False, turn_noise=0.003), np.random.default_rng(0), []
     for _ in range(150):
-        state, xy = _drawn(model, rng)
-        new = initialise(state, np.arange(4), xy, _SIGMA, config)
-        assert new is not None
-        state.add_landmark(0, new.point, new.across, new.cov)
+        state, (track,) = _drawn(model, rng)
+        new = new_landmark(state, _rays(state, track))
+        state.add_landmark(0, *new, walk=0.0)
         error = new.point - _POINT
         nees.append(error @ np.linalg.solve(state.landmark_covariance(0), error))
     assert 2.4 < np.mean(nees) < 3.7
 
 
-def test_distance_that_rays_do_not_tell_and_rays_that_do_not_meet_are_refused() -> None:
+def test_distance_that_rays_do_not_tell_and_rays_that_do_not_meet_are_known() -> None:
     model, rng = vehicle.VehicleModel(planar=True, turn_noise=0.001), np.random.default_rng(0)
-    state, xy = _drawn(model, rng)
-    assert initialise(state, np.arange(4), xy, _SIGMA, EkfConfig()) is not None
-    assert initialise(state, np.arange(4), xy, _SIGMA, EkfConfig(depth_share=0.001)) is None
-    xy[1, 1] += 10.0 * _SIGMA
-    assert initialise(state, np.arange(4), xy, _SIGMA, EkfConfig()) is None
+    state, (track,) = _drawn(model, rng)
+    assert rays_meet(state, _rays(state, track), EkfConfig().residual_gate)
+    assert 0.001 < distance_share(state, _rays(state, track)) < 0.1
+    track.xy[1, 1] += 10.0 * _SIGMA
+    assert not rays_meet(state, _rays(state, track), EkfConfig().residual_gate)
+
+
+def _direction_errors(wrong: int, noisy: bool) -> tuple[float, float, float]:
+    """RMS error of the direction of motion in rad, before and after tracks correct it, and the NEES of the pose after.
+
+    wrong: of eight tracks are wrong matches.
+    """
+    model = vehicle.VehicleModel(planar=False, path_noise=0.1 if noisy else 0.03, turn_noise=0.01)
+    rng, cam, before, after, nees = np.random.default_rng(1), vehicle.camera(), [], [], []
+    points = _POINT + rng.uniform([-2.0, -1.5, -1.0], [2.0, 1.5, 1.0], (8, 3))
+    truth = vehicle.loop(planar=False)[12] @ cam.T_b_c
+    for _ in range(40):
+        state, tracks = _drawn(model, rng, points)
+        for track in tracks[:wrong]:
+            track.xy[2:] += 0.02
+        before.append(_angle(state.T_o_c, truth))
+        update_by_rays(state, tracks)
+        after.append(_angle(state.T_o_c, truth))
+        T = state.T_o_c
+        error = np.concatenate([truth[:3, 3] - T[:3, 3], se3.so3_log(T[:3, :3].T @ truth[:3, :3])])
+        nees.append(error @ np.linalg.solve(state.pose_covariance(np.eye(4)), error))
+    return float(np.sqrt(np.mean(np.square(before)))), float(np.sqrt(np.mean(np.square(after)))), float(np.mean(nees))
+
+
+def _angle(T_o_c: F64, truth: F64) -> float:
+    start = vehicle.loop(planar=False)[0] @ vehicle.camera().T_b_c
+    a, b = T_o_c[:3, 3] - start[:3, 3], truth[:3, 3] - start[:3, 3]
+    return float(np.linalg.norm(np.cross(a, b)) / (np.linalg.norm(a) * np.linalg.norm(b)))
+
+
+def test_tracks_that_are_no_landmarks_tell_where_the_vehicle_went() -> None:
+    """Over 40 draws, as sure as its covariance says, by good odometry and by one that is a tenth off."""
+    for noisy, share in ((False, 0.65), (True, 0.3)):
+        before, after, nees = _direction_errors(0, noisy)
+        assert after < share * before
+        assert 4.0 < nees < 8.0
+
+
+def test_wrong_matches_are_outvoted() -> None:
+    before, after, _ = _direction_errors(2, noisy=True)
+    assert after < 0.65 * before

@@ -1,0 +1,55 @@
+"""Correction of camera and past views by what the rays of tracks tell beyond the points where they meet.
+
+Source: A. Mourikis, S. Roumeliotis, "A multi-state constraint Kalman filter for vision-aided inertial navigation",
+2007.
+Where odometry is poor the views are off by a tenth of the way between them, and what a track tells is far from linear
+in that: all tracks are linearised again at the corrected views (iterated Kalman filter).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_agent.ekf.filter_state import FilterState
+from kiteline_agent.ekf.ray_initialisation import Rays, Track, linearised
+
+F64 = NDArray[np.float64]
+
+_ITERATIONS = 3
+_MANY = 3.0  # deviations over degrees of freedom at which a track counts half: Cauchy's weights
+
+
+def update_by_rays(state: FilterState, tracks: Sequence[Track]) -> None:
+    """Correct the state by tracks; those that contradict the others count less."""
+    columns = np.concatenate([np.arange(6), *(state.view_row(int(v)) + np.arange(6) for v in state.used_views)])
+    P = state.rows(columns)
+    block = P[:, columns]
+    change = np.zeros(len(columns))
+    for _ in range(_ITERATIONS):
+        T_o_c, view_T_o_c = state.corrected_views(columns, change)
+        linear = [linearised(state, track, T_o_c, view_T_o_c) for track in tracks]
+        every = [rays for rays in linear if rays is not None]
+        if not every:
+            return
+        H, told = _stacked(every, columns, change)
+        L = np.asarray(np.linalg.cholesky(H @ block @ H.T + np.eye(len(H))), np.float64)
+        white = np.asarray(np.linalg.solve(L, told + H @ change), np.float64)
+        change = block @ H.T @ np.linalg.solve(L.T, white)
+    state.update(np.ascontiguousarray(H @ P), L, white)
+
+
+def _stacked(every: Sequence[Rays], columns: NDArray[np.int64], change: F64) -> tuple[F64, F64]:
+    """H (m,k) over the columns (k,), and told (m,), each track by its weight."""
+    H = np.zeros((sum(len(r.told) for r in every), len(columns)))
+    told = np.zeros(len(H))
+    at = 0
+    for r in every:
+        m = len(r.told)
+        weight = 1.0 / np.sqrt(1.0 + (r.told @ r.told) / (m * _MANY * _MANY)) if change.any() else 1.0
+        H[at : at + m, np.searchsorted(columns, r.columns)] = weight * r.H
+        told[at : at + m] = weight * r.told
+        at += m
+    return H, told
