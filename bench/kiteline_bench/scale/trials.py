@@ -37,10 +37,10 @@ from kiteline_hw.system.vocabulary import shipped_vocabulary
 F64 = NDArray[np.float64]
 
 _MODULE = "kiteline_bench.scale.trials"
-_STEP_NS = 50_000_000
+STEP_NS = 50_000_000
 _KEYFRAME_NS = 1_000_000_000
-_PLACE_M = 40.0  # between two places of a large map
-_ERROR = np.array([0.06, 0.0, 0.0, 0.0, 0.0, 0.0004])  # of an agent between two places: 0.15 %, and a slow turn
+PLACE_M = 40.0  # between two places of a large map
+ERROR = np.array([0.06, 0.0, 0.0, 0.0, 0.0, 0.0004])  # of an agent between two places: 0.15 %, and a slow turn
 _WORKER_S = 0.5  # that the worker may still take for the last keyframe's jobs
 _LAST = 1000  # keyframes over which steps are judged
 
@@ -71,7 +71,8 @@ class Link:
         return self.end.poll(now_ns)
 
 
-def _station() -> Station:
+def empty_station() -> Station:
+    """A base without a map, whose channels are real ones."""
     return Station(BaseConfig(), lambda agent: coded_channel(1, 0, "wifi", peer=agent), shipped_vocabulary())
 
 
@@ -115,17 +116,17 @@ class _Flown:
         self.step_ms.append((time.process_time_ns() - begin_ns) / 1e6)
         self.worker.add(output.jobs, self.now_ns)
         self.link.down = dict(output.packets).get(self.link.agent, ())
-        self.now_ns += _STEP_NS
+        self.now_ns += STEP_NS
         return output
 
 
 def large_map(flight: RecordedFlight, keyframes: int) -> LargeMap:
     """Fly through so many keyframes in one submap, back to where it began, until the loop is closed."""
-    station, worker = _station(), Workers()
+    station, worker = empty_station(), Workers()
     flown = _Flown(station, Link(AgentId(0), coded_channel(1, 0, "wifi", bounded=True)), worker)
     places = max(3, round(keyframes / len(flight.keyframes)))
     angle = 2.0 * np.pi * np.arange(places) / (places - 1)
-    radius = _PLACE_M * (places - 1) / (2.0 * np.pi)
+    radius = PLACE_M * (places - 1) / (2.0 * np.pi)
     shift = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), np.zeros(places)])
     found = LargeMap([], [], [], [], [])
     begin_s = time.monotonic()
@@ -137,7 +138,7 @@ def large_map(flight: RecordedFlight, keyframes: int) -> LargeMap:
     mapper, map_id = station.mapper, begin.submap
     assert mapper.merger is not None
     try:
-        for group in rounds(flight, AgentId(0), 0, places, shift, se3.exp(_ERROR)):
+        for group in rounds(flight, AgentId(0), 0, places, shift, se3.exp(ERROR)):
             about = () if count else map_all(flight.about, begin)
             records = [*about, *group]
             flown.step_ms.clear()
@@ -199,7 +200,7 @@ class Day:
 
 def day(flight: RecordedFlight, hours: float, flights: int) -> Day:
     """Hours of silence with flights in between; each is deleted when the next one has landed."""
-    station, jobs = _station(), LockstepJobs()
+    station, jobs = empty_station(), LockstepJobs()
     found = Day([], 0, 0)
     hour_ns = 3_600_000_000_000
     now_ns = 0
@@ -215,7 +216,7 @@ def day(flight: RecordedFlight, hours: float, flights: int) -> Day:
         groups += [map_all(group, name) for group in flight.keyframes[1:]]
         for group in groups:
             done: tuple[JobDone, ...] = ()
-            for k in range(_KEYFRAME_NS // _STEP_NS):
+            for k in range(_KEYFRAME_NS // STEP_NS):
                 records: list[Record] = list(group) if k == 0 else []
                 records.append(LivePose(agent, now_ns, name.keyframe(0), np.eye(4), 100))
                 up = link.exchange(records, now_ns)
@@ -224,7 +225,7 @@ def day(flight: RecordedFlight, hours: float, flights: int) -> Day:
                 orders = []
                 jobs.add(output.jobs, now_ns)
                 link.down = dict(output.packets).get(agent, ())
-                now_ns += _STEP_NS
+                now_ns += STEP_NS
         found.flights += 1
         found.keyframes += len(groups)
         if number:
@@ -236,7 +237,7 @@ def day(flight: RecordedFlight, hours: float, flights: int) -> Day:
                 deleted += answer.ok
             orders = []
             jobs.add(output.jobs, now_ns)
-            now_ns += 20 * _STEP_NS
+            now_ns += 20 * STEP_NS
         found.rss_mib.append(rss_mib())
     if deleted != flights - 1:
         raise RuntimeError(f"{deleted} maps deleted, expected {flights - 1}")
