@@ -203,8 +203,10 @@ class EkfSlam:
         """Take out tracks that are followed no more; those that were seen often enough. ids: (n,) followed ones."""
         tracks, config = self._tracks, self._config
         ended = np.flatnonzero(~np.isin(tracks.ids, ids))
-        out = []
+        out: list[Track] = []
         for row in ended[tracks.seen[ended].sum(axis=1) >= config.least_rays].tolist():
+            if len(out) == config.ended:
+                break
             views = np.flatnonzero(tracks.seen[row])
             views = views[np.argsort(self._view_way[views], kind="stable")]
             views = views[np.unique(np.linspace(0, len(views) - 1, config.ended_rays).round().astype(np.int64))]
@@ -213,7 +215,7 @@ class EkfSlam:
             if rays is not None and rays_meet(self.state, rays, config.residual_gate):
                 out.append(track)
         tracks.drop(tracks.ids[ended])
-        return out[: config.ended]
+        return out
 
     def _free_slot(self) -> int | None:
         """A free slot; if there is none, that of the least seen landmark out of view, if any."""

@@ -19,6 +19,7 @@ from kiteline_agent.ekf.ray_initialisation import Rays, Track, linearised
 F64 = NDArray[np.float64]
 
 _ITERATIONS = 3
+_SETTLED = 0.1  # deviations of the state by which another iteration would have to change it
 _MANY = 3.0  # deviations over degrees of freedom at which a track counts half: Cauchy's weights
 
 
@@ -27,6 +28,7 @@ def update_by_rays(state: FilterState, tracks: Sequence[Track]) -> None:
     columns = np.concatenate([np.arange(6), *(state.view_row(int(v)) + np.arange(6) for v in state.used_views)])
     P = state.rows(columns)
     block = P[:, columns]
+    deviation = np.sqrt(np.diagonal(block)) + 1e-12
     change = np.zeros(len(columns))
     for _ in range(_ITERATIONS):
         T_o_c, view_T_o_c = state.corrected_views(columns, change)
@@ -37,7 +39,9 @@ def update_by_rays(state: FilterState, tracks: Sequence[Track]) -> None:
         H, told = _stacked(every, columns, change)
         L = np.asarray(np.linalg.cholesky(H @ block @ H.T + np.eye(len(H))), np.float64)
         white = np.asarray(np.linalg.solve(L, told + H @ change), np.float64)
-        change = block @ H.T @ np.linalg.solve(L.T, white)
+        last, change = change, block @ H.T @ np.linalg.solve(L.T, white)
+        if (np.abs(change - last) < _SETTLED * deviation).all():
+            break
     state.update(np.ascontiguousarray(H @ P), L, white)
 
 
