@@ -117,6 +117,15 @@ def test_landmarks_told_before_the_offset_was_found_are_corrected_by_it() -> Non
     assert flight.map.rho[1, :30] == pytest.approx(0.27 - OFFSET_PX[0] / CAMERA.bf)
 
 
+def test_landmarks_that_come_without_poses_are_of_the_offset_of_the_poses_before() -> None:
+    flight = _Flight(4)
+    flight.map.share(KeyframeId(1), 30)
+    assert flight.told(k1=1.03, k2=2.06, k3=3.09)
+    flight.find_offset()
+    flight.corrections.take([RefinedLandmarks(KeyframeId(1), np.arange(30), np.full(30, 0.3), np.zeros((30, 2)))], [])
+    assert flight.map.rho[1, :30] == pytest.approx(0.3 - OFFSET_PX[0] / CAMERA.bf)
+
+
 @pytest.mark.parametrize("placed", [False, True])
 def test_live_poses_follow_an_offset_without_a_jump_whether_or_not_a_base_is_there(*, placed: bool) -> None:
     """Keyframe and camera at 3 m move back by 90 mm at once; live poses do so in 33 frames."""
@@ -141,6 +150,37 @@ def test_a_placement_that_comes_later_changes_the_frame_and_nothing_else() -> No
     flight.corrections.take([SubmapPlacement(SubmapId(0), _at(7.0))], [])
     assert before is not None
     assert _live(flight, 0.09, 2 * TICK_NS) == pytest.approx(7.0 + before, abs=0.003)
+
+
+def test_a_placement_keeps_what_live_poses_leave_out() -> None:
+    """Corrections turned the map as a whole before it was placed; 1.5 mm and 0.2 mrad were between the two poses."""
+    flight = _Flight(4)
+    flight.corrections.move_on_board(SubmapId(0), np.eye(4))
+    _live(flight, 0.0, 0)
+    turn = se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.004]))
+    poses = {KeyframeId(k): turn @ _at(STEP_M * k) for k in range(1, 4)}
+    assert flight.corrections.take([KeyframePose(k, T_m_k) for k, T_m_k in poses.items()], [])[0]
+    T_m_b, T_o_m = poses[KeyframeId(3)], se3.inverse(turn)
+    S_w_m = se3.exp(np.array([7.0, 3.0, 0.0, 0.0, 0.0, 2.0]))
+    before = flight.corrections.in_world(SubmapId(0), T_m_b, T_o_m, TICK_NS, metric=True)
+    flight.corrections.take([SubmapPlacement(SubmapId(0), S_w_m)], [])
+    after = flight.corrections.in_world(SubmapId(0), T_m_b, T_o_m, TICK_NS, metric=True)
+    assert before is not None and after is not None
+    np.testing.assert_allclose(after, S_w_m @ before, atol=1e-6)
+
+
+def test_a_later_submap_that_is_placed_first_begins_live_poses_anew() -> None:
+    flight = _Flight(1)
+    flight.corrections.move_on_board(SubmapId(0), np.eye(4))
+    _live(flight, 0.0, 0)
+    flight.map.activate(SubmapId(1))
+    x_m = []
+    for n, placed in enumerate([SubmapPlacement(SubmapId(1), _at(5.0)), SubmapPlacement(SubmapId(0), _at(0.6))], 1):
+        flight.corrections.take([placed], [])
+        T_w_b = flight.corrections.in_world(SubmapId(1), np.eye(4), _at(3.0), n * TICK_NS, metric=True)
+        assert T_w_b is not None
+        x_m.append(float(T_w_b[0, 3]))
+    assert x_m == [5.0, 5.0]
 
 
 def _live(flight: _Flight, back_m: float, t_ns: int) -> float | None:

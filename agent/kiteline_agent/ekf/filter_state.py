@@ -96,7 +96,7 @@ class FilterState:
             self.P[i, : i + 1] += along[i] * scale_row[SCALE] * along[: i + 1]
             self.P[3:n, i] += along[i] * scale_row[3:n]
         # White errors: one of the rotation also moves landmarks relative to the camera's heading.
-        factor = np.linalg.cholesky(motion.cov + 1e-18 * np.eye(6))
+        factor = _root(motion.cov)
         turned = R1 @ factor[3:]  # (3,6)
         noise = np.zeros((6, n))
         noise[:, :3] = (R0 @ factor[:3] + np.cross(p1, turned, axisb=0, axisc=0)).T
@@ -204,6 +204,15 @@ class FilterState:
         both = self.rows(rows)[:, rows]
         to_error = np.concatenate([-se3.skew(self.points[slot]), np.eye(3)], axis=1)
         return np.asarray(to_error @ both @ to_error.T)
+
+
+def _root(cov: F64) -> F64:
+    """A factor (6,6) of a covariance, factor factor^T; without the negative variances that some odometers tell."""
+    try:
+        return np.asarray(np.linalg.cholesky(cov + 1e-18 * np.eye(6)))
+    except np.linalg.LinAlgError:
+        variance, axes = np.linalg.eigh(0.5 * (cov + cov.T))
+        return np.asarray(axes * np.sqrt(np.maximum(variance, 0.0)))
 
 
 def _jacobian(turn: F64) -> F64:

@@ -199,10 +199,21 @@ class Corrections:
         self._smoothing.hasten()
 
     def _leave_own_world(self, submap: SubmapId, S_w_m: F64) -> None:
-        """A submap that was w is placed (4,4): live poses change their frame at once."""
-        if submap == self._own_world:
+        """A submap is placed (4,4): live poses change their frame at once if w was a submap until now.
+
+        Nothing tells where that lies in w if it is not placed itself: live poses begin anew in the active one.
+        """
+        own = self._own_world
+        if own is None or submap not in (own, self._map.active):
+            return
+        self._own_world = None
+        if submap == own:
             self._smoothing.change_world(S_w_m)
-            self._own_world = None
+            self._whole.change_world(S_w_m)
+        else:
+            self._S_w_m.pop(own, None)
+            self._smoothing.snap()
+            self._whole.clear()
 
     def _contradicts_gravity(self, submap: SubmapId, S_w_m: F64) -> bool:
         """True if a placement tilts a submap whose vertical the agent knows."""

@@ -32,6 +32,10 @@ class WholeMapMotion:
         """Live poses are in w again."""
         self._T_v_w = np.eye(4)
 
+    def change_world(self, S_n_w: F64) -> None:
+        """Live poses are in frame n from now on, where w lies at S_n_w (4,4)."""
+        self._T_v_w = S_n_w @ self._T_v_w @ sim3.inverse(S_n_w)
+
     def add(self, before: F64, after: F64, S_w_m: F64) -> None:
         """Corrections moved keyframes in m from `before` to `after`, (k,4,4) each, the one near the vehicle last.
 

@@ -44,6 +44,7 @@ class OffsetHistory:
     def __init__(self) -> None:
         self._changes: list[_Change] = []
         self._known = 0  # so many changes the base knows, at least
+        self._likely = 0  # so many it knew when it told poses last
 
     def __len__(self) -> int:
         return len(self._changes)
@@ -55,16 +56,17 @@ class OffsetHistory:
 
     def base_knows_all(self) -> None:
         """The map has the base's own offset now."""
-        self._known = len(self._changes)
+        self._known = self._likely = len(self._changes)
 
     def known_to_base(self, told: Mapping[int, F64], held: Mapping[int, F64], parents: Mapping[int, int]) -> int:
         """How many changes the base knew when it told poses: those that fit the map best once the others move them.
 
-        told, held: poses T_m_k (4,4) of the base and of the map, by keyframe. parents: of the map's keyframes.
+        told, held: poses T_m_k (4,4) of the base and of the map, by keyframe. parents: of the map's keyframes. Without
+        poses, as many as when it told some last.
         """
         n = len(self._changes)
         if self._known == n or not told:
-            return n
+            return self._likely
         errors = [
             float(np.mean([
                 np.sum((self.moved(T, keyframe, known, parents)[:3, 3] - held[keyframe][:3, 3]) ** 2)
@@ -75,6 +77,7 @@ class OffsetHistory:
         best = self._known + len(errors) - 1 - int(np.argmin(errors[::-1]))  # of equal ones the newest
         if errors[0] - min(errors) > _TOLD_M**2:
             self._known = best
+        self._likely = best
         return best
 
     def moved(self, T_m_k: F64, keyframe: int, known: int, parents: Mapping[int, int]) -> F64:

@@ -10,9 +10,11 @@ import pytest
 
 from kiteline_agent.ekf.ekf_slam import EkfSlam
 from kiteline_agent.ekf.filter_state import FilterState, Motion
+from kiteline_agent.ekf.odometer_motion import OdometerMotion
 from kiteline_agent.ekf_config import EkfConfig
 from kiteline_bench.papers import ekf
 from kiteline_bench.papers import simulated_vehicle as vehicle
+from kiteline_core.frame import OdometryBatch
 from kiteline_core.geometry import se3
 
 
@@ -57,6 +59,21 @@ def test_vehicle_that_sees_nothing_follows_its_odometry() -> None:
         slam.predict(motion)
         slam.update(none, np.zeros((0, 2)))
     np.testing.assert_allclose(slam.state.T_o_c @ se3.inverse(cam.T_b_c), poses[40], atol=1e-9)
+
+
+def test_an_odometer_whose_covariance_is_none_does_not_end_the_flight() -> None:
+    """Correlations of -0.9 between each two axes pass for themselves; all three together cannot be."""
+    t_ns = np.arange(20) * 20_000_000
+    cov = 0.04 * np.array([[1.0, -0.9, -0.9], [-0.9, 1.0, -0.9], [-0.9, -0.9, 1.0]])
+    odometer = OdometerMotion(np.eye(4), EkfConfig(), keep_s=5.0, max_gap_s=0.5)
+    odometer.add(
+        OdometryBatch(t_ns, np.full((20, 3), 0.5), np.zeros((20, 3)), np.tile(cov, (20, 1, 1)), np.zeros((20, 3, 3)))
+    )
+    state = FilterState(np.eye(4), EkfConfig())
+    state.propagate(odometer.between(100_000_000, 200_000_000))
+    assert odometer.measured
+    assert np.linalg.eigvalsh(state.block(0, 6))[0] > -1e-12
+    assert 1e-4 < state.block(0, 3)[0, 0] < 1e-3
 
 
 def test_prediction_moves_the_covariance_as_perturbed_motions_do() -> None:
