@@ -28,7 +28,7 @@ def update_by_rays(state: FilterState, tracks: Sequence[Track]) -> None:
     columns = np.concatenate([np.arange(6), *(state.view_row(int(v)) + np.arange(6) for v in state.used_views)])
     P = state.rows(columns)
     block = P[:, columns]
-    deviation = np.sqrt(np.diagonal(block)) + 1e-12
+    deviation = np.sqrt(np.maximum(np.diagonal(block), 1e-24))
     change = np.zeros(len(columns))
     for _ in range(_ITERATIONS):
         T_o_c, view_T_o_c = state.corrected_views(columns, change)

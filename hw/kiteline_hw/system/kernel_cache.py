@@ -27,7 +27,6 @@ _KERNELS = "_kernels"  # suffix of kernel modules
 _RECORD = "kiteline-compiled"  # file that lists compiled modules, beside their kernels
 _POLL_S = 0.1  # s between two looks at the compiler
 _ROOM_BYTES = 32 << 20  # bytes that must be free: all kernels take 15 MB
-_TELL_S = 10.0  # s between two words to the parent, which takes a long silence for a hang
 
 
 def fill(modules: Sequence[str], stop: StopSignal | None = None, parent: Parent | None = None) -> bool:
@@ -40,6 +39,8 @@ def fill(modules: Sequence[str], stop: StopSignal | None = None, parent: Parent 
         return True
     if parent is None:
         _say(COMPILING)
+    else:
+        parent.send_event("compiling")
     if why := _no_room():
         _say(f"compiled kernels cannot be kept ({why}): they are compiled anew, for a minute; see `kiteline doctor`")
         return False
@@ -50,18 +51,16 @@ def fill(modules: Sequence[str], stop: StopSignal | None = None, parent: Parent 
         )  # fmt: skip
         with compiler:
             try:
-                if _ended(compiler, stop, parent) and compiler.returncode == 0:
+                if _ended(compiler, stop) and compiler.returncode == 0:
                     mark()
             finally:
                 compiler.kill()
     return filled()
 
 
-def _ended(compiler: subprocess.Popen[bytes], stop: StopSignal | None, parent: Parent | None) -> bool:
+def _ended(compiler: subprocess.Popen[bytes], stop: StopSignal | None) -> bool:
     """Wait for the compiler to end; False if a signal came first. Raises TimeoutExpired."""
-    for polls in range(round(COMPILE_S / _POLL_S)):
-        if parent is not None and polls % round(_TELL_S / _POLL_S) == 0:
-            parent.send_event("compiling")
+    for _ in range(round(COMPILE_S / _POLL_S)):
         with contextlib.suppress(subprocess.TimeoutExpired):
             compiler.wait(_POLL_S)
             return True

@@ -94,7 +94,7 @@ class _Supervisor:
         if not self._live:  # agents wait for the base at the barrier
             self._start_agents()
         while self._flying or self._base_up:
-            event = self._children.next_event(_NO_EVENT_S if self._flying else _AGENT_END_S)
+            event = self._children.next_event(self._longest_silence_s())
             if event is None:
                 self.outcome.note(
                     f"{', '.join(self._children.running())}: silent for too long; the flight was given up"
@@ -102,6 +102,12 @@ class _Supervisor:
                 self.outcome.failed = True
                 return
             self._take(event)
+
+    def _longest_silence_s(self) -> float:
+        """Seconds without an event after which nothing more is expected: before the first frame kernels may compile."""
+        if not self._flying:
+            return _AGENT_END_S
+        return _NO_EVENT_S if any(self._frames) else kernel_cache.COMPILE_S
 
     def _start_agents(self) -> None:
         for spec in self._agents:
