@@ -34,7 +34,7 @@ class CorrectionBatches:
         self._config = config
         self._number = 0
         self._members: dict[Key, None] = {}  # of the newest batch
-        self._missing: Key | None = None  # one that had not arrived at the last look: while it has not, no others count
+        self._missing: Key | None = None  # a member that had not arrived at the last check: it is checked first
         self._made_ns = 0
         self._overdue = False  # the newest batch does not arrive: later values join it, and wait for no other ones
 

@@ -19,7 +19,7 @@ _OUTLIERS = 0.15  # share of a surface's pixels that are outliers
 _FALL_M = 0.12  # below the ground, at least, of a pixel that shows that it falls: a step
 _FALL_SIGMAS = 3.0  # the same in standard deviations of its height
 _FALL_BINS = 2  # before the ray on which a fall is seen: matched blocks carry an edge on by half their rows
-_SOME_FALL = 3  # pixels below the ground, nearer than it is seen, that tell that it begins there
+_SOME_FALL = 3  # pixels of a column below the ground, no farther than its end, from which a fall is near
 _STEP_M = 0.06  # by which ground falls within _STEP_OVER_M, beyond a slope of _STEP_SLOPE: a step, no ramp
 _STEP_SLOPE = 0.15
 _STEP_OVER_M = 0.8
@@ -49,11 +49,11 @@ def label_points(  # type: ignore[no-untyped-def]
     x, z, column, textured, ground, seen, bf, sigma_px, ground_m, sigmas, most_m, bands, slab_m, labels, grounds,
     obstacles, falls, heights, sums, in_band, slab, slab_sums,
 ):  # fmt: skip
-    """Label pixels (h,w), and count them by column and bin (n, bins): ground, obstacles, their band, and the slab.
+    """Label pixels (h,w), and count them by column and bin (n, bins): ground, obstacles, their band, falls, slab.
 
     ground: (bins+1,) slope -z/x of the ground at the borders of bins; seen: (bins,) whether it was seen there.
     most_m: heights beyond are not ground, however uncertain. bands: (b,) heights. sums: of disparities of obstacles.
-    falls: pixels below the ground, where their rays pass through it. heights: sums of z of ground.
+    falls: pixels below the ground, where their rays pass through it. heights: sums of z of ground in m.
     in_band: (n, bins, b-1). slab, slab_sums: within slab_m of the camera's height. Labels and counts are zero before.
     Returns how many pixels lie on the ground that was seen, and how many below it.
     """
@@ -272,14 +272,14 @@ def _longest_ground(  # type: ignore[no-untyped-def]
 ):
     """From where and up to where ground was seen in counts (bins,), between two ranges; 0, 0 if it was not.
 
-    And whether it ended before a _WALL, a _FALL or _NOTHING, and whether ground fell before it. The longest part with
-    gaps of at most gap_m, or two deviations of the range, and without `least` pixels of obstacles (bins,) at the same
-    range: those stand there, or hang above. Nor is a step within it, nor `least_falls` pixels below it. bf: px m along
-    the column.
+    And whether it ended before a _WALL, a _FALL or _NOTHING, and whether _SOME_FALL pixels up to its end lie below it.
+    The longest part with gaps of at most gap_m, or two deviations of the range, and without `least` pixels of obstacles
+    (bins,) at the same range: those stand there, or hang above. Nor is a step within it, nor `least_falls` pixels below
+    it. bf: px m along the column.
     """
     bins = len(grounds)
     half = int(_PX / BIN_PX)
-    best_from, best, start, last, ended, fell, behind = 0.0, 0.0, 0.0, 0.0, _NOTHING, 0, False
+    best_from, best, start, last, ended, fell, has_fall = 0.0, 0.0, 0.0, 0.0, _NOTHING, 0, False
     for j in range(bins - 1, lowest - 1, -1):
         fell += falls[j]
         near, far = bf / ((j + 1) * BIN_PX), bf / ((j if j else 0.5) * BIN_PX)
@@ -302,10 +302,10 @@ def _longest_ground(  # type: ignore[no-untyped-def]
             start = near
         last = far
         if last - start > best - best_from:
-            best_from, best, ended, behind = start, last, _NOTHING, fell >= _SOME_FALL
+            best_from, best, ended, has_fall = start, last, _NOTHING, fell >= _SOME_FALL
     if best > 0.0 and bf / BIN_PX * (1.0 / best_from - 1.0 / best) < _LEAST_BINS - 0.5:
         return 0.0, 0.0, ended, False
-    return best_from, min(best, end_m), ended, behind
+    return best_from, min(best, end_m), ended, has_fall
 
 
 @njit
@@ -328,7 +328,7 @@ def collect_scan(  # type: ignore[no-untyped-def]
             clear[c] = bf / surface[c, 1] * along
             if abs(surface[c, 1] - surface[c, 0]) < _SAME_PX:
                 clear[c] = obstacle[c]  # the same surface: the obstacle's mean is that of more pixels
-        free_from[c], free[c], ended, behind = _longest_ground(
+        free_from[c], free[c], ended, has_fall = _longest_ground(
             grounds[c], heights[c], obstacles[c], falls[c], _NEVER, least, 0.0, obstacle[c], lowest, bf * along,
             sigma_px, gap_m,
         )  # fmt: skip
@@ -337,7 +337,7 @@ def collect_scan(  # type: ignore[no-untyped-def]
             free[c] = obstacle[c]  # up to its foot
         elif free[c] > 0.0:
             free[c] = _open_end(free[c], bf * along, sigma_px)
-        if behind:
+        if has_fall:
             free_from[c] = _open_start(free_from[c], limits[0] / height, bf * along, sigma_px)
         if obstacle[c] < np.inf:
             top = 0
@@ -365,8 +365,9 @@ def _open_end(end, bf, sigma_px):  # type: ignore[no-untyped-def]
 
 @njit
 def _open_start(start, low, bf, sigma_px):  # type: ignore[no-untyped-def]
-    """A range from which ground was seen behind a fall, later by the deviation of its first pixels.
+    """A range from which ground was seen that falls near there, later by the deviation of its first pixels.
 
-    low: part of it before it in which a grid takes rays for so low that cells are free.
+    low: height of the lowest obstacles over that of the camera. A grid also frees cells before `start` where the ray to
+    it is lower than such obstacles, this share of the range, so the range is made longer by as much.
     """
     return bf / max(bf / start - _OPEN_SIGMAS * sigma_px, BIN_PX) / (1.0 - min(low, 0.5))
