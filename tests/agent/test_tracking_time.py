@@ -23,10 +23,14 @@ def test_a_slow_log_is_no_part_of_the_tracking_time(
     runtime = AgentRuntime(options, open_source(options.source), NoBaseChannel(), whole_process=False)
     runtime.begin_at(0)
     monkeypatch.setattr(FlightRecord, "step", lambda *_: time.sleep(0.1))
+    whole_ms = []
     for _ in range(2):
         now_ns = runtime.next_ns
         assert now_ns is not None
         frame, imu, odometry = runtime.reader.take()
+        begin_s = time.monotonic()
         runtime.step(frame, imu, (), now_ns, odometry)
-    assert 0.0 < min(runtime.report()["timing"]["tracking_ms"]) < 100.0
+        whole_ms.append(1e3 * (time.monotonic() - begin_s))
+    for tracking_ms, step_ms in zip(runtime.report()["timing"]["tracking_ms"], whole_ms, strict=True):
+        assert 0.0 < tracking_ms < step_ms - 99.0
     runtime.close()
