@@ -261,10 +261,7 @@ class PoseCovariance:
         self._noise = self._noise * self._config.refined_share
 
     def correct_disparities(self, offset: F64) -> F64:
-        """Update after the disparity offset of the map changed: how the camera in m moves by it, on the left (6,).
-
-        offset: (5,) px, the change, as in `disparity_offset`. Keyframes move with it.
-        """
+        """Move keyframes by a change (5,) px of the disparity offset; how the camera moves in m, on the left (6,)."""
         m, errors = self._map, np.zeros(SHAPES)
         errors[:DISPARITY_SHAPES] = self._at_edge * offset
         slots = np.flatnonzero(m.keyframe >> SEQUENCE_BITS == m.active)

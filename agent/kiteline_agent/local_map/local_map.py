@@ -151,11 +151,9 @@ class LocalMap:
         self.seed[slot] = False
         self.seed[slot, :n] = rho[:n] <= 0.0
         self._has_new_seeds = True
-        self.octave[rows] = octave[:n]
-        self.angle[rows], self.descriptor[rows] = angle[:n], descriptor[:n]
+        self.octave[rows], self.angle[rows], self.descriptor[rows] = octave[:n], angle[:n], descriptor[:n]
         self.templates[rows] = templates[:n]
-        self.tried[rows], self.hits[rows], self.misses[rows] = 0, 0, 0
-        self.last_hit[rows] = frame_number
+        self.tried[rows], self.hits[rows], self.misses[rows], self.last_hit[rows] = 0, 0, 0, frame_number
         return slot
 
     def _bearings(self, uv: F64) -> F64:
@@ -376,8 +374,7 @@ class LocalMap:
 
     def set_disparity_offset(self, offset: F64) -> None:
         """Set the error of stereo disparities (5,) px (`disparity_offset`); correct the depths measured by stereo."""
-        at = disparity_offset.terms(self.bearing[self.measured])
-        change = at @ (offset - self.disparity_offset) / self.camera.bf
+        change = disparity_offset.terms(self.bearing[self.measured]) @ (offset - self.disparity_offset) / self.camera.bf
         self.disparity_offset = np.array(offset)
         self.rho[self.measured] = np.maximum(self.rho[self.measured] - change, self.least_rho)
 
@@ -389,8 +386,7 @@ class LocalMap:
     def relate_to_parents(self) -> None:
         """Set the poses of keyframes relative to their parents from those in the submap."""
         for slot in np.flatnonzero((self.keyframe != NO_KEYFRAME) & (self.parent != NO_KEYFRAME)):
-            parent = self.slot_of(int(self.parent[slot]))
-            if parent >= 0:
+            if (parent := self.slot_of(int(self.parent[slot]))) >= 0:
                 self.T_p_k[slot] = se3.orthonormalise(se3.inverse(self.T_m_k[parent]) @ self.T_m_k[slot])
 
     def compose_unplaced(self) -> None:

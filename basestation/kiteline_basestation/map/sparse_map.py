@@ -225,10 +225,7 @@ class SparseMap(RigValues):
         self._refresh_usable(row)
 
     def fuse(self, child: int, parent: int) -> list[KeyframeId]:
-        """Fuse root landmark `child` into root landmark `parent`.
-
-        Returns the keyframes, sorted, of the landmarks that have another root now.
-        """
+        """Fuse root landmark `child` into `parent`; the keyframes, sorted, of landmarks that have another root now."""
         table = self.keypoints
         one = np.array([child], np.int32)
         self.keyframes.live[table.row[child]] -= self.is_live(one)[0]

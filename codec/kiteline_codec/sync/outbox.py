@@ -380,10 +380,7 @@ class Outbox:
                 del self._entries[key]
 
     def give_up(self, now_ns: int, round_trip: RoundTrip, overtaken_below: int, *, idle: bool) -> bool:
-        """Queue again what packets carried that count as lost (`PacketsInFlight.give_up_late`).
-
-        idle: nothing waits to be sent. Returns True if packets count as lost.
-        """
+        """Queue again what packets carried that count as lost; True if any do. idle: nothing waits to be sent."""
         lost = self.packets.give_up_late(now_ns, round_trip, overtaken_below, last=idle)
         for packet in lost:
             self._lose(packet)
@@ -398,7 +395,6 @@ class Outbox:
             unsent = ranges.add(entry.unsent, start, stop)
             for a, b in entry.acknowledged:
                 unsent = ranges.cut(unsent, a, b)
-            entry.unsent = unsent
-            entry.send_plain = True
+            entry.unsent, entry.send_plain = unsent, True
             if unsent:
                 self._queue.add(key, entry)

@@ -20,7 +20,7 @@ from kiteline_bench.harness.placed import KeyframesInWorld
 from kiteline_bench.harness.result import AgentRun
 from kiteline_bench.harness.run import Part, Scenario, fly_with_base
 from kiteline_bench.papers.sequences import find_sequences
-from kiteline_bench.papers.several_maps.plot import plot_experiments
+from kiteline_bench.papers.several_maps.plot import Drawn, plot_experiments
 from kiteline_bench.papers.several_maps.street import street_recording
 from kiteline_bench.reality.flown import table
 from kiteline_core.geometry import se3
@@ -241,6 +241,10 @@ def own(folder: Path) -> list[Experiment]:
     return experiments
 
 
+def _drawn(o: Outcome) -> Drawn:
+    return Drawn(f"{o.experiment.name}\n{o.merges} merges, joint ATE {o.ate_m:.3f} m", o.found, o.true)
+
+
 def run(bench: Bench) -> list[Bar]:
     """All experiments, their bars, table and plot."""
     outcomes = []
@@ -256,7 +260,7 @@ def run(bench: Bench) -> list[Bar]:
     name = Path("images/papers-multi-map.png")
     folder = Path("docs") if Path("docs").is_dir() else bench.folder
     (folder / name.parent).mkdir(exist_ok=True)
-    plot_experiments(folder / name, outcomes)
+    plot_experiments(folder / name, [_drawn(o) for o in outcomes])
     _tell(bench, outcomes)
     bench.more.append(f"![Keyframes of all robots in the base's world, and the true paths]({name})")
     return [bar for o in outcomes for bar in bars(o)]
