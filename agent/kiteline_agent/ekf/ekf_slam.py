@@ -79,9 +79,9 @@ class EkfSlam:
         entered: I64 = np.zeros(0, np.int64)
         is_view = self._is_view_due()
         if is_view:
-            ended = self._take_ended(ids)
             if int(good.sum()) < self._config.in_view:  # else the landmarks tell enough
-                entered = self._enter(ids[fresh], xy[fresh], coarse[fresh], ended)
+                entered = self._enter(ids[fresh], xy[fresh], coarse[fresh], self._ended(ids))
+            self._tracks.keep(ids)
             self._add_view(ids[fresh], xy[fresh], coarse[fresh])
         return FrameUpdate(ids[good], ids[bad], entered, is_view)
 
@@ -145,8 +145,7 @@ class EkfSlam:
         ids, xy, coarse: (n,), (n,2), (n,) tracks that are no landmarks, see `update`.
         """
         state = self.state
-        fitting = [(int(ids[k]), track) for k, track in self._positioned(ids, xy, coarse) if self._may_enter(track)]
-        new = fitting[: self._config.entries]
+        new = [(int(ids[k]), track) for k, track in self._positioned(ids, xy, coarse) if self._may_enter(track)]
         update_by_rays(state, [track for _, track in new] + ended)
         entered = []
         for k, track in new:
@@ -199,8 +198,8 @@ class EkfSlam:
             return False
         return distance_share(state, rays) <= config.depth_share
 
-    def _take_ended(self, ids: I64) -> list[Track]:
-        """Take out tracks that are followed no more; those that were seen often enough. ids: (n,) followed ones."""
+    def _ended(self, ids: I64) -> list[Track]:
+        """Tracks that are followed no more, were seen often enough, and whose rays meet. ids: (n,) followed ones."""
         tracks, config = self._tracks, self._config
         ended = np.flatnonzero(~np.isin(tracks.ids, ids))
         out: list[Track] = []
@@ -214,7 +213,6 @@ class EkfSlam:
             rays = linearised(self.state, track, self.state.T_o_c, self.state.view_T_o_c)
             if rays is not None and rays_meet(self.state, rays, config.residual_gate):
                 out.append(track)
-        tracks.drop(tracks.ids[ended])
         return out
 
     def _free_slot(self) -> int | None:

@@ -113,11 +113,8 @@ class FilterState:
     def correct(self, change: F64) -> None:
         """Apply a correction (size,) in the coordinates of the error."""
         turn = se3.so3_exp(change[3:6])
-        self.T_o_c = _corrected(self.T_o_c, change[:6])
+        self.T_o_c, self.view_T_o_c = self.corrected_views(np.arange(self._first), change[: self._first])
         self.scale *= float(np.exp(change[SCALE]))
-        for view in self.used_views.tolist():
-            row = self.view_row(view)
-            self.view_T_o_c[view] = _corrected(self.view_T_o_c[view], change[row : row + 6])
         count = (self._size - self._first) // 3
         used = self.used[:count]
         moved = change[self._first : self._size].reshape(-1, 3) @ _jacobian(change[3:6]).T
@@ -129,7 +126,7 @@ class FilterState:
         return np.flatnonzero(self.view_used)
 
     def corrected_views(self, columns: I64, change: F64) -> tuple[F64, F64]:
-        """Camera (4,4) and past views (views,4,4) after a change (k,) of columns (k,): six each, the camera first."""
+        """Camera (4,4) and past views (views,4,4) after a change (k,) of columns (k,) of the state."""
         whole = np.zeros(self._first)
         whole[columns] = change
         views = self.view_T_o_c.copy()

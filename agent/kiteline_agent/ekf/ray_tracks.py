@@ -43,6 +43,10 @@ class RayTracks:
         """Forget tracks."""
         self._keep(~np.isin(self.ids, ids))
 
+    def keep(self, ids: I64) -> None:
+        """Forget all other tracks."""
+        self._keep(np.isin(self.ids, ids))
+
     def find(self, ids: I64) -> tuple[I64, I64]:
         """Places (k,) in `ids` of those that are known, and their rows (k,)."""
         if not len(self.ids):
