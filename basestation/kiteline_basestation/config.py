@@ -244,7 +244,8 @@ class PublishConfig:
     pose_rad: float = 0.0002  # rad; a tenth of a pixel at 500 px of focal length
     depth_px: float = 0.1  # px; of projection or disparity, the largest of a keyframe's landmarks
     batch_s: float = 2.0  # s that a thin link takes to carry a batch of corrections, about; the next one waits so long
-    batch_values: int = 1000  # values of a batch, which take 30 ms to code: a loop over a large map moves them all
+    batch_values: int = 1000  # values of a batch: a loop over a large map moves all its keyframes
+    step_values: int = 100  # values of a batch that are coded in one step, about 15 ms; the next steps code the others
     batch_wait_s: float = 10.0  # s after which a batch that has not arrived is waited for no more: nobody listens
 
 

@@ -59,12 +59,16 @@ class MapperInput:
 
 @dataclass(frozen=True, slots=True)
 class MapperOutput:
-    """Records for each agent, jobs to be run, answers to the commands, and keys of records that are void."""
+    """Records for each agent, jobs to be run, answers to the commands, and keys of records that are void.
+
+    unfinished: agents whose batch of corrections goes on with the next step.
+    """
 
     publish: Published
     jobs: tuple[Job, ...]
     answers: tuple[Answer, ...] = ()
     withdrawn: tuple[tuple[AgentId, Key], ...] = ()
+    unfinished: frozenset[AgentId] = frozenset()
 
 
 class Mapper:
@@ -141,7 +145,8 @@ class Mapper:
         if self.merger is not None:
             jobs += self.merger.jobs(now_ns)
         # 7. Publish the values that changed and for which there is room.
-        return MapperOutput(self._publisher.collect(dict(given.room_bytes)), tuple(jobs), tuple(answers), withdrawn)
+        published = self._publisher.collect(dict(given.room_bytes))
+        return MapperOutput(published, tuple(jobs), tuple(answers), withdrawn, self._publisher.unfinished)
 
     def adopt(self, record: Record) -> None:
         """Replace a published value by its quantised code, as the agent will hold it."""

@@ -101,9 +101,11 @@ class Station:
             if isinstance(end := self.channels.get(agent), CodedChannel):
                 end.endpoint.claims.earned += KEYFRAME_BYTES * keyframes
         self.published = sum(len(records) for _, records in output.publish)
-        for agent, records in output.publish:
+        published = dict(output.publish)
+        for agent in sorted(published.keys() | {a for a, batches in self._batches.items() if batches.is_open}):
             self.join(agent)
-            self._put(agent, self._batches[agent].numbered(records, now_ns))
+            numbered, unfinished = self._batches[agent].numbered, agent in output.unfinished
+            self._put(agent, numbered(published.get(agent, ()), now_ns, unfinished=unfinished))
         for agent, key in output.withdrawn:
             self.join(agent).remove(key)
             if self.changed is not None:
@@ -129,6 +131,8 @@ class Station:
         for record in own:
             self._batches[agent].restore(record)
         self.mapper.restore(agent, (), tuple(channel.put(record) for record in own), now_ns)
+        if (released := self._batches[agent].release()) is not None:
+            self._put(agent, [released])
 
     def _track(self, agent: AgentId, own: bool, records: Sequence[Record]) -> None:
         if self.changed is not None:

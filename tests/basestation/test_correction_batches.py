@@ -130,6 +130,41 @@ def test_numbers_go_on_after_a_restart() -> None:
     assert numbers(after.numbered([pose(3)], 0)) == [3, 3]
 
 
+def test_a_batch_over_several_steps_is_whole_with_its_last_ones() -> None:
+    link, batches, holder = Link(), CorrectionBatches(AGENT, PublishConfig()), Holder()
+    first = batches.numbered([pose(1), pose(2)], 0, unfinished=True)
+    assert numbers(first) == [1, 1] and batches.is_open and not holder.take(first, [])
+    link.missing = {messages.key(first[0])}
+    assert batches.room_bytes(link, STEP_NS) == 0
+    second = batches.numbered([pose(3), pose(1)], STEP_NS, unfinished=True)
+    assert numbers(second) == [1, 1] and not holder.take(second, [])
+    assert batches.numbered([], STEP_NS, unfinished=True) == []
+    last = batches.numbered([], STEP_NS)  # what was left turned out to be void
+    assert numbers(last) == [1] and not batches.is_open
+    assert [r.keyframe for r in holder.take(last, [])] == [1, 2, 3]
+    link.missing.clear()
+    assert batches.room_bytes(link, STEP_NS) is None
+    assert numbers(batches.numbered([pose(4)], STEP_NS)) == [2, 2]
+
+
+def test_a_batch_that_a_restart_cut_off_is_not_waited_for() -> None:
+    before, after, holder = (
+        CorrectionBatches(AGENT, PublishConfig()),
+        CorrectionBatches(AGENT, PublishConfig()),
+        Holder(),
+    )
+    whole, part = before.numbered([pose(1)], 0), before.numbered([pose(1), pose(2)], 0, unfinished=True)
+    holder.take([*whole, *part], [])
+    for record in [*whole, *part]:
+        after.restore(record)
+    released = after.release()
+    assert released == CorrectionBatch.of(AGENT, 2, []) and after.release() is None
+    assert len(holder.take([released], [])) == 2
+    for record in before.numbered([], 0):
+        after.restore(record)
+    assert after.release() is None
+
+
 def replace_batch(record: KeyframePose, batch: int) -> KeyframePose:
     return KeyframePose(record.keyframe, record.T_m_k, batch)
 

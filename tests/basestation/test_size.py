@@ -37,7 +37,7 @@ from kiteline_basestation.store.integrity import contradictions
 from kiteline_codec.channel import CodedChannel, coded_channel
 from kiteline_codec.schema import KEYFRAME_KINDS, CameraIntrinsics, CulledLandmarks, Key, KeyframePose
 from kiteline_codec.sync.resumption import agent_session
-from kiteline_core.geometry import se3
+from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import NO_KEYFRAME, KeyframeId, keyframe_id, submap_id, submap_of_keyframe
 from kiteline_core.optimisation.bundle import BundleResult
 from tests.basestation.feeding import STEP_NS, WITHOUT_GRID, feed
@@ -200,6 +200,33 @@ def test_keyframes_carried_along_to_their_targets_stay_composed_and_are_not_sent
     assert all(np.allclose(sparse_map.world_pose(k), T, atol=1e-9) for k, T in targets.items())
 
 
+@pytest.mark.parametrize("scale", [0.0, 1.0, 1.7])
+def test_keyframes_are_moved_together_to_the_bit_as_one_by_one(scale: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A pose graph moves 20,000 keyframes in one step, for which all agents wait. scale: of the submap, or 0."""
+    (together, keyframes), (single, _) = chain(40), chain(40)
+    submap = submap_id(0, 0, 0)
+    for sparse_map in (together, single):
+        for keyframe in keyframes[1:]:
+            sparse_map.set_pose(keyframe, sparse_map.pose(keyframe), carry=False)
+        if scale:
+            S_w_m = sim3.of(scale, se3.exp(np.array([1.0, -2.0, 0.5, 0.2, 0.1, -0.4])))
+            sparse_map.move_submap(submap, S_w_m)
+    step = se3.exp(np.array([0.2, 0.1, 0.0, 0.0, 0.1, 0.3]))
+    targets = {k: step @ together.world_pose(k) for k in keyframes[1:]}
+    for keyframe, T_w_k in targets.items():
+        single.set_world_pose(keyframe, T_w_k, carry=False)
+    updated: list[int] = []
+    monkeypatch.setattr(together, "_update_world_pose", updated.append)
+    publisher = Publisher(together)
+    move_keyframes(together, submap, targets, publisher, PublishConfig())
+    assert not updated
+    assert np.array_equal(together.keyframes.T_w_k, single.keyframes.T_w_k)
+    assert np.array_equal(together.keyframes.T_m_k, single.keyframes.T_m_k)
+    assert together.moved_rows == single.moved_rows
+    ((_, records),) = publisher.collect()
+    assert [r.keyframe for r in records] == keyframes[1:]
+
+
 def test_counts_of_landmarks_and_observations_follow_the_map(make_flight: MakeFlight) -> None:
     """They are kept by keyframe: the page asks twice a second, and 20,000 keyframes have seven million keypoints."""
     flight, mapper = make_flight(keyframes=30), Mapper(WITHOUT_GRID)
@@ -246,6 +273,26 @@ def test_many_corrections_are_sent_newest_first_a_batch_at_a_time(mapped: tuple[
         sent.append([r.keyframe for r in records])
     live = flight.keyframes[1:]
     assert sent == [live[max(0, n - 8) : n] for n in range(len(live), 0, -8)]
+
+
+def test_a_step_codes_a_part_of_a_batch_and_the_next_ones_the_rest(mapped: tuple[Any, Mapper]) -> None:
+    """A loop over a large map changes all its keyframes: a step that codes a whole batch keeps every agent waiting."""
+    flight, mapper = mapped
+    publisher = Publisher(mapper.map, replace(PublishConfig(), batch_values=20, step_values=6))
+    agent, live = flight.agent, flight.keyframes[1:]
+    for keyframe in live:
+        publisher.mark_changed(KeyframePose.KIND, keyframe)
+    sent: list[list[KeyframeId]] = []
+    for _ in range(4):  # the batch goes on though it has not arrived
+        for _, records in publisher.collect({agent: 0} if sent else {}):
+            sent.append([r.keyframe for r in records])
+        publisher.mark_changed(KeyframePose.KIND, live[-1])  # changes again
+        publisher.mark_changed(KeyframePose.KIND, live[-9])  # the same, while it is chosen
+    assert [len(part) for part in sent] == [6, 6, 6, 2]
+    assert sorted(k for part in sent for k in part) == live[-20:]
+    assert not publisher.unfinished and publisher.collect({agent: 0}) == ()
+    ((_, records),) = publisher.collect()
+    assert publisher.unfinished == {agent} and [r.keyframe for r in records][-1] == live[-1]
 
 
 def test_deleted_maps_leave_their_memory_to_the_next_ones(make_flight: MakeFlight, words: Any) -> None:

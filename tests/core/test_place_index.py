@@ -68,7 +68,8 @@ def test_words_and_scores_are_the_reference() -> None:
     assert found.keys.tolist() == sorted(expected, key=lambda k: -expected[k]) == [5, 17, 900]
     assert np.allclose(found.score, [expected[k] for k in found.keys.tolist()], rtol=1e-6)
     between = plain_score(v, places[5], places[17])
-    assert np.allclose(index.similarity(5, [5, 17, 3]), [1.0, between, 0.0], rtol=1e-6)
+    scores = index.scores(places[5])
+    assert np.allclose([scores.of(k) for k in (5, 17, 3)], [1.0, between, 0.0], rtol=1e-6)
 
 
 def test_a_repeated_feature_counts_once_for_each_feature_asked() -> None:
@@ -81,7 +82,8 @@ def test_a_repeated_feature_counts_once_for_each_feature_asked() -> None:
     index.add(3, other)
     index.remove(1)
     index.add(4, once)
-    assert index.similarity(4, [2])[0] == pytest.approx(1 / np.sqrt(50))
+    assert index.scores(once).of(2) == pytest.approx(1 / np.sqrt(50))
+    assert index.scores(np.repeat(once, 50, axis=0)).of(4) == pytest.approx(50 / np.sqrt(50))
 
 
 @given(st.lists(st.tuples(st.booleans(), st.integers(0, 9)), max_size=40), st.integers(0, 1000))

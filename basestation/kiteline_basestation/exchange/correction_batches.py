@@ -1,7 +1,8 @@
 """Corrections for one agent in batches: the next one is made when the one before has arrived.
 
 What changes meanwhile waits at the base, at its newest value. So a batch is never overtaken by the next one, and the
-agent can wait for all of it. On a thin link a batch is as large as the link carries in a few seconds.
+agent can wait for all of it. On a thin link a batch is as large as the link carries in a few seconds; a large one is
+coded over several steps.
 """
 
 from __future__ import annotations
@@ -36,6 +37,8 @@ class CorrectionBatches:
         self._members: dict[Key, None] = {}  # of the newest batch
         self._missing: Key | None = None  # a member that had not arrived at the last check: it is checked first
         self._made_ns = 0
+        self._open = False  # more values of the newest batch come with the next steps
+        self._closed = 0  # number of the newest batch whose record was made
         self._overdue = False  # the newest batch does not arrive: later values join it, and wait for no other ones
 
     def room_bytes(self, channel: RecordChannel, now_ns: int) -> int | None:
@@ -57,19 +60,32 @@ class CorrectionBatches:
         self._missing = next((key for key in reversed(self._members) if not channel.arrived(key)), None)
         return self._missing is None
 
-    def numbered(self, records: Sequence[Record], now_ns: int) -> list[Record]:
-        """Records with the number of their batch, and the record of the batch; as they are if none moves the map."""
+    @property
+    def is_open(self) -> bool:
+        """True while `numbered` is to be called in each step, since more values of the batch come."""
+        return self._open
+
+    def numbered(self, records: Sequence[Record], now_ns: int, *, unfinished: bool = False) -> list[Record]:
+        """Records with the number of their batch, and the record of the batch; as they are if none moves the map.
+
+        unfinished: more values of this batch come with a later step; its record comes with the last ones.
+        """
         keys = [messages.key(record) for record in records if isinstance(record, MEMBERS)]
-        if not keys:
+        if not keys and (unfinished or not self._open):
             return list(records)
         if self._overdue and self._number:
             self._members.update(dict.fromkeys(keys))
-            batch = CorrectionBatch.of(self._agent, self._number, [])
+            self._open = False
+            batch = [CorrectionBatch.of(self._agent, self._number, [])]
         else:
-            self._number, self._made_ns = self._number + 1, now_ns
-            self._members = dict.fromkeys(keys)
-            batch = CorrectionBatch.of(self._agent, self._number, keys)
-        return [replace(r, batch=self._number) if isinstance(r, MEMBERS) else r for r in records] + [batch]
+            if not self._open:
+                self._number, self._made_ns, self._members = self._number + 1, now_ns, {}
+            self._members.update(dict.fromkeys(keys))
+            self._open = unfinished
+            batch = [] if unfinished else [CorrectionBatch.of(self._agent, self._number, list(self._members))]
+        if batch:
+            self._closed = self._number
+        return [replace(r, batch=self._number) if isinstance(r, MEMBERS) else r for r in records] + batch
 
     def without(self, key: Key) -> CorrectionBatch | None:
         """The record that replaces that of the newest batch if a value of it is removed; None if none was."""
@@ -83,8 +99,17 @@ class CorrectionBatches:
         number = record.number if isinstance(record, CorrectionBatch) else getattr(record, "batch", 0)
         if number > self._number:
             self._number, self._members = number, {}
+        if isinstance(record, CorrectionBatch):
+            self._closed = max(self._closed, number)
         if isinstance(record, MEMBERS) and number and number == self._number:
             self._members[messages.key(record)] = None
+
+    def release(self) -> CorrectionBatch | None:
+        """The record that lets the agent wait for no more of a batch that an earlier process did not finish, if any."""
+        if self._closed == self._number:
+            return None
+        self._closed = self._number
+        return CorrectionBatch.of(self._agent, self._number, [])
 
     @property
     def _key(self) -> Key:

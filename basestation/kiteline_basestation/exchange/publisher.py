@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
+from itertools import chain, islice
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,20 +36,56 @@ _Mark = tuple[int, KeyframeId]  # KIND of a record, and the keyframe that it is 
 Published = tuple[tuple[AgentId, tuple[Record, ...]], ...]
 
 
+class _Moves:
+    """What moves the map of one agent and has not been sent.
+
+    batch: chosen for the batch that is being made, in order of sending. poses: keyframes. others: what has waited
+    longest first. None of them is in two.
+    """
+
+    def __init__(self) -> None:
+        self.batch: dict[_Mark, None] = {}
+        self.poses: dict[KeyframeId, None] = {}
+        self.others: dict[_Mark, None] = {}
+
+    def __bool__(self) -> bool:
+        return bool(self.batch or self.poses or self.others)
+
+    def add(self, kind: int, keyframe: KeyframeId) -> None:
+        """Add a change; of one that is chosen already, the newest value is sent."""
+        if (kind, keyframe) in self.batch:
+            return
+        if kind == KeyframePose.KIND:
+            self.poses.setdefault(keyframe)
+        else:
+            self.others.setdefault((kind, keyframe))
+
+    def forget(self, submaps: Collection[SubmapId]) -> None:
+        """Drop the changes of some submaps."""
+        self.batch = {mark: None for mark in self.batch if submap_of_keyframe(mark[1]) not in submaps}
+        self.poses = {keyframe: None for keyframe in self.poses if submap_of_keyframe(keyframe) not in submaps}
+        self.others = {mark: None for mark in self.others if submap_of_keyframe(mark[1]) not in submaps}
+
+
 class Publisher:
     """The base's changed values. A record holds a whole value, so that a later one replaces an earlier one."""
 
     def __init__(self, sparse_map: SparseMap, config: PublishConfig | None = None) -> None:
         self._map = sparse_map
-        self._most = (config or PublishConfig()).batch_values
+        self._config = config or PublishConfig()
         self._dirty: dict[_Mark, None] = {}
-        self._moves: dict[AgentId, dict[_Mark, None]] = {}  # what moves an agent's map; what has waited longest first
+        self._moves: dict[AgentId, _Moves] = {}
         self._records: list[tuple[AgentId, Record]] = []
 
     def mark_changed(self, kind: int, keyframe: KeyframeId) -> None:
         """Mark a value of a keyframe as changed. kind: KIND of a record class."""
-        marks = self._moves.setdefault(agent_of_keyframe(keyframe), {}) if kind in _MEMBER_KINDS else self._dirty
-        marks.setdefault((int(kind), keyframe))
+        if kind not in _MEMBER_KINDS:
+            self._dirty.setdefault((int(kind), keyframe))
+            return
+        moves = self._moves.get(agent := agent_of_keyframe(keyframe))
+        if moves is None:
+            moves = self._moves[agent] = _Moves()
+        moves.add(int(kind), keyframe)
 
     def mark_changed_slots(self, kind: int, slots: I32) -> None:
         """Mark a value of the keyframes that own slots (n,) as changed."""
@@ -72,14 +109,19 @@ class Publisher:
 
     def forget(self, submaps: Collection[SubmapId]) -> None:
         """Drop changes of deleted submaps that have not been sent."""
-        for marks in (self._dirty, *self._moves.values()):
-            for mark in [m for m in marks if submap_of_keyframe(m[1]) in submaps]:
-                del marks[mark]
+        self._dirty = {mark: None for mark in self._dirty if submap_of_keyframe(mark[1]) not in submaps}
+        for moves in self._moves.values():
+            moves.forget(submaps)
 
     @property
     def waiting(self) -> bool:
         """True if changes wait for room."""
         return bool(self._dirty or self._records or any(self._moves.values()))
+
+    @property
+    def unfinished(self) -> frozenset[AgentId]:
+        """Agents whose batch of corrections goes on with the next call of `collect`."""
+        return frozenset(agent for agent, moves in self._moves.items() if moves.batch)
 
     def collect(self, room_bytes: Mapping[AgentId, int] | None = None) -> Published:
         """The changes since the last call for which there is room, by agent, in order of kind and keyframe.
@@ -102,32 +144,37 @@ class Publisher:
         return tuple((agent, tuple(found.values())) for agent, found in sorted(out.items()))
 
     def _in_turn(self, room: Mapping[AgentId, int]) -> list[_Mark]:
-        """Take the changes for which there is room: all poses, then landmarks of the keyframe that has waited longest
-        and of the newest ones. In a room above 0 at least one change is taken, and never more than a batch holds.
+        """Take the changes of one step. A batch is chosen where there is room, and taken over several steps if it is
+        large; in a room above 0 it has at least one change.
         """
         taken, self._dirty = list(self._dirty), {}
-        for agent, marks in self._moves.items():
-            left = room.get(agent)
-            if left is None and len(marks) <= self._most:
-                taken += marks
-                marks.clear()
-            elif left != 0:
-                taken += self._batch(marks, left)
+        for agent, moves in self._moves.items():
+            if not moves.batch and room.get(agent) != 0:
+                moves.batch = dict.fromkeys(self._choose(moves, room.get(agent)))
+            now = list(islice(moves.batch, self._config.step_values))
+            taken += now
+            for mark in now:
+                del moves.batch[mark]
         return taken
 
-    def _batch(self, marks: dict[_Mark, None], left: int | None) -> list[_Mark]:
-        """Take as many of an agent's changes as `left` bytes hold."""
-        poses = sorted((m for m in marks if m[0] == KeyframePose.KIND), key=lambda m: -m[1])
-        others = [m for m in marks if m[0] != KeyframePose.KIND]
-        taken: list[_Mark] = []
-        for mark in poses + others[:1] + sorted(others[1:], key=lambda m: -m[1]):
-            if len(taken) == self._most or (left is not None and left <= 0):
+    def _choose(self, moves: _Moves, left: int | None) -> list[_Mark]:
+        """Take as many of an agent's changes as a batch and `left` bytes hold: all poses, the newest first, then
+        landmarks of the keyframe that has waited longest and of the newest ones.
+        """
+        kind, out = KeyframePose.KIND, list[_Mark]()
+        others = list(moves.others)
+        poses = ((kind, keyframe) for keyframe in sorted(moves.poses, reverse=True))
+        for mark in chain(poses, others[:1], sorted(others[1:], key=lambda m: -m[1])):
+            if len(out) == self._config.batch_values or (left is not None and left <= 0):
                 break
             if left is not None:
                 left -= self._bytes(*mark)
-            taken.append(mark)
-            del marks[mark]
-        return taken
+            out.append(mark)
+            if mark[0] == kind:
+                del moves.poses[mark[1]]
+            else:
+                del moves.others[mark]
+        return out
 
     def _bytes(self, kind: int, keyframe: KeyframeId) -> int:
         """About what a change takes on the wire."""

@@ -1,4 +1,4 @@
-"""The placed part of the map in w: input of exports."""
+"""The placed part of the map in w: input of exports and of the status page."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from kiteline_core.geometry import sim3
 from kiteline_core.ids import KEYPOINT_BITS, SEQUENCE_BITS, SubmapId
 
 F64 = NDArray[np.float64]
+I32 = NDArray[np.int32]
 I64 = NDArray[np.int64]
 
 
@@ -74,3 +75,24 @@ def placed_map(sparse_map: SparseMap, placements: Mapping[SubmapId, F64]) -> Pla
         pairs,
         np.array(metric, np.bool_),
     )
+
+
+def some_landmarks(sparse_map: SparseMap, placements: Mapping[SubmapId, F64], most: int) -> tuple[I32, F64]:
+    """Slots (m,) and positions in w (m,3) of landmarks with two observations or more in placed submaps.
+
+    At most `most` keypoints of the whole map, evenly chosen, are looked at: it may hold millions.
+    """
+    slots = np.arange(0, sparse_map.slots, max(1, -(-sparse_map.slots // most)), dtype=np.int32)
+    slots = sparse_map.sorted_by_id(slots[sparse_map.is_live(slots)])
+    submap = sparse_map.landmark_ids(slots) >> (SEQUENCE_BITS + KEYPOINT_BITS)
+    placed = np.isin(submap, sorted(placements))
+    slots, submap = slots[placed], submap[placed]
+    starts, _ = sparse_map.observations(slots)
+    xyz, known = sparse_map.positions(slots)
+    known &= np.diff(starts) >= 2
+    slots, submap, xyz = slots[known], submap[known], xyz[known]
+    for one in np.unique(submap).tolist():
+        inside = submap == one
+        T = placements[SubmapId(one)] @ sim3.inverse(sparse_map.submap_pose(SubmapId(one)))
+        xyz[inside] = xyz[inside] @ T[:3, :3].T + T[:3, 3]
+    return slots, xyz

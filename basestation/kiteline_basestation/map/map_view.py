@@ -303,6 +303,11 @@ class MapView:
             return None
         return np.asarray(self.keyframes.T_w_k[row]).copy()
 
+    def first_pose(self, submap: SubmapId) -> F64:
+        """T_m_k (4,4) of the first keyframe of a submap; the identity if it has no pose."""
+        begin = self.pose(self.submaps[submap][0]) if submap in self.submaps else None
+        return np.eye(4) if begin is None else begin
+
     def submap_pose(self, submap: SubmapId) -> F64:
         """S_w_m (4,4) of a submap: rigid, or a similarity if its unit of length differs from that of w."""
         held = self.submap_poses.get(submap)

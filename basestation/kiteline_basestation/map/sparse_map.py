@@ -8,7 +8,7 @@ landmark that a keypoint observes; for a fused landmark, the root landmark. Reco
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,12 +28,14 @@ from kiteline_basestation.map.map_tables import (
 )
 from kiteline_basestation.map.map_view import Rows
 from kiteline_basestation.map.rig_values import RigValues, parameters
+from kiteline_basestation.map.world_poses import in_submap, place_in_world
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import (
     KEYPOINT_BITS,
     MAX_KEYPOINTS,
     NO_KEYFRAME,
     NO_LANDMARK,
+    SEQUENCE_BITS,
     KeyframeId,
     SubmapId,
     agent_of_keyframe,
@@ -62,16 +64,14 @@ class SparseMap(RigValues):
         """
         if not 0 <= keypoints <= MAX_KEYPOINTS:
             raise ValueError(f"keyframe {keyframe} claims {keypoints} keypoints: expected at most {MAX_KEYPOINTS}")
-        if parent != NO_KEYFRAME and not (
-            parent < keyframe and submap_of_keyframe(parent) == submap_of_keyframe(keyframe)
-        ):
+        is_older = parent < keyframe and submap_of_keyframe(parent) == submap_of_keyframe(keyframe)
+        if not (parent == NO_KEYFRAME or is_older):
             raise ValueError(f"keyframe {keyframe} names parent {parent}: expected an older one of its submap")
         table = self.keyframes
         row = self.rows.get(keyframe)
         if row is None:
             free = self._free_rows.take()
-            row = self.height if free is None else free
-            self.height = max(self.height, row + 1)
+            self.height = max(self.height, (row := self.height if free is None else free) + 1)
             if row == len(table.id):
                 grow(table, row + max(32, row // 4))
             self.rows[keyframe] = row
@@ -140,15 +140,9 @@ class SparseMap(RigValues):
         self._refresh_usable(self.rows[keyframe])
 
     def put_observations(
-        self,
-        keyframe: KeyframeId,
-        part: int,
-        index: NDArray[np.uint16],
-        uv: F32,
-        inv_depth: F32,
-        octave: U8,
+        self, keyframe: KeyframeId, part: int, index: NDArray[np.uint16], uv: F32, inv_depth: F32, octave: U8,
         landmark: I64,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Set the observations of a known keyframe (see codec Observations); a part replaces its older version."""
         slots, keep = self._slots_of_record(keyframe, part, index, OBSERVATION)
         table = self.keypoints
@@ -183,6 +177,15 @@ class SparseMap(RigValues):
             T_w_k = se3.orthonormalise(sim3.place(sim3.inverse(S_w_m), T_w_k))
         self.set_pose(keyframe, T_w_k, carry=carry)
 
+    def set_world_poses(self, keyframes: Sequence[KeyframeId], T_w_k: F64) -> None:
+        """Set (n,4,4) in w of keyframes that have refined poses; submaps and descendants do not move."""
+        rows = np.array([self.rows[k] for k in keyframes], np.int32)
+        submaps = self.keyframes.id[rows] >> SEQUENCE_BITS
+        for submap in map(SubmapId, np.unique(submaps).tolist()):
+            inside = submaps == submap
+            self.keyframes.T_m_k[rows[inside]] = in_submap(T_w_k[inside], self.submap_poses.get(submap))
+            self._update_world_poses(submap, rows[inside])
+
     def compose(self, keyframe: KeyframeId) -> None:
         """Compose the pose of a keyframe without a refined one from its parent's pose; its children stay."""
         table, row = self.keyframes, self.rows[keyframe]
@@ -194,17 +197,11 @@ class SparseMap(RigValues):
         if submap in self.submap_poses or not np.array_equal(S_w_m, np.eye(4)):
             self.submap_poses[submap] = np.array(S_w_m)
             self._scales[submap] = sim3.scale_of(S_w_m)
-        for keyframe in self.submaps.get(submap, []):
-            self._update_world_pose(self.rows[keyframe])
+        self._update_world_poses(submap, self.rows_of(submap))
 
     def scale_submap(self, submap: SubmapId, factor: float) -> None:
         """Multiply the scale of a submap in w; its first keyframe does not move."""
         self.move_submap(submap, sim3.scaled_about(self.submap_pose(submap), factor, self.first_pose(submap)))
-
-    def first_pose(self, submap: SubmapId) -> F64:
-        """T_m_k (4,4) of the first keyframe of a submap; the identity if it has no pose."""
-        begin = self.pose(self.submaps[submap][0]) if submap in self.submaps else None
-        return np.eye(4) if begin is None else begin
 
     def set_depths(self, slots: I32, inv_depth: F32, offset: F32) -> None:
         """Set refined positions of landmarks (n,): inv_depth (n,) 1/m, offset (n,2) px."""
@@ -381,6 +378,11 @@ class SparseMap(RigValues):
         table.T_w_k[row] = table.T_m_k[row] if S_w_m is None else S_w_m @ table.T_m_k[row]
         if scale != 1.0:
             table.T_w_k[row, :3, :3] /= scale
+
+    def _update_world_poses(self, submap: SubmapId, rows: I32) -> None:
+        """The same for keyframes of one submap."""
+        self.moved_rows.update(rows.tolist())
+        place_in_world(self.keyframes, rows, self.submap_poses.get(submap), self._scales.get(submap, 1.0))
 
     def _compose_children(self, keyframe: KeyframeId) -> None:
         table = self.keyframes

@@ -92,7 +92,7 @@ def move_keyframes(
     here = table.T_w_k[[rows_by_id[k] for k in targets]]
     differ = (np.array(list(targets.values())).reshape(-1, 4, 4) != here).any(axis=(1, 2))
     changed = list(compress(targets, differ.tolist()))
-    for keyframe in _carried(sparse_map, changed, targets):
+    for keyframe in _carried(sparse_map, map_id, changed, targets):
         parent = KeyframeId(int(table.parent[rows_by_id[keyframe]]))
         above, old = table.T_w_k[rows_by_id[parent]], table.T_w_k[rows_by_id[keyframe]]
         goal[keyframe] = se3.orthonormalise(goal[parent] @ se3.inverse(above) @ old)
@@ -114,18 +114,21 @@ def move_keyframes(
         return has_moved
     rows, new = np.array([rows_by_id[k] for k in moving]), np.stack([goal[k] for k in moving])
     composed = table.pose_source[rows] != REFINED_POSE  # these are carried along as their parents move
-    moved: set[KeyframeId] = set()
-    for i in np.flatnonzero(_differ(table.T_w_k[rows], new, publish) | composed).tolist():  # parents first
+    differs = _differ(table.T_w_k[rows], new, publish)
+    set_now = np.flatnonzero(differs & ~composed)
+    moved = {moving[i] for i in set_now.tolist()}
+    sparse_map.set_world_poses([moving[i] for i in set_now.tolist()], new[set_now])
+    for i in np.flatnonzero(composed).tolist():  # parents first
         keyframe, row = moving[i], rows[i]
-        if composed[i]:
-            if KeyframeId(int(table.parent[row])) in moved:
-                sparse_map.compose(keyframe)
-                moved.add(keyframe)
-            if not _differ(table.T_w_k[rows[i : i + 1]], new[i : i + 1], publish)[0]:
-                continue
-        sparse_map.set_world_pose(keyframe, new[i], carry=False)
-        moved.add(keyframe)
-        publisher.mark_changed(KeyframePose.KIND, keyframe)
+        if KeyframeId(int(table.parent[row])) in moved:
+            sparse_map.compose(keyframe)
+            moved.add(keyframe)
+        if _differ(table.T_w_k[rows[i : i + 1]], new[i : i + 1], publish)[0]:
+            sparse_map.set_world_pose(keyframe, new[i], carry=False)
+            moved.add(keyframe)
+            set_now = np.append(set_now, i)
+    for i in np.sort(set_now).tolist():
+        publisher.mark_changed(KeyframePose.KIND, moving[i])
     return has_moved
 
 
@@ -138,10 +141,12 @@ def _differ(a: F64, b: F64, publish: PublishConfig) -> NDArray[np.bool_]:
 
 
 def _carried(
-    sparse_map: SparseMap, changed: Sequence[KeyframeId], targets: Mapping[KeyframeId, F64]
+    sparse_map: SparseMap, map_id: SubmapId, changed: Sequence[KeyframeId], targets: Mapping[KeyframeId, F64]
 ) -> list[KeyframeId]:  # fmt: skip
     """Descendants of changed keyframes, in order of id, that move along: neither they nor one between has a target."""
     table, open_, out = sparse_map.keyframes, list(changed), list[KeyframeId]()
+    if len(targets) == len(keyframes_of(sparse_map, map_id)):
+        return out  # all have one
     while open_:
         for row in sparse_map.children_of(open_.pop()):
             child = KeyframeId(int(table.id[row]))

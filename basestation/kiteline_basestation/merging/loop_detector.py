@@ -184,13 +184,10 @@ class LoopDetector:
         at = sparse_map.number_of(keyframe)
         near = same[max(0, at - config.min_gap) : at + config.min_gap + 1]
         before = [k for k in near if k < keyframe][-1:]
-        enough_same_map = config.min_likeness
-        if before and keyframe in self._index and before[0] in self._index:
-            usual = float(self._index.similarity(keyframe, before)[0])
-            enough_same_map = max(enough_same_map, config.min_neighbour_ratio * usual)
-        places = self._index.query(
-            observations.descriptor, known | set(near) | {keyframe}, _QUERIED * config.candidates
-        )  # fmt: skip
+        scores = self._index.scores(observations.descriptor)
+        usual = scores.of(before[0]) if before and keyframe in self._index else 0.0
+        enough_same_map = max(config.min_likeness, config.min_neighbour_ratio * usual)
+        places = scores.best(known | set(near) | {keyframe}, _QUERIED * config.candidates)
         out: list[KeyframeId] = []
         taken: set[int] = set()
         left = {True: config.candidates_same_map, False: config.candidates}

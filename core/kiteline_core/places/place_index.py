@@ -9,7 +9,7 @@ vocabulary is trained once; consistency of successive candidates is left to the 
 from __future__ import annotations
 
 import struct
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -86,6 +86,33 @@ class Places:
 
 
 @dataclass(frozen=True, slots=True)
+class Scores:
+    """Similarity of some descriptors to each place of an index. Read it before the index changes."""
+
+    _row: Mapping[int, int]
+    _key: I64
+    _total: F64
+
+    def of(self, key: int) -> float:
+        """Similarity to one place; 0 if it is unknown."""
+        row = self._row.get(key)
+        return 0.0 if row is None else float(self._total[row])
+
+    def best(self, exclude: Collection[int] = (), limit: int = 10) -> Places:
+        """The `limit` most similar places, without excluded ones.
+
+        Places without a common word are left out; ties are ordered by key.
+        """
+        total = self._total.copy()
+        total[[row for key in exclude if (row := self._row.get(key)) is not None]] = 0.0
+        rows = np.flatnonzero(total > 0.0)
+        if len(rows) > 4 * limit:
+            rows = rows[total[rows] >= np.partition(total[rows], len(rows) - limit)[len(rows) - limit]]
+        rows = rows[np.lexsort((self._key[rows], -total[rows]))[:limit]]
+        return Places(self._key[rows], total[rows])
+
+
+@dataclass(frozen=True, slots=True)
 class _Entry:
     """One place. word: (n,) of its features. signature: (n,) first 64 bits of their descriptors. norm: of weights."""
 
@@ -159,28 +186,12 @@ class PlaceIndex:
         self._unused.append(row)
 
     def query(self, descriptors: U8, exclude: Collection[int] = (), limit: int = 10) -> Places:
-        """The `limit` places most similar to descriptors (n,32), without excluded ones.
+        """The `limit` places most similar to descriptors (n,32), without excluded ones; see `Scores.best`."""
+        return self.scores(descriptors).best(exclude, limit)
 
-        Places without a common word are left out; ties are ordered by key.
-        """
-        total = self._scores(self._entry(descriptors))
-        for key in exclude:
-            if (row := self._row.get(key)) is not None:
-                total[row] = 0.0
-        rows = np.flatnonzero(total > 0.0)
-        if len(rows) > 4 * limit:
-            rows = rows[total[rows] >= np.partition(total[rows], len(rows) - limit)[len(rows) - limit]]
-        rows = rows[np.lexsort((self._key[rows], -total[rows]))[:limit]]
-        return Places(self._key[rows], total[rows])
-
-    def similarity(self, key: int, others: Collection[int]) -> F64:
-        """Similarity (n,) of a known place to others, 0 for unknown ones."""
-        row = self._row[key]
-        word = self._words[row].astype(np.int32)
-        signature = np.empty(len(word), np.uint64)
-        kernels.signatures(word, row, self._start, self._size, self._owner, self._signature, signature)
-        total = self._scores(_Entry(word, signature, float(self._norm[row])))
-        return np.array([total[self._row[k]] if k in self._row else 0.0 for k in others])
+    def scores(self, descriptors: U8) -> Scores:
+        """Similarity of descriptors (n,32) to all places. It reads all their features of the same words."""
+        return Scores(self._row, self._key, self._scores(self._entry(descriptors)))
 
     def _scores(self, asked: _Entry) -> F64:
         total = np.zeros(len(self._words))

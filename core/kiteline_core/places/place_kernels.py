@@ -91,43 +91,23 @@ def remove(word: I32, place: int, start: I32, size: I32, owner: I32, signature_o
 
 
 @njit
-def signatures(
-    word: I32, place: int, start: I32, size: I32, owner: I32, signature_of: U64, signature: U64
-) -> None:  # fmt: skip
-    """Signatures (n,) of a place's features, out: its postings of a word are in the order of its features."""
-    for i in range(word.shape[0]):
-        w = word[i]
-        before = 0
-        for j in range(i):
-            if word[j] == w:
-                before += 1
-        for k in range(start[w], start[w] + size[w]):
-            if owner[k] == place:
-                if before == 0:
-                    signature[i] = signature_of[k]
-                    break
-                before -= 1
-
-
-@njit
 def score(
     word: I32, signature: U64, weight: F32, likeness: F64, start: I32, size: I32, owner: I32, signature_of: U64,
     total: F64,
 ) -> None:  # fmt: skip
     """Score of each place: the sum over features of weight^2 times the likeness of the place's most similar feature.
 
-    Only features of the same word are compared. likeness: (65,) by the number of bits in which signatures differ.
-    total: (places,) zeros in, out.
+    Only features of the same word are compared. likeness: (65,) by the number of bits in which signatures differ; it
+    never grows with it. total: (places,) zeros in, out.
     """
     for i in range(word.shape[0]):
         w = word[i]
-        value = float(weight[w]) * float(weight[w])
-        place, best = -1, 0.0
-        for k in range(start[w], start[w] + size[w]):
-            if owner[k] != place:
-                if place >= 0:
-                    total[place] += value * best
-                place, best = owner[k], 0.0
-            best = max(best, likeness[count_bits(signature[i] ^ signature_of[k])])
-        if place >= 0:
-            total[place] += value * best
+        value, asked = float(weight[w]) * float(weight[w]), signature[i]
+        k, end = start[w], start[w] + size[w]
+        while k < end:
+            place, least = owner[k], count_bits(asked ^ signature_of[k])
+            k += 1
+            while k < end and owner[k] == place:
+                least = min(least, count_bits(asked ^ signature_of[k]))
+                k += 1
+            total[place] += value * likeness[least]
