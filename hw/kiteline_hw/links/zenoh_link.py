@@ -27,8 +27,8 @@ from kiteline_hw.system.closing import Closing
 
 _MAX_AGENT = MAX_AGENTS - 1
 _NEW_AGENT_S = 0.05  # s until the hub's sender thread notices a new agent
-# s within which a live base must have answered. Over UDP, Zenoh's own declarations may be lost for good: then the
-# session is opened anew. The limit doubles each time, because the link may just be slow.
+# s within which a live base must have answered. Over UDP, Zenoh's own declarations may be lost for good, those that say
+# that there is a base, too: then the session is opened anew. The limit doubles each time: the link may just be slow.
 _SILENCE_S = 3.0
 _LONGEST_SILENCE_S = 24.0
 _INBOXES_BYTES = 8 << 20  # memory for the packets of all agents: strangers may fill the inboxes of 256
@@ -121,6 +121,7 @@ class ZenohLink(_PeerLink):
         self._prefix = _prefix(group)
         self._closed = threading.Event()
         self._silence_s = _SILENCE_S
+        self._loses = endpoint.removeprefix("router/").startswith("udp/")  # declarations, too
         self._session: zenoh.Session | None = None
         self._session_lock = threading.Lock()
         self._declared: list[Any] = []  # Zenoh withdraws a declaration whose object is garbage collected
@@ -163,7 +164,10 @@ class ZenohLink(_PeerLink):
             close_session(session)
 
     def _serve(self, publisher: zenoh.Publisher) -> None:
-        """Send queued packets until the link is closed, or until a base that is said to be alive stays silent."""
+        """Send queued packets until the link is closed, or a base that is alive stays silent.
+
+        Over UDP also until no base has been heard of for as long: what says that there is one may have been lost.
+        """
         received_before, last_received_s = self.counters.received_packets, time.monotonic()
         while not self._closed.is_set():
             with self._wake:
@@ -174,16 +178,17 @@ class ZenohLink(_PeerLink):
             received = self.counters.received_packets
             if received != received_before:
                 self._silence_s = _SILENCE_S
-            if received != received_before or not self.alive:
+            if received != received_before or not (self.alive or self._loses):
                 received_before, last_received_s = received, now_s
-            if packet is None or self._closed.is_set():
+            if self._closed.is_set() or (packet is None and self.alive):
                 continue
-            if now_s - last_received_s > self._silence_s:
+            if now_s - last_received_s >= self._silence_s:
                 self._silence_s = min(2.0 * self._silence_s, _LONGEST_SILENCE_S)
                 self.alive = False
                 self.clear_outbox()
                 return
-            _put(self, publisher, packet)
+            if packet is not None:
+                _put(self, publisher, packet)
 
     def _declare(self, session: zenoh.Session) -> zenoh.Publisher:
         key = f"{self._prefix}/{self._agent}"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import time
+from typing import Any
 
 import pytest
 import zenoh
@@ -43,6 +44,26 @@ def test_two_agents_and_a_base_that_starts_late_and_restarts() -> None:
             wait_for(lambda: not one.connected and not two.connected)
         assert one.counters.reconnects == 2
         assert one.counters.sent_packets == 2 and one.counters.callback_errors == 0
+
+
+def test_a_base_whose_token_was_lost_over_udp_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Zenoh repeats no declaration that UDP lost."""
+    monkeypatch.setattr("kiteline_hw.links.zenoh_link._SILENCE_S", 0.3)
+    endpoint = free_endpoint().replace("tcp/", "udp/")
+    lost: list[Any] = []
+
+    class FirstTokenLost(ZenohLink):
+        def on_liveliness(self, sample: Any) -> None:
+            if lost:
+                super().on_liveliness(sample)
+            lost.append(sample)
+
+    with ZenohHub(endpoint) as hub, FirstTokenLost(endpoint, 3) as link:
+        wait_for(lambda: lost)
+        assert not link.connected
+        wait_for(lambda: link.connected and hub.alive() == {3})
+        assert link.send(b"up")
+        wait_for(lambda: hub.links()[3].receive() == [b"up"])
 
 
 def test_an_agent_that_leaves_is_noticed_and_its_link_stays() -> None:
