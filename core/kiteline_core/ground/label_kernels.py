@@ -229,80 +229,108 @@ def refine_surfaces(left, right, rotation, camera, bf, offset, x, z, column, lab
 
 
 @njit
-def _is_fall(grounds, falls, at, least):  # type: ignore[no-untyped-def]
-    """True if as many pixels as lie on the ground of a bin, and at least so many, lie below it, or right behind it."""
-    for i in range(max(at - _FALL_BINS, 0), at + 1):
-        below, on = 0, 0
-        for k in range(max(i - 1, 0), min(i + 2, len(grounds))):
-            below += falls[k]
-            on += grounds[k]
+def _mark_falls(grounds, falls, least, fell):  # type: ignore[no-untyped-def]
+    """Mark bins (bins,) in which as many pixels as lie on the ground, and at least so many, lie below it.
+
+    And the bins right before: matched blocks carry an edge on.
+    """
+    bins, total = len(grounds), 0
+    for j in range(bins):
+        fell[j] = False
+        total += falls[j]
+    if total < least:
+        return
+    below, on = falls[0], grounds[0]  # around bin i
+    for i in range(bins):
+        if i + 1 < bins:
+            below += falls[i + 1]
+            on += grounds[i + 1]
+        if i > 1:
+            below -= falls[i - 2]
+            on -= grounds[i - 2]
         if below >= least and below >= on:
-            return True
-    return False
+            for j in range(i, min(i + _FALL_BINS + 1, bins)):
+                fell[j] = True
 
 
 @njit
-def _is_step(grounds, heights, at, bf):  # type: ignore[no-untyped-def]
-    """True if ground in a bin lies lower than nearer ground by more than a ramp would; heights: sums of z."""
+def _mark_steps(grounds, heights, bf, lowest, means, steps):  # type: ignore[no-untyped-def]
+    """Mark bins (bins,) from `lowest` on whose ground lies lower than nearer ground by more than a ramp would.
+
+    heights: sums of z. means: (bins,), out: mean height of the ground around a bin, -inf where too few pixels tell it.
+    """
     bins = len(grounds)
-    n, low = 0, 0.0
-    for i in range(max(at - 1, 0), at + 1):
-        n += grounds[i]
-        low += heights[i]
-    if n < _STEP_PIXELS:
-        return False
-    low /= n
-    far = bf / ((at + 0.5) * BIN_PX)
-    for k in range(at + 2, bins - 1):
-        apart = far - bf / ((k + 0.5) * BIN_PX)
-        if apart > _STEP_OVER_M:
-            return False
-        m, high = 0, 0.0
-        for i in range(k - 1, k + 2):
-            m += grounds[i]
-            high += heights[i]
-        if m >= _STEP_PIXELS and high / m - low > _STEP_M + _STEP_SLOPE * apart:
-            return True
-    return False
+    m, highest = 0, -np.inf  # pixels around bin k; highest mean of the bins up to it, which are nearer than bin k - 2
+    for k in range(bins - 1, lowest + 1, -1):
+        if k == bins - 1:
+            m = grounds[k] + grounds[k - 1]
+            means[k] = -np.inf
+        else:
+            m += grounds[k - 1] - (grounds[k + 2] if k + 2 < bins else 0)
+            means[k] = (heights[k - 1] + heights[k] + heights[k + 1]) / m if m >= _STEP_PIXELS else -np.inf
+        highest = max(highest, means[k])
+        j = k - 2
+        steps[j] = False
+        n = grounds[j] + grounds[j - 1] if j > 0 else grounds[j]
+        if n < _STEP_PIXELS:
+            continue
+        low = ((heights[j - 1] if j > 0 else 0.0) + heights[j]) / n
+        if highest - low <= _STEP_M:
+            continue
+        far = bf / ((j + 0.5) * BIN_PX)
+        for i in range(j + 2, bins - 1):
+            apart = far - bf / ((i + 0.5) * BIN_PX)
+            if apart > _STEP_OVER_M:
+                break
+            if means[i] - low > _STEP_M + _STEP_SLOPE * apart:
+                steps[j] = True
+                break
+    for j in range(max(bins - 2, 0), bins):
+        steps[j] = False
 
 
 @njit
 def _longest_ground(  # type: ignore[no-untyped-def]
-    grounds, heights, obstacles, falls, least, least_falls, begin_m, end_m, lowest, bf, sigma_px, gap_m
+    grounds, obstacles, falls, fell, steps, least, begin_m, end_m, lowest, bf, sigma_px, gap_m
 ):
     """From where and up to where ground was seen in counts (bins,), between two ranges; 0, 0 if it was not.
 
     And whether it ended before a _WALL, a _FALL or _NOTHING, and whether _SOME_FALL pixels up to its end lie below it.
     The longest part with gaps of at most gap_m, or two deviations of the range, and without `least` pixels of obstacles
-    (bins,) at the same range: those stand there, or hang above. Nor is a step within it, nor `least_falls` pixels below
-    it. bf: px m along the column.
+    (bins,) at the same range: those stand there, or hang above. Nor is a step within it, nor a fall: see `_mark_steps`,
+    `_mark_falls`. bf: px m along the column.
     """
     bins = len(grounds)
     half = int(_PX / BIN_PX)
-    best_from, best, start, last, ended, fell, has_fall = 0.0, 0.0, 0.0, 0.0, _NOTHING, 0, False
+    best_from, best, start, last, ended, below, has_fall = 0.0, 0.0, 0.0, 0.0, _NOTHING, 0, False
+    above = 0  # pixels of obstacles around a bin
+    for j in range(bins - half, bins):
+        above += obstacles[j]
     for j in range(bins - 1, lowest - 1, -1):
-        fell += falls[j]
-        near, far = bf / ((j + 1) * BIN_PX), bf / ((j if j else 0.5) * BIN_PX)
+        below += falls[j]
+        if j >= half:
+            above += obstacles[j - half]
+        if j + half + 1 < bins:
+            above -= obstacles[j + half + 1]
+        stops = above >= least or fell[j] or (last > 0.0 and steps[j])
+        if not stops and grounds[j] < 2:
+            continue
+        near = bf / ((j + 1) * BIN_PX)
         if near < begin_m:
             continue
-        above = 0
-        for i in range(max(j - half, 0), min(j + half + 1, bins)):
-            above += obstacles[i]
-        falling = _is_fall(grounds, falls, j, least_falls) or (last > 0.0 and _is_step(grounds, heights, j, bf))
-        if above >= least or falling:
+        apart = near - last > max(gap_m, 2.0 * near * sigma_px / ((j + 1) * BIN_PX))
+        if stops:
             if last > 0.0 and last == best:
-                ended = _FALL if falling else _WALL
+                ended = _FALL if fell[j] or steps[j] else _NOTHING if apart else _WALL
             last = 0.0
-            continue
-        if grounds[j] < 2:
             continue
         if near >= end_m:
             break
-        if last == 0.0 or near - last > max(gap_m, 2.0 * near * sigma_px / ((j + 1) * BIN_PX)):
+        if last == 0.0 or apart:
             start = near
-        last = far
+        last = bf / ((j if j else 0.5) * BIN_PX)
         if last - start > best - best_from:
-            best_from, best, ended, has_fall = start, last, _NOTHING, fell >= _SOME_FALL
+            best_from, best, ended, has_fall = start, last, _NOTHING, below >= _SOME_FALL
     if best > 0.0 and bf / BIN_PX * (1.0 / best_from - 1.0 / best) < _LEAST_BINS - 0.5:
         return 0.0, 0.0, ended, False
     return best_from, min(best, end_m), ended, has_fall
@@ -319,6 +347,8 @@ def collect_scan(  # type: ignore[no-untyped-def]
     least bin that counts. Free is the longest part of the ground, before the obstacle or behind; there only where fewer
     than `least` pixels of obstacles have its range, and it was seen over the obstacle, not beside a leg or below a top.
     """
+    bins = grounds.shape[1]
+    means, fell, steps = np.empty(bins), np.empty(bins, np.bool_), np.empty(bins, np.bool_)
     for c in range(len(grounds)):
         along = 1.0 / np.cos(azimuth[c])
         obstacle[c], free[c], free_from[c], clear[c] = np.inf, 0.0, 0.0, 0.0
@@ -328,9 +358,11 @@ def collect_scan(  # type: ignore[no-untyped-def]
             clear[c] = bf / surface[c, 1] * along
             if abs(surface[c, 1] - surface[c, 0]) < _SAME_PX:
                 clear[c] = obstacle[c]  # the same surface: the obstacle's mean is that of more pixels
+        _mark_falls(grounds[c], falls[c], least, fell)
+        _mark_steps(grounds[c], heights[c], bf * along, lowest, means, steps)
         free_from[c], free[c], ended, has_fall = _longest_ground(
-            grounds[c], heights[c], obstacles[c], falls[c], _NEVER, least, 0.0, obstacle[c], lowest, bf * along,
-            sigma_px, gap_m,
+            grounds[c], obstacles[c], falls[c], fell, steps, _NEVER, 0.0, obstacle[c], lowest, bf * along, sigma_px,
+            gap_m,
         )  # fmt: skip
         deviation = obstacle[c] * sigma_px / surface[c, 0] if obstacle[c] < np.inf else 0.0
         if free[c] > 0.0 and ended == _NOTHING and obstacle[c] - free[c] < max(gap_m, 3.0 * deviation):
@@ -346,8 +378,8 @@ def collect_scan(  # type: ignore[no-untyped-def]
             if height > limits[top]:
                 over = obstacle[c] / (1.0 - limits[top] / height)
                 begin, end, ended, _ = _longest_ground(
-                    grounds[c], heights[c], obstacles[c], falls[c], least, least,
-                    max(obstacle[c] + 3.0 * deviation, over), np.inf, lowest, bf * along, sigma_px, gap_m,
+                    grounds[c], obstacles[c], falls[c], fell, steps, least, max(obstacle[c] + 3.0 * deviation, over),
+                    np.inf, lowest, bf * along, sigma_px, gap_m,
                 )  # fmt: skip
                 if ended != _WALL:  # what else stands there is not in the scan
                     end = _open_end(end, bf * along, sigma_px)

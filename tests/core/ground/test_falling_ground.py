@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
+from kiteline_core.ground import label_kernels
 from kiteline_core.ground.column_scan import ColumnScan
+from kiteline_core.ground.level_kernels import BIN_PX
 from kiteline_core.ground.segmentation import ExpectedGround
 from tests.core.ground.test_segmentation import HEIGHT_M, Surface, level_ground, up, view, wall
 
@@ -78,3 +82,48 @@ def test_a_slope_down_is_ground(fall: float) -> None:
     segmenter, disparity = view(up(), slope)
     scan = segmenter.segment(disparity, None, up()).scan
     assert (scan.free_m > 4.5).mean() > 0.9
+
+
+def behind_a_low_box(wall_m: float) -> float:
+    """Where free ground ends that is seen over a low box up to 3.5 m, with a wall beyond."""
+    bf, bins, height = 25.0, 192, 1.5
+    centres = bf / ((np.arange(bins) + 0.5) * BIN_PX)
+    grounds, obstacles, heights = np.zeros((3, 1, bins), np.int32)
+    grounds[0, (centres > 2.6) & (centres < 3.5)] = 20
+    obstacles[0, int(bf / wall_m / BIN_PX)] = 40
+    free_from, free, obstacle, clear = np.zeros((4, 1))
+    label_kernels.collect_scan(
+        grounds, -height * grounds.astype(float), obstacles, heights, 5, np.array([[bf / 2.0, 0.0]]),
+        np.array([1], np.uint8), np.array([0.1, 0.5, 1.2, 2.0]), height, np.zeros(1), bf, 10, 0.25, 0.25, free_from,
+        free, obstacle, clear,
+    )  # fmt: skip
+    return float(free[0])
+
+
+def test_a_wall_beyond_a_gap_is_not_what_ends_free_ground() -> None:
+    """Free ground ends earlier where nothing is seen beyond: a pit may begin there."""
+    assert behind_a_low_box(4.5) == behind_a_low_box(20.0) < behind_a_low_box(3.6)
+
+
+def test_ground_below_nearer_ground_by_more_than_a_slope_is_a_step() -> None:
+    """Compared with sums that are taken anew for each pair of bins."""
+    random, bf, bins = np.random.default_rng(0), 25.0, 160
+    grounds = random.integers(0, 12, bins).astype(np.int32) * (random.random(bins) < 0.8)
+    z = -1.5 - 0.15 * (np.arange(bins) < 50) + random.normal(0.0, 0.01, bins)
+    heights = grounds * z
+    means, steps = np.empty(bins), np.empty(bins, np.bool_)
+    kernel: Any = label_kernels._mark_steps
+    kernel.py_func(grounds, heights, bf, 10, means, steps)
+
+    def is_step(j: int) -> bool:
+        low, n = heights[max(j - 1, 0) : j + 1].sum(), grounds[max(j - 1, 0) : j + 1].sum()
+        for k in range(j + 2, bins - 1):
+            apart = bf / ((j + 0.5) * BIN_PX) - bf / ((k + 0.5) * BIN_PX)
+            m = grounds[k - 1 : k + 2].sum()
+            if n >= 8 and m >= 8 and apart <= 0.8 and heights[k - 1 : k + 2].sum() / m - low / n > 0.06 + 0.15 * apart:
+                return True
+        return False
+
+    expected = [is_step(j) for j in range(10, bins)]
+    assert any(expected)
+    assert steps[10:].tolist() == expected
