@@ -54,21 +54,27 @@ def texture(seed: int) -> U8:
     return np.asarray(cv2.normalize(cv2.GaussianBlur(noise, (0, 0), 1.6), None, 5, 250, cv2.NORM_MINMAX), np.uint8)
 
 
+@cache
+def rays() -> F64:
+    """Rays (h,w,3) of the pixels, in camera axes."""
+    u, v = np.meshgrid(np.arange(float(W)), np.arange(float(H)))
+    return np.stack([(u - CAMERA.cx) / FOCAL, (v - CAMERA.cy) / FOCAL, np.ones_like(u)], -1)
+
+
 def room(T_w_c: F64) -> tuple[U8, F64]:
     """What a camera sees of the room, (h,w) grey, and the depths (h,w)."""
-    u, v = np.meshgrid(np.arange(float(W)), np.arange(float(H)))
-    ray = np.stack([(u - CAMERA.cx) / FOCAL, (v - CAMERA.cy) / FOCAL, np.ones_like(u)], -1) @ T_w_c[:3, :3].T
-    best, image = np.full((H, W), np.inf), np.zeros((H, W), np.uint8)
-    for seed, (normal, d, a, b) in enumerate(PLANES):
-        with np.errstate(divide="ignore", invalid="ignore"):
-            depth = (d - normal @ T_w_c[:3, 3]) / (ray @ normal)
-        depth = np.where(depth > 1e-6, depth, np.inf)
-        hit = T_w_c[:3, 3] + ray * np.where(np.isfinite(depth), depth, 0.0)[..., None]
-        place = (hit * 60.0).astype(np.float32)
-        seen = cv2.remap(texture(seed), place[..., a] % 510, place[..., b] % 510, cv2.INTER_LINEAR)
-        image = np.where(depth < best, seen, image)
-        best = np.minimum(depth, best)
-    return np.asarray(image, np.uint8), best
+    ray = rays() @ T_w_c[:3, :3].T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depths = np.stack([(d - normal @ T_w_c[:3, 3]) / (ray @ normal) for normal, d, _, _ in PLANES])
+    depths = np.where(depths > 1e-6, depths, np.inf)
+    best, nearest = depths.min(axis=0), depths.argmin(axis=0)
+    hit = T_w_c[:3, 3] + ray * np.where(np.isfinite(best), best, 0.0)[..., None]
+    place, image = (hit * 60.0).astype(np.float32) % 510, np.zeros((H, W), np.uint8)
+    for seed, (_, _, a, b) in enumerate(PLANES):
+        here = (nearest == seed) & np.isfinite(best)
+        if here.any():
+            image[here] = cv2.remap(texture(seed), place[..., a], place[..., b], cv2.INTER_LINEAR)[here]
+    return image, best
 
 
 def path(k: float) -> F64:

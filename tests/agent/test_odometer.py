@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -32,12 +33,17 @@ def camera_at(t_s: float) -> F64:
     return body_at(t_s) @ T_B_C
 
 
+@cache
+def true_twists(seconds: float) -> F64:
+    t_s = np.arange(0, round(seconds * 1e9), SAMPLE_NS) * 1e-9
+    return np.array([se3.log(se3.inverse(body_at(t)) @ body_at(t + 1e-5)) / 1e-5 for t in t_s])
+
+
 def driven(seconds: float, noise: float = 0.02, seed: int = 0) -> OdometryBatch:
     """What a good odometer says of it, every 20 ms."""
     rng = np.random.default_rng(seed)
     t_ns = np.arange(0, round(seconds * 1e9), SAMPLE_NS, dtype=np.int64)
-    twists = [se3.log(se3.inverse(body_at(t * 1e-9)) @ body_at(t * 1e-9 + 1e-5)) / 1e-5 for t in t_ns]
-    values = np.array(twists) + noise * rng.standard_normal((len(t_ns), 6)) * ([1.0] * 3 + [0.3] * 3)
+    values = true_twists(seconds) + noise * rng.standard_normal((len(t_ns), 6)) * ([1.0] * 3 + [0.3] * 3)
     cov = np.tile(max(noise, 1e-3) ** 2 * np.eye(3), (len(t_ns), 1, 1))
     return OdometryBatch(t_ns, values[:, :3], values[:, 3:], cov, 0.1 * cov)
 

@@ -194,23 +194,23 @@ def lively_room() -> Scene:
 
 @pytest.fixture(scope="session")
 def ring() -> Scene:
-    """A corridor that runs in a ring of 16 m radius, 4 m wide, every piece of wall another."""
+    """A corridor that runs in a ring of 9 m radius, 4 m wide, every piece of wall another."""
     rng = np.random.default_rng(11)
-    points = 7000
+    points = 4000
     phi, z = rng.uniform(0, 2 * np.pi, points), rng.uniform(-1.2, 1.2, points)
-    radius = np.where(rng.random(points) < 0.6, 18.0, 14.0)
+    radius = np.where(rng.random(points) < 0.6, 11.0, 7.0)
     world = np.stack([radius * np.cos(phi), radius * np.sin(phi), z], 1)
 
     def path(turns: float) -> F64:
         a = 2 * np.pi * turns
-        here = np.array([16.0 * np.cos(a), 16.0 * np.sin(a), 0.1 * np.sin(5 * a)])
+        here = np.array([9.0 * np.cos(a), 9.0 * np.sin(a), 0.1 * np.sin(5 * a)])
         return look(here, np.array([-np.sin(a), np.cos(a), 0.0]) + 0.35 * np.array([np.cos(a), np.sin(a), 0.0]))
 
     descriptors = rng.integers(0, 256, (points, 32), dtype=np.uint8)
     return Scene(world, descriptors, rng.uniform(-0.4, 1.4, points), rng.integers(0, 256, points), path)
 
 
-def straight(pieces: int, period_m: float, same: float, seed: int, turns_around: bool = False) -> Scene:
+def straight(pieces: int, period_m: float, same: float, seed: int) -> Scene:
     """A straight corridor whose walls repeat: this share of each piece's points is the same in every piece."""
     rng = np.random.default_rng(seed)
     n = 260

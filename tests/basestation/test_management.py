@@ -71,8 +71,8 @@ def ids(value: dict[str, Any]) -> list[str]:
 def flown_pair(make_flight: MakeFlight, words: Any) -> Base:
     """Two agents in one room, whose maps have become one."""
     base = Base(words)
-    a = make_flight(keyframes=30, turns=0.6)
-    b = make_flight(keyframes=30, turns=0.6, start=0.3, variant=1, agent=1, T_w_m=ELSEWHERE)
+    a = make_flight(keyframes=20, turns=0.6)
+    b = make_flight(keyframes=20, turns=0.6, start=0.3, variant=1, agent=1, T_w_m=ELSEWHERE)
     base.fly([a, b])
     assert base.mapper.summary()["merges"] == 1
     return base
@@ -90,7 +90,7 @@ def test_list_and_get_describe_all_maps(pair: Base) -> None:
     assert told["agents"] == [0, 1]
     assert told["placed"] is True
     assert [s["id"] for s in told["submaps"]] == ["0.1.0", "1.1.0"]
-    assert told["keyframes"] == 60 == sum(s["keyframes"] for s in told["submaps"])
+    assert told["keyframes"] == 40 == sum(s["keyframes"] for s in told["submaps"])
     assert told["points"] == len(pair.mapper.map.live_landmarks())
     got = pair.ask("get", map="1.1.0")
     assert got["id"] == "0.1.0"
@@ -114,8 +114,8 @@ def test_map_can_be_addressed_by_name(pair: Base) -> None:
 def test_split_maps_are_not_merged_again(pair: Base, make_flight: MakeFlight) -> None:
     assert ids(pair.ask("split", map="1.1.0")) == ["0.1.0", "1.1.0"]
     assert ids(pair.ask("list")) == ["0.1.0", "1.1.0"]
-    more = make_flight(keyframes=45, turns=0.9, start=0.3, variant=1, agent=1, T_w_m=ELSEWHERE)
-    for records in more.records[30:]:
+    more = make_flight(keyframes=30, turns=0.9, start=0.3, variant=1, agent=1, T_w_m=ELSEWHERE)
+    for records in more.records[20:]:
         pair.step([(more.agent, tuple(records))])
     pair.rest()
     assert ids(pair.ask("list")) == ["0.1.0", "1.1.0"]
@@ -124,8 +124,8 @@ def test_split_maps_are_not_merged_again(pair: Base, make_flight: MakeFlight) ->
 
 def test_user_merges_maps_by_a_transform(make_flight: MakeFlight, words: Any) -> None:
     base = Base(words)
-    a = make_flight(keyframes=20, turns=0.3)
-    b = make_flight(keyframes=20, turns=0.3, start=0.5, variant=1, agent=1, T_w_m=ELSEWHERE)
+    a = make_flight(keyframes=14, turns=0.3)
+    b = make_flight(keyframes=14, turns=0.3, start=0.5, variant=1, agent=1, T_w_m=ELSEWHERE)
     base.fly([a, b])
     assert ids(base.ask("list")) == ["0.1.0", "1.1.0"]
     assert "rigid" in base.ask("merge", map="1.1.0", into="0.1.0", T_into_map=[1.0] * 16)["error"]
@@ -133,7 +133,7 @@ def test_user_merges_maps_by_a_transform(make_flight: MakeFlight, words: Any) ->
     assert base.ask("merge", map="1.1.0", into="0.1.0", T_into_map=T)["merged"] is True
     base.rest()
     (told,) = base.ask("list")["maps"]
-    assert told["keyframes"] == 40
+    assert told["keyframes"] == 28
     placed = np.reshape(told["submaps"][1]["T_w_m"], (4, 4))
     assert np.allclose(placed, ELSEWHERE, atol=0.03)
     assert "one map already" in base.ask("merge", map="1.1.0", into="0.1.0")["error"]
@@ -141,13 +141,13 @@ def test_user_merges_maps_by_a_transform(make_flight: MakeFlight, words: Any) ->
 
 def test_user_requests_a_search_for_loops(make_flight: MakeFlight, words: Any) -> None:
     base = Base(words)
-    a = make_flight(keyframes=24, turns=0.5)
-    b = make_flight(keyframes=24, turns=0.5, start=0.42, variant=1, agent=1, T_w_m=ELSEWHERE)
+    a = make_flight(keyframes=16, turns=0.5)
+    b = make_flight(keyframes=16, turns=0.5, start=0.42, variant=1, agent=1, T_w_m=ELSEWHERE)
     base.fly([a, b])
     if len(ids(base.ask("list"))) == 1:
         base.ask("split", map="1.1.0")
         base.mapper.merger.detector.kept_apart.clear()  # type: ignore[union-attr]
-    assert base.ask("merge", map="1.1.0", into="0.1.0") == {"merged": False, "looking": 24}
+    assert base.ask("merge", map="1.1.0", into="0.1.0") == {"merged": False, "looking": 16}
     base.rest()
     assert ids(base.ask("list")) == ["0.1.0"]
 

@@ -40,8 +40,8 @@ def joint_error_m(mapper: Mapper, flights: Sequence[Any]) -> F64:
 
 
 def test_maps_of_two_agents_in_one_room_are_merged(make_flight: MakeFlight, words: Any) -> None:
-    a = make_flight(keyframes=40, turns=0.8)
-    b = make_flight(keyframes=40, turns=0.8, start=0.5, variant=1, agent=1, T_w_m=ELSEWHERE)
+    a = make_flight(keyframes=26, turns=0.8)
+    b = make_flight(keyframes=26, turns=0.8, start=0.5, variant=1, agent=1, T_w_m=ELSEWHERE)
     mapper = Mapper(WITHOUT_GRID, words)
     published = feed(mapper, [a, b])
     assert mapper.summary()["merges"] == 1
@@ -66,8 +66,8 @@ def test_similar_rooms_are_not_merged(
     make_flight: MakeFlight, request: pytest.FixtureRequest, words: Any, rooms: str
 ) -> None:
     one, other = request.getfixturevalue(rooms)
-    a = make_flight(keyframes=40, turns=1.0, scene=one)
-    b = make_flight(keyframes=40, turns=1.0, scene=other, variant=1, agent=1)
+    a = make_flight(keyframes=28, turns=1.0, scene=one)
+    b = make_flight(keyframes=28, turns=1.0, scene=other, variant=1, agent=1)
     mapper = Mapper(WITHOUT_GRID, words)
     feed(mapper, [a, b])
     assert mapper.merger is not None
@@ -77,8 +77,8 @@ def test_similar_rooms_are_not_merged(
 
 
 def test_repetitive_corridor_is_not_merged(make_flight: MakeFlight, corridor: Any, words: Any) -> None:
-    a = make_flight(keyframes=40, turns=0.6, scene=corridor)
-    b = make_flight(keyframes=40, turns=0.6, start=0.35, scene=corridor, variant=1, agent=1)
+    a = make_flight(keyframes=26, turns=0.6, scene=corridor)
+    b = make_flight(keyframes=26, turns=0.6, start=0.35, scene=corridor, variant=1, agent=1)
     mapper = Mapper(WITHOUT_GRID, words)
     feed(mapper, [a, b])
     assert mapper.summary()["merges"] == 0
@@ -100,7 +100,7 @@ def test_predecessors_of_a_matched_keyframe_are_verified(
 
 def test_agents_share_maps_within_groups(make_flight: MakeFlight, words: Any) -> None:
     flights = [
-        make_flight(keyframes=24, turns=0.45, start=0.3 * n, variant=n, agent=n, T_w_m=se3.exp(np.full(6, 0.2 * n)))
+        make_flight(keyframes=16, turns=0.45, start=0.3 * n, variant=n, agent=n, T_w_m=se3.exp(np.full(6, 0.2 * n)))
         for n in range(3)
     ]
     for share, merges in (("all", 2), ("0 1", 1), ("none", 0)):
@@ -113,10 +113,10 @@ def test_agents_share_maps_within_groups(make_flight: MakeFlight, words: Any) ->
 
 
 def test_submap_after_a_loss_is_merged_and_split_again(make_flight: MakeFlight, words: Any) -> None:
-    a = make_flight(keyframes=30, turns=0.6)
-    b = make_flight(keyframes=30, turns=0.6, start=0.3, variant=1, submap=1, T_w_m=ELSEWHERE)
+    a = make_flight(keyframes=20, turns=0.6)
+    b = make_flight(keyframes=20, turns=0.6, start=0.3, variant=1, submap=1, T_w_m=ELSEWHERE)
     mapper = Mapper(WITHOUT_GRID, words)
-    feed(mapper, [a, b], [0, 30])
+    feed(mapper, [a, b], [0, 20])
     assert mapper.summary()["merges"] == 1
     assert np.sqrt(np.mean(joint_error_m(mapper, [a, b]) ** 2)) < 0.02
     output = mapper.step(MapperInput(((a.agent, ()),), (), (Command(1, "split", '{"map": "0.1.1"}'),)), 10**12)
@@ -133,15 +133,15 @@ def test_submap_after_a_loss_is_merged_and_split_again(make_flight: MakeFlight, 
 
 
 def test_placement_of_a_split_map_is_withdrawn(make_flight: MakeFlight, words: Any) -> None:
-    a = make_flight(keyframes=30, turns=0.6)
-    b = make_flight(keyframes=30, turns=0.6, start=0.3, variant=1, agent=1, T_w_m=ELSEWHERE)
+    a = make_flight(keyframes=20, turns=0.6)
+    b = make_flight(keyframes=20, turns=0.6, start=0.3, variant=1, agent=1, T_w_m=ELSEWHERE)
     ours, theirs = {}, {}
     for flight in (a, b):
         theirs[flight.agent], ours[flight.agent] = plain_pair()
     station = Station(WITHOUT_GRID, ours.__getitem__, words)
     done: tuple[JobDone, ...] = ()
     young = submap_of_keyframe(b.keyframes[0])
-    for n in range(70):
+    for n in range(50):
         for flight in (a, b):
             if n == 0:
                 theirs[flight.agent].put(CameraIntrinsics(flight.agent, flight.camera))

@@ -77,6 +77,14 @@ def true_places(flight: Any) -> F64:
     return np.array([T[:3, 3] for T in flight.true_T_w_k])
 
 
+def believed(flight: Any) -> F64:
+    """Poses (n,4,4) that the agent's keyframes alone give: what a base without loops shows."""
+    poses: list[F64] = []
+    for n, records in enumerate(flight.records):
+        poses.append(poses[-1] @ records[0].T_p_k if n else records[0].T_p_k)
+    return np.stack(poses)
+
+
 def error_m(found: F64, true: F64) -> tuple[float, float]:
     """RMS after the best similarity, in true metres, and the scale of that."""
     S = align_points(true, found, with_scale=True)
@@ -86,38 +94,37 @@ def error_m(found: F64, true: F64) -> tuple[float, float]:
 
 def the_other_eye(make_flight: MakeFlight) -> Any:
     return in_own_unit(
-        make_flight(keyframes=40, turns=0.8, start=0.5, variant=1, agent=1, T_w_m=ELSEWHERE, stereo=False), 0.37
+        make_flight(keyframes=26, turns=0.8, start=0.5, variant=1, agent=1, T_w_m=ELSEWHERE, stereo=False), 0.37
     )
 
 
-def lengths(mapper: Mapper, flight: Any) -> F64:
-    """How long each step is in the world, over what it is in truth."""
-    ours, true = placed(mapper, flight), true_places(flight)
+def lengths(ours: F64, flight: Any) -> F64:
+    """How long each step between places (n,3) is, over what it is in truth."""
+    true = true_places(flight)
     return np.asarray(np.linalg.norm(np.diff(ours, axis=0), axis=1) / np.linalg.norm(np.diff(true, axis=0), axis=1))
 
 
-@pytest.mark.parametrize("growth", [0.001, 0.003])
+@pytest.mark.parametrize("growth", [0.0016, 0.0035])
 def test_a_loop_takes_back_the_drift_of_the_unit(make_flight: MakeFlight, ring: Any, words: Any, growth: float) -> None:
     flight = in_own_unit(
-        make_flight(keyframes=88, turns=1.2, scene=ring, drift_m=0.002, seed=4, noise_px=0.5, memory=3, stereo=False),
+        make_flight(keyframes=50, turns=1.2, scene=ring, drift_m=0.002, seed=4, noise_px=0.5, memory=3, stereo=False),
         0.4, growth,
     )  # fmt: skip
-    blind, mapper = Mapper(WITHOUT_GRID), Mapper(WITHOUT_GRID, words)
-    feed(blind, [flight], run=untouched)
+    blind, mapper = believed(flight), Mapper(WITHOUT_GRID, words)
     published = feed(mapper, [flight], run=untouched)
     assert mapper.summary()["loops"] >= 1
-    before, after = (error_m(placed(m, flight), true_places(flight))[0] for m in (blind, mapper))
+    before, after = (error_m(p, true_places(flight))[0] for p in (blind[:, :3, 3], placed(mapper, flight)))
     assert after < 0.15 * before
-    drifted, mended = (lengths(m, flight) for m in (blind, mapper))
-    assert np.median(drifted[-8:]) / np.median(drifted[:8]) > 1.0 + 60 * growth
+    drifted, mended = (lengths(p, flight) for p in (blind[:, :3, 3], placed(mapper, flight)))
+    assert np.median(drifted[-8:]) / np.median(drifted[:8]) > 1.0 + 36 * growth
     assert abs(np.median(mended[-8:]) / np.median(mended[:8]) - 1.0) < 0.04
     assert abs(np.median(mended[:8]) / np.median(drifted[:8]) - 1.0) < 0.05  # the world keeps its unit
     # Where the agent flies nothing was stretched: its place says how long its unit has become.
     submap = submap_of_keyframe(flight.keyframes[0])
     last = [r for r in published if isinstance(r, SubmapPlacement)][-1]
     assert np.allclose(last.S_w_m, mapper.placements[submap], atol=1e-5)
-    assert sim3.scale_of(last.S_w_m) < 1.0 - 50 * growth
-    steps = [np.array([m.map.pose(k)[:3, 3] for k in flight.keyframes[-9:]]) for m in (blind, mapper)]  # type: ignore[index]
+    assert sim3.scale_of(last.S_w_m) < 1.0 - 30 * growth
+    steps = [blind[-9:, :3, 3], np.array([mapper.map.pose(k)[:3, 3] for k in flight.keyframes[-9:]])]  # type: ignore[index]
     ours, theirs = (np.median(np.linalg.norm(np.diff(s, axis=0), axis=1)) for s in steps)
     assert abs(theirs / ours - 1.0) < 0.015
 
@@ -128,7 +135,7 @@ Met = tuple[Any, Any, Mapper, list[Record]]
 @pytest.fixture(scope="module")
 def met(make_flight: MakeFlight, words: Any) -> Met:
     """A stereo agent and a monocular one that fly together, the map of both, and what was published."""
-    pair, eye = make_flight(keyframes=40, turns=0.8), the_other_eye(make_flight)
+    pair, eye = make_flight(keyframes=26, turns=0.8), the_other_eye(make_flight)
     mapper = Mapper(WITHOUT_GRID, words)
     return pair, eye, mapper, feed(mapper, [pair, eye])
 
@@ -139,7 +146,7 @@ def test_a_monocular_map_takes_the_scale_of_a_stereo_map(met: Met, words: Any, l
     flights = [eye, pair] if late else [pair, eye]  # whose map is the world at first
     if late:
         mapper = Mapper(WITHOUT_GRID, words)
-        published = feed(mapper, flights, [0, 20])
+        published = feed(mapper, flights, [0, 13])
     assert mapper.summary()["merges"] == 1
     found = np.concatenate([placed(mapper, f) for f in flights])
     error, scale = error_m(found, np.concatenate([true_places(f) for f in flights]))
@@ -162,7 +169,7 @@ def test_a_monocular_map_takes_the_scale_of_a_stereo_map(met: Met, words: Any, l
 
 
 def test_two_eyes_with_other_units_become_one_map_and_part_again(make_flight: MakeFlight, words: Any) -> None:
-    a = in_own_unit(make_flight(keyframes=40, turns=0.8, stereo=False), 2.0)
+    a = in_own_unit(make_flight(keyframes=26, turns=0.8, stereo=False), 2.0)
     b = the_other_eye(make_flight)
     mapper = Mapper(BaseConfig(), words)
     feed(mapper, [a, b])
@@ -226,19 +233,19 @@ def test_rooms_with_one_wallpaper_stay_two_for_monocular_agents_too(
 def test_a_repetitive_corridor_is_not_merged_by_a_monocular_agent(
     make_flight: MakeFlight, corridor: Any, words: Any
 ) -> None:
-    a = make_flight(keyframes=40, turns=0.6, scene=corridor)
-    b = make_flight(keyframes=40, turns=0.6, start=0.35, scene=corridor, variant=1, agent=1, stereo=False)
+    a = make_flight(keyframes=26, turns=0.6, scene=corridor)
+    b = make_flight(keyframes=26, turns=0.6, start=0.35, scene=corridor, variant=1, agent=1, stereo=False)
     b = in_own_unit(b, 0.6)
     mapper = Mapper(WITHOUT_GRID, words)
     feed(mapper, [a, b])
     assert mapper.summary()["merges"] == 0
     lone = Mapper(WITHOUT_GRID, words)
-    feed(lone, [in_own_unit(make_flight(keyframes=60, turns=1.0, scene=corridor, seed=4, stereo=False), 0.6)])
+    feed(lone, [in_own_unit(make_flight(keyframes=40, turns=1.0, scene=corridor, seed=4, stereo=False), 0.6)])
     assert lone.summary()["loops"] == 0
 
 
 def test_a_loop_may_be_off_by_as_much_as_its_scale_says(make_flight: MakeFlight, ring: Any, words: Any) -> None:
-    flight = make_flight(keyframes=40, turns=0.5, scene=ring, drift_m=0.002, seed=4, memory=3, stereo=False)
+    flight = make_flight(keyframes=30, turns=0.9, scene=ring, drift_m=0.002, seed=4, memory=3, stereo=False)
     mapper = Mapper(WITHOUT_GRID, words)
     feed(mapper, [flight])
     assert mapper.merger is not None

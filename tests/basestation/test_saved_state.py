@@ -109,11 +109,11 @@ def whole(station: Station) -> dict[str, Any]:
 @pytest.fixture(scope="module")
 def joined(make_flight: MakeFlight, words: Any) -> tuple[Agents, Station]:
     """Two agents whose maps have become one, and a third that is alone."""
-    a = make_flight(keyframes=30, turns=0.6)
-    b = make_flight(keyframes=30, turns=0.6, start=0.3, variant=1, agent=1, T_w_m=ELSEWHERE)
+    a = make_flight(keyframes=20, turns=0.6)
+    b = make_flight(keyframes=20, turns=0.6, start=0.3, variant=1, agent=1, T_w_m=ELSEWHERE)
     c = make_flight(keyframes=8, turns=0.1, seed=9, agent=2)
     agents, station = Agents([a, b, c]), new_station(words)
-    agents.fly(station, 0, 60)
+    agents.fly(station, 0, 45)
     assert station.mapper.summary()["merges"] == 1
     return agents, station
 
@@ -124,7 +124,7 @@ def test_restored_map_is_equal_to_the_last_bit(joined: tuple[Agents, Station], w
     kept = snapshot(first, SavedMap())
     second = new_station(words, session=2)
     restored = restore(second, kept, 0)
-    assert (restored.faults, restored.awaited, restored.keyframes) == ((), 0, 68)
+    assert (restored.faults, restored.awaited, restored.keyframes) == ((), 0, 48)
     assert whole(second) == whole(first)
     assert snapshot(second, restored.saved) == kept
     for channel, before in zip(second.channels.values(), first.channels.values(), strict=True):
@@ -167,9 +167,9 @@ def test_what_an_agent_said_of_deleted_maps_ends_with_its_session(make_flight: M
 
 
 def test_map_survives_six_restarts(make_flight: MakeFlight, words: Any, tmp_path: Path) -> None:
-    flight = make_flight(keyframes=40, turns=1.0)
+    flight = make_flight(keyframes=26, turns=1.0)
     agents, at = Agents([flight]), 0
-    for session, until in enumerate((3, 9, 14, 22, 27, 35, 80), 1):
+    for session, until in enumerate((3, 6, 10, 15, 18, 23, 66), 1):
         station, keeper = new_station(words, session, BaseConfig()), Keeper(tmp_path)
         held = keeper.load()
         restored = restore(station, held, agents.now_ns)
@@ -295,18 +295,18 @@ def kept(make_flight: MakeFlight, words: Any) -> list[SavedMap]:
     """Two maps of one room, by agents 0 and 1, each saved by a base of its own."""
     maps = []
     for agent, start in ((0, 0.0), (1, 0.3)):
-        agents = Agents([make_flight(keyframes=30, turns=0.6, start=start, variant=agent, agent=agent)])
+        agents = Agents([make_flight(keyframes=20, turns=0.6, start=start, variant=agent, agent=agent)])
         station = new_station(words)
-        agents.fly(station, 0, 40)
+        agents.fly(station, 0, 30)
         maps.append(snapshot(station, SavedMap()))
     return maps
 
 
 def test_new_flight_is_merged_with_a_restored_map(make_flight: MakeFlight, kept: list[SavedMap], words: Any) -> None:
-    today = Agents([make_flight(keyframes=30, turns=0.6, start=0.3, variant=1, agent=1, T_w_m=ELSEWHERE)])
+    today = Agents([make_flight(keyframes=20, turns=0.6, start=0.3, variant=1, agent=1, T_w_m=ELSEWHERE)])
     station = new_station(words, session=2)
     restore(station, kept[0], 0)
-    today.fly(station, 0, 60)
+    today.fly(station, 0, 45)
     assert station.mapper.summary()["merges"] == 1
     assert next(iter(station.mapper.placements)) == submap_id(0, 1, 0)
 

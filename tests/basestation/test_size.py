@@ -296,13 +296,13 @@ def test_a_step_codes_a_part_of_a_batch_and_the_next_ones_the_rest(mapped: tuple
 
 
 def test_deleted_maps_leave_their_memory_to_the_next_ones(make_flight: MakeFlight, words: Any) -> None:
-    stays = make_flight(keyframes=24, agent=1, seed=5)
+    stays = make_flight(keyframes=12, agent=1, seed=5)
     mapper, alone = Mapper(WITHOUT_GRID, words), Mapper(WITHOUT_GRID, words)
     feed(alone, [stays])
     feed(mapper, [stays])
     sizes = []
     for number in range(4):
-        flight = make_flight(keyframes=24, submap=number, seed=20 + number)
+        flight = make_flight(keyframes=12, submap=number, seed=20 + number)
         feed(mapper, [flight])
         sizes.append((mapper.map.height, mapper.map.slots, mapper.map.nbytes()))
         command = Command(number, "delete", f'{{"map": "0.1.{number}"}}')
@@ -310,8 +310,8 @@ def test_deleted_maps_leave_their_memory_to_the_next_ones(make_flight: MakeFligh
             output = mapper.step(MapperInput((), (), (command,) if n == 0 else ()), (10**6 + number * 10 + n) * STEP_NS)
             assert all(answer.ok for answer in output.answers)
         assert contradictions(mapper) == []
-        assert len(mapper.map) == 24 and mapper.idle
-    assert {height for height, _, _ in sizes} == {48}
+        assert len(mapper.map) == 12 and mapper.idle
+    assert {height for height, _, _ in sizes} == {24}
     assert max(slots for _, slots, _ in sizes) < 1.05 * sizes[0][1]  # flights are not all of one size
     for keyframe in stays.keyframes:
         assert np.array_equal(mapper.map.pose(keyframe), alone.map.pose(keyframe))
@@ -454,9 +454,9 @@ def test_without_full_bundles_a_base_goes_on(make_flight: MakeFlight, most: int)
 
 
 def test_a_map_too_large_for_one_bundle_is_bundled_in_parts(make_flight: MakeFlight, ring: Any) -> None:
-    flight = make_flight(keyframes=70, turns=0.8, scene=ring, drift_m=0.01, seed=3)
+    flight = make_flight(keyframes=40, turns=0.8, scene=ring, drift_m=0.01, seed=3)
     errors = {}
-    for most in (0, 24):
+    for most in (0, 16):
         config = WITHOUT_GRID
         graph = replace(config.graph, max_full=most or 800, full_share=1.0)
         jobs: list[Job] = []
@@ -469,13 +469,13 @@ def test_a_map_too_large_for_one_bundle_is_bundled_in_parts(make_flight: MakeFli
         feed(mapper, [flight], run=run)
         full = [job for job in jobs if job.kind == "full"]
         if most:
-            assert max(len(job.inputs.problem.T_c_m) for job in full) <= 24 + 24  # free, and held around them
+            assert max(len(job.inputs.problem.T_c_m) for job in full) <= 16 + 16  # free, and held around them
             assert mapper.merger is not None
             bundled = mapper.merger._corrections._schedule.bundled
-            assert {part for _, part in bundled} >= set(range(len(part_spans(70, 24))))
+            assert {part for _, part in bundled} >= set(range(len(part_spans(40, 16))))
         poses = [mapper.map.pose(k) for k in flight.keyframes]
         errors[most] = np.sqrt(np.mean([np.sum((p - t)[:3, 3] ** 2) for p, t in zip(poses, flight.true_T_m_k)]))
-    assert errors[24] < 1.5 * errors[0] + 0.01
+    assert errors[16] < 1.5 * errors[0] + 0.01
 
 
 def test_what_follows_a_part_is_held_also_behind_culled_keyframes(make_flight: MakeFlight) -> None:

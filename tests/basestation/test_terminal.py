@@ -48,14 +48,14 @@ def told(flights: list[Any], words: Any, away: range, restart: int) -> tuple[lis
         for agent, out in output.packets:
             ends[agent].receive(out, n * STEP_NS)
         done = tuple(run_job(job) for job in output.jobs)
-        lines += reporter.lines(here, n * STEP_NS, 230.0, n < 60)
+        lines += reporter.lines(here, n * STEP_NS, 230.0, n < 55)
     return lines, station, reporter
 
 
 def test_agents_merges_and_status_are_reported_once_each(make_flight: MakeFlight, words: Any) -> None:
-    a = make_flight(keyframes=40, turns=0.8)
-    b = make_flight(keyframes=40, turns=0.8, start=0.5, variant=1, agent=1, T_w_m=ELSEWHERE)
-    lines, station, reporter = told([a, b], words, range(45, 55), 65)
+    a = make_flight(keyframes=26, turns=0.8)
+    b = make_flight(keyframes=26, turns=0.8, start=0.5, variant=1, agent=1, T_w_m=ELSEWHERE)
+    lines, station, reporter = told([a, b], words, range(45, 55), 44)
     texts = [line.split("s  ", 1)[1] for line in lines]
     assert texts[:2] == ["agent 0 connected", "agent 1 connected"]
     assert sorted(texts[2:4]) == ["agent 0 starts map 0.1.0", "agent 1 starts map 1.1.0"]
@@ -78,7 +78,7 @@ def test_agents_merges_and_status_are_reported_once_each(make_flight: MakeFlight
 
 
 def test_a_loop_is_reported_with_its_length_and_error(make_flight: MakeFlight, ring: Any, words: Any) -> None:
-    flight = make_flight(keyframes=88, turns=1.2, scene=ring, drift_m=0.02, seed=3, noise_px=0.7, memory=2)
+    flight = make_flight(keyframes=50, turns=1.2, scene=ring, drift_m=0.02, seed=3, noise_px=1.0, memory=2)
     lines, _, _ = told([flight], words, range(0), -1)
     loops = [line for line in lines if re.search(r"loop \d+ closed", line)]
     found = re.search(r"loop 1 closed: error (\d+\.\d\d) m after (\d+) m", loops[0])
