@@ -197,8 +197,9 @@ class Agent:
             self._depth.search_seeds(ctx, track)
             if self.right_camera is not None:
                 T_o_m = camera.pose.T_o_m
-                events += self.right_camera.add(track)
-                if camera.pose.T_o_m is not T_o_m:  # map and camera were moved
+                moved, said = self.right_camera.add(track)
+                events += said
+                if moved:
                     self._corrections.move_on_board(self.submap, T_o_m)
             # 7. Make a keyframe if the policy needs one.
             events += self._keyframes.add_if_needed(ctx, track)

@@ -60,7 +60,7 @@ def chosen(batch: OdometryBatch, keep: Bools | slice) -> OdometryBatch:
 
 
 def usable(batch: OdometryBatch) -> Bools:
-    """Mask (n,) of samples with plausible values and valid covariances."""
+    """Mask (n,) of samples with plausible values, and covariances in which no two axes correlate by more than 1."""
     moving = np.concatenate([batch.velocity, batch.rate], axis=1)
     good = np.asarray((np.abs(moving) < _MAX_SPEED).all(axis=1))
     for cov in (batch.velocity_cov, batch.rate_cov):

@@ -35,7 +35,6 @@ class FrameUpdate:
     compatible: I64
     rejected: I64
     entered: I64
-    is_view: bool
 
 
 class EkfSlam:
@@ -77,18 +76,12 @@ class EkfSlam:
         good, bad = self._update_landmarks(slots, xy, coarse)
         fresh = np.flatnonzero(slots < 0)
         entered: I64 = np.zeros(0, np.int64)
-        is_view = self._is_view_due()
-        if is_view:
+        if self._is_view_due():
             if int(good.sum()) < self._config.in_view:  # else the landmarks tell enough
                 entered = self._enter(ids[fresh], xy[fresh], coarse[fresh], self._ended(ids))
             self._tracks.keep(ids)
             self._add_view(ids[fresh], xy[fresh], coarse[fresh])
-        return FrameUpdate(ids[good], ids[bad], entered, is_view)
-
-    def landmark(self, track: int) -> F64 | None:
-        """Position (3,) in o of the landmark of a track; None without one."""
-        slot = self.slot_of.get(track)
-        return None if slot is None else self.state.points[slot].copy()
+        return FrameUpdate(ids[good], ids[bad], entered)
 
     def depths(self, tracks: I64) -> F64:
         """Depths (n,) in m of the landmarks of tracks (n,) in the camera now; 0 without a landmark, or behind it."""

@@ -64,6 +64,10 @@ class FilterState:
         """First row of a past view: position, then rotation."""
         return _VIEWS + 6 * view
 
+    def view_columns(self, views: I64) -> I64:
+        """Columns (6 + 6 v,) of the camera and of past views (v,)."""
+        return np.concatenate([np.arange(6), *(self.view_row(int(v)) + np.arange(6) for v in views)])
+
     def landmark_row(self, slot: int | I64) -> int | I64:
         """First row of a landmark."""
         return self._first + 3 * slot
@@ -194,13 +198,6 @@ class FilterState:
         to_error = np.zeros((6, 6))
         to_error[:3, :3], to_error[:3, 3:], to_error[3:, 3:] = np.eye(3), -se3.skew(p_b), R.T
         return np.asarray(to_error @ self.block(0, 6) @ to_error.T)
-
-    def landmark_covariance(self, slot: int) -> F64:
-        """Covariance (3,3) of a landmark in o."""
-        rows = np.array([3, 4, 5, *(self._first + 3 * slot + np.arange(3))])
-        both = self.rows(rows)[:, rows]
-        to_error = np.concatenate([-se3.skew(self.points[slot]), np.eye(3)], axis=1)
-        return np.asarray(to_error @ both @ to_error.T)
 
 
 def _root(cov: F64) -> F64:

@@ -121,12 +121,10 @@ def linearised(state: FilterState, track: Track, T_o_c: F64, view_T_o_c: F64) ->
         return None
     # by_point (xi_l - xi_pi - [l]x (xi_R - xi_Ri)); of the camera now, the rotations cancel.
     turned = by_point @ se3.skew(point)
-    columns = [np.arange(6)]
     by_state = np.zeros((len(poses), 2, 6 + 6 * len(views)))
     if is_seen_now:
         by_state[-1, :, :3] = -by_point[-1]
-    for k, view in enumerate(views):
-        columns.append(state.view_row(int(view)) + np.arange(6))
+    for k in range(len(views)):
         at = 6 + 6 * k
         by_state[k, :, at : at + 3] = -by_point[k]
         by_state[k, :, at + 3 : at + 6] = turned[k]
@@ -135,7 +133,8 @@ def linearised(state: FilterState, track: Track, T_o_c: F64, view_T_o_c: F64) ->
     if np.abs(np.diagonal(r)).min() * track.sigma < 1e-9:
         return None
     flat = q.T @ by_state.reshape(-1, by_state.shape[2]) / track.sigma
-    return Rays(point, np.concatenate(columns), r[:3], flat[:3], flat[3:], (q.T @ residual.ravel())[3:] / track.sigma)
+    columns = state.view_columns(views)
+    return Rays(point, columns, r[:3], flat[:3], flat[3:], (q.T @ residual.ravel())[3:] / track.sigma)
 
 
 def rays_meet(state: FilterState, rays: Rays, gate: float) -> bool:

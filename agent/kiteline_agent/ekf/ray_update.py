@@ -25,7 +25,7 @@ _MANY = 3.0  # deviations over degrees of freedom at which a track counts half: 
 
 def update_by_rays(state: FilterState, tracks: Sequence[Track]) -> None:
     """Correct the state by tracks; those that contradict the others count less."""
-    columns = np.concatenate([np.arange(6), *(state.view_row(int(v)) + np.arange(6) for v in state.used_views)])
+    columns = state.view_columns(state.used_views)
     P = state.rows(columns)
     block = P[:, columns]
     deviation = np.sqrt(np.maximum(np.diagonal(block), 1e-24))

@@ -189,7 +189,7 @@ class Corrections:
             self._S_w_m[alignment.submap] = alignment.T_l_m
 
     def move_on_board(self, submap: SubmapId, T_o_m: F64) -> None:
-        """The agent is about to move the map of a submap that lies at T_o_m (4,4): live poses follow without a jump.
+        """The agent moved the map of a submap, which lay at T_o_m (4,4) before: live poses follow without a jump.
 
         With a base or without. Until the submap is placed, live poses stay in its frame.
         """

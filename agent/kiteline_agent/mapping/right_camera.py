@@ -50,10 +50,10 @@ class RightCamera:
         self._found_px = known.disparity
         self._put(known.rows)
 
-    def add(self, track: Track) -> list[str]:
-        """Estimate the disparity offset with a tracked frame; map and camera move with it. Returns events."""
+    def add(self, track: Track) -> tuple[bool, list[str]]:
+        """Estimate the disparity offset with a tracked frame. Returns whether that moved map and camera, and events."""
         if self.disparities is None:
-            return []
+            return False, []
         covariance, disparities = self._camera.covariance, self.disparities
         disparities.add_row_evidence(self.rows.worn_evidence)
         if self.rows.roll_px is not None:
@@ -61,14 +61,14 @@ class RightCamera:
         change = disparities.add(track.T_c_m, track.rows[track.inlier], track.observed[track.inlier])
         if change is None:
             covariance.set_disparity_error(disparities.expected_cov, disparities.rig_worn)
-            return []
+            return False, []
         # the odometry frame keeps the error that the map had until now
         covariance.set_disparity_error(disparities.cov + np.outer(change, change), disparities.rig_worn)
         self._camera.correct_disparities(change)
         covariance.set_disparity_error(disparities.expected_cov, disparities.rig_worn)
         self._found_px, self._sigma_px = self._map.disparity_offset, self.disparities.sigma_px
         self._put(self.rows.estimate_px)
-        return self.disparities.take_events()
+        return True, self.disparities.take_events()
 
     @property
     def disparity_cov(self) -> F64:

@@ -90,7 +90,7 @@ def plan(o: Options, quiet: bool = False) -> FlightPlan:
                 config=o.config, rig=o.rig, calibration=o.calibration, grid=o.grid, tracker=o.tracker,
                 start_ns=starts[k], seconds=o.seconds, up_bytes_s=o.up_bytes_s, profile=o.profile,
                 delay_s=o.delay_s, loss=o.loss, disorder=o.loss,
-                seed=o.seed * 64 + k, cpu_percent=o.cpu_percent,
+                seed=o.seed * 64 + k % 32 + (k // 32 << 32), cpu_percent=o.cpu_percent,
                 kill_at_s=o.kill_agent_at_s if k == 0 else None,
                 await_base_at_s=o.restart_base_at_s, await_bases=bool(o.base_kills),
             )
