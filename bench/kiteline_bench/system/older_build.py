@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import subprocess
@@ -36,6 +37,11 @@ class Build:
         )  # fmt: skip
         if done.returncode:
             raise RuntimeError(f"{' '.join(arguments[:4])}: {done.stderr[-300:]}")
+
+    def warm(self) -> None:
+        """Compile all kernels: on a slow machine that takes longer than a flight of the older build waits for it."""
+        with contextlib.suppress(RuntimeError):  # doctor also judges the machine
+            self.run(["-m", "kiteline_cli", "doctor", "--warm"])
 
     def fly(self, sources: Sequence[str], out: Path, *options: str) -> dict[str, Any]:
         """Fly as `kiteline fly` does; the report. Raises RuntimeError."""
