@@ -86,7 +86,9 @@ def main(argv: list[str]) -> int:
     )
     p.add_argument("--data", metavar="DIR", type=Path, help="of `papers/sequences` and `papers/multi-map`: fly "
                    "the sequences of KITTI, EuRoC, TUM and TUM-VI that are in this folder")  # fmt: skip
-    p.add_argument("--full", action="store_true", help="of `scale`: the whole size, which takes up to an hour a part")
+    p.add_argument(
+        "--full", action="store_true", help="of `scale`: the whole size, which takes up to half an hour a part"
+    )
     a = p.parse_args(argv)
     chosen: list[tuple[str, str, Run]] = []
     for name in a.names or BENCHMARKS:

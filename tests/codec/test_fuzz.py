@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from kiteline_bench.trust import fuzz
-from kiteline_bench.trust.doors import doors
+from kiteline_bench.trust.doors import Door, doors
 from kiteline_codec.schema import Key, messages
 
 HERE = Path(__file__).parent
@@ -38,3 +38,10 @@ def test_it_would_find_a_crash(monkeypatch: pytest.MonkeyPatch) -> None:
     found = fuzz.fuzz(fuzz.read_corpus(HERE / "corpus"), values(), 700, seed=1)
     assert len(found.failures) == 20
     assert "IndexError" in found.failures[0]
+
+
+def test_doors_that_cost_less_are_fed_more_often() -> None:
+    taken: list[str] = []
+    others = [Door(name, lambda data, draw, name=name: taken.append(name), (b"1",)) for name in ("slow", "fast")]
+    fuzz.fuzz([b"1"], values(), 2 * (7 + 1 + 4), seed=1, others=others, turns={"fast": 4})
+    assert (taken.count("slow"), taken.count("fast")) == (30 + 2, 30 + 8)  # 30 before memory is measured

@@ -5,7 +5,7 @@ Descriptors of a copy are turned by a mask: distances within it stay, and places
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from kiteline_agent.step import Identity
 from kiteline_bench.harness.recording import items_of
 from kiteline_bench.harness.run import FlyingAgent
-from kiteline_codec.channel import coded_channel
+from kiteline_codec.channel import CodedChannel, coded_channel
 from kiteline_codec.schema import (
     CameraIntrinsics,
     Key,
@@ -187,3 +187,20 @@ def rounds(
                     replace(r, parent=parent, T_p_k=seam) if isinstance(r, KeyframeHeader) else r for r in given
                 ]  # fmt: skip
             yield tuple(given)
+
+
+@dataclass(slots=True)
+class Link:
+    """One agent's end of a link to a station in the same process; real packets, no time on the way."""
+
+    agent: AgentId
+    end: CodedChannel
+    down: Sequence[bytes] = ()
+
+    def exchange(self, records: Sequence[Record], now_ns: int) -> list[bytes]:
+        """Take in packets, share records, and give the packets for the base."""
+        self.end.receive(self.down, now_ns)
+        self.down = ()
+        for record in records:
+            self.end.put(record)
+        return self.end.poll(now_ns)

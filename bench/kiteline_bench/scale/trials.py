@@ -6,10 +6,13 @@
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
+import subprocess
 import sys
+import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -23,10 +26,11 @@ from kiteline_basestation.management import Command
 from kiteline_basestation.runtime.warm import warm, warm_graphs
 from kiteline_basestation.runtime.worker import LockstepJobs, Workers
 from kiteline_basestation.station import Station, StationOutput
-from kiteline_bench.harness.bars import run_command
-from kiteline_bench.scale.recorded import Name, RecordedFlight, mask_of, record_flight, renamed, rounds
+from kiteline_bench.harness.bars import environment
+from kiteline_bench.scale.copies import PlaceCopies
+from kiteline_bench.scale.recorded import Link, Name, RecordedFlight, mask_of, record_flight, renamed, rounds
 from kiteline_codec import warm as codec_warm
-from kiteline_codec.channel import CodedChannel, coded_channel
+from kiteline_codec.channel import coded_channel
 from kiteline_codec.schema import LivePose, Record
 from kiteline_codec.sync.resumption import agent_session
 from kiteline_core.geometry import se3
@@ -42,33 +46,33 @@ _KEYFRAME_NS = 1_000_000_000
 PLACE_M = 40.0  # between two places of a large map
 ERROR = np.array([0.06, 0.0, 0.0, 0.0, 0.0, 0.0004])  # of an agent between two places: 0.15 %, and a slow turn
 _WORKER_S = 0.5  # that the worker may still take for the last keyframe's jobs
-_LAST = 1000  # keyframes over which steps are judged
+_LAST = 600  # keyframes over which steps are judged
+_SETTLING = 40  # steps in which the worker has time for its last jobs
 
 
-def start(trial: str, source: str, *options: str, timeout_s: float = 7200.0) -> dict[str, Any]:
-    """Run a trial in a process of its own and return its outcome. Raises RuntimeError with the end of its stderr."""
-    done = run_command([sys.executable, "-m", _MODULE, trial, source, *options], timeout_s)
-    if done.returncode:
-        raise RuntimeError(f"{trial} {source}: {done.stderr[-600:]}")
-    found: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
-    return found
+def start(trial: str, source: str, *options: str, say: Callable[[str], None]) -> Any:
+    """Run a trial of this module in a process of its own and return its outcome; see `run_trial`."""
+    return run_trial(_MODULE, [trial, source, *options], say)
 
 
-@dataclass(slots=True)
-class Link:
-    """One agent's end of a link to a station in the same process; real packets, no time on the way."""
+def run_trial(module: str, arguments: Sequence[str], say: Callable[[str], None]) -> Any:
+    """The outcome of a module that prints it as JSON in its last line; what it prints before is said.
 
-    agent: AgentId
-    end: CodedChannel
-    down: Sequence[bytes] = ()
-
-    def exchange(self, records: Sequence[Record], now_ns: int) -> list[bytes]:
-        """Take in packets, share records, and give the packets for the base."""
-        self.end.receive(self.down, now_ns)
-        self.down = ()
-        for record in records:
-            self.end.put(record)
-        return self.end.poll(now_ns)
+    Raises RuntimeError with the end of its stderr.
+    """
+    last = ""
+    with tempfile.TemporaryFile("w+") as wrong, subprocess.Popen(
+        [sys.executable, "-m", module, *arguments], env=environment(), stdout=subprocess.PIPE, stderr=wrong, text=True
+    ) as process:  # fmt: skip
+        assert process.stdout is not None
+        for line in process.stdout:
+            last = line
+            if not line.startswith(("{", "[")):
+                say(line.rstrip())
+        if process.wait():
+            wrong.seek(0)
+            raise RuntimeError(f"{module} {' '.join(arguments)}: {wrong.read()[-600:]}")
+    return json.loads(last)
 
 
 def empty_station() -> Station:
@@ -120,8 +124,11 @@ class _Flown:
         return output
 
 
-def large_map(flight: RecordedFlight, keyframes: int) -> LargeMap:
-    """Fly through so many keyframes in one submap, back to where it began, until the loop is closed."""
+def large_map(flight: RecordedFlight, keyframes: int, flown_last: int | None = None) -> LargeMap:
+    """Fly through so many keyframes in one submap, back to where it began, until the loop is closed.
+
+    flown_last: without the first place, only so many are flown; all between are copies of the first place.
+    """
     station, worker = empty_station(), Workers()
     flown = _Flown(station, Link(AgentId(0), coded_channel(1, 0, "wifi", bounded=True)), worker)
     places = max(3, round(keyframes / len(flight.keyframes)))
@@ -137,8 +144,29 @@ def large_map(flight: RecordedFlight, keyframes: int) -> LargeMap:
     begin, end = Name(AgentId(0), 0, 0, mask_of(0)), Name(AgentId(0), 0, boundary, mask_of(0))
     mapper, map_id = station.mapper, begin.submap
     assert mapper.merger is not None
+    copied = 0 if flown_last is None else max(0, places - 2 - round(flown_last / n))
+    given = rounds(flight, AgentId(0), 0, places, shift, se3.exp(ERROR))
     try:
-        for group in rounds(flight, AgentId(0), 0, places, shift, se3.exp(ERROR)):
+        for group in given:
+            if count == n and copied:
+                for _ in range(_SETTLING):
+                    flown.step(())
+                    time.sleep(0.05)
+                copies = PlaceCopies(station, flown.link, begin)
+                here = [group, *itertools.islice(given, n - 1)]
+                for number in range(1, copied + 1):
+                    name = Name(AgentId(0), 0, number * n, mask_of(number))
+                    flown.now_ns = copies.add(name, here, flown.now_ns)
+                    count += n
+                    found.keyframes.append(count)
+                    found.rss_mib.append(rss_mib())
+                    found.step_ms += [0.0] * n
+                    found.most_ms += [0.0] * n
+                    if number % 20 == 0:
+                        _tell(count, begin_s)
+                    here = list(itertools.islice(given, n)) if number < copied else []
+                copies.finish()
+                continue
             about = () if count else map_all(flight.about, begin)
             records = [*about, *group]
             flown.step_ms.clear()
@@ -156,6 +184,7 @@ def large_map(flight: RecordedFlight, keyframes: int) -> LargeMap:
             if count % 100 == 0 or count == boundary:
                 found.keyframes.append(count)
                 found.rss_mib.append(rss_mib())
+                _tell(count, begin_s)
             if any(e.new >= end.keyframe(0) and e.old < begin.keyframe(n) for e in mapper.merger.edges[edges:]):
                 loop_begin_s = time.monotonic()
                 break
@@ -176,6 +205,10 @@ def large_map(flight: RecordedFlight, keyframes: int) -> LargeMap:
     finally:
         worker.close()
     return found
+
+
+def _tell(keyframes: int, begin_s: float) -> None:
+    print(f"{keyframes} keyframes after {time.monotonic() - begin_s:.0f} s, {rss_mib():.0f} MiB", flush=True)
 
 
 def _error_m(station: Station, begin: Name, end: Name, count: int) -> float:
@@ -239,6 +272,7 @@ def day(flight: RecordedFlight, hours: float, flights: int) -> Day:
             jobs.add(output.jobs, now_ns)
             now_ns += 20 * STEP_NS
         found.rss_mib.append(rss_mib())
+        print(f"flight {number + 1} of {flights}: {found.rss_mib[-1]:.1f} MiB", flush=True)
     if deleted != flights - 1:
         raise RuntimeError(f"{deleted} maps deleted, expected {flights - 1}")
     return found
@@ -255,6 +289,7 @@ def main(argv: list[str] | None = None) -> int:
     p.add_argument("trial", choices=("map", "day"))
     p.add_argument("source")
     p.add_argument("--keyframes", type=int, default=2000)
+    p.add_argument("--flown", type=int, help="of `map`: keyframes at the end that are flown, where others are copies")
     p.add_argument("--hours", type=float, default=24.0)
     p.add_argument("--flights", type=int, default=24)
     p.add_argument("--recorded", type=int, default=60, help="keyframes of the recorded flight")
@@ -265,7 +300,9 @@ def main(argv: list[str] | None = None) -> int:
     codec_warm.warm()
     warm(BaseConfig())
     warm_graphs()
-    print(json.dumps(asdict(large_map(flight, a.keyframes) if a.trial == "map" else day(flight, a.hours, a.flights))))
+    mapped = a.trial == "map"
+    outcome = large_map(flight, a.keyframes, a.flown) if mapped else day(flight, a.hours, a.flights)
+    print(json.dumps(asdict(outcome)))
     return 0
 
 

@@ -86,16 +86,17 @@ class Writer:
         c, n = values.shape
         if n and c:
             out = np.zeros(c * (5 * n + 16) + 8, np.uint8)
-            self._out += out[: pack_columns(values, out)].tobytes()
+            self._out += out[: pack_columns(values, out)].data
 
     def residual_columns(self, values: I64) -> None:
         """Append columns (c, n) of integers, |value| < 2^30, Golomb-Rice coded; nothing for n = 0."""
         c, n = values.shape
         if n and c:
-            if max(int(values.max()), -int(values.min())) >= LIMIT:
-                raise ValueError(f"numbers below {LIMIT} are expected, found {values.min()}..{values.max()}")
             out = np.zeros(c * (7 * n + 16) + 8, np.uint8)
-            self._out += out[: pack_residuals(np.ascontiguousarray(values), out)].tobytes()
+            size = pack_residuals(np.ascontiguousarray(values), out)
+            if size < 0:
+                raise ValueError(f"numbers below {LIMIT} are expected, found {values.min()}..{values.max()}")
+            self._out += out[:size].data
 
     def bytes(self) -> bytes:
         """What has been written."""

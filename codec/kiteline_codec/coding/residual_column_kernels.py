@@ -101,9 +101,13 @@ def _shape(values: I64, out: I64) -> None:
 def pack_residuals(values: I64, out: U8) -> int:
     """Pack values (c, n) int64, n >= 1, |value| < LIMIT, into `out` (zeroed, at least c * (7 * n + 16) + 8 bytes).
 
-    Returns the number of bytes written.
+    Returns the number of bytes written; -1, and writes none, where a value is too large.
     """
     c, n = values.shape
+    for i in range(c):
+        for j in range(n):
+            if values[i, j] >= LIMIT or values[i, j] <= -LIMIT:
+                return -1
     shape = np.zeros((c, 4), np.int64)
     at = 0
     for i in range(c):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -124,8 +125,8 @@ class ObservationResiduals:
         for mask, (versions, landmarks), begin, end in rows:
             if not mask:
                 continue
-            parts = [part for part in range(mask.bit_length()) if mask >> part & 1]
-            if any(part not in versions for part in parts):
+            parts = _parts_of(mask)
+            if not versions.keys() >= {*parts}:
                 raise WireError("a residual code is predicted from landmarks that are not held")
             used += [versions[part] for part in parts]
             kernels.select(landmarks, observed.keypoint[begin:end], mask, begin, codes)
@@ -142,6 +143,12 @@ class ObservationResiduals:
                 T_k_a[i] = poses.T_k_a[a]
         kernels.predict(codes, observed.place, T_k_a, camera[1], predicted)
         return predicted, octave, [*used, *poses.versions, camera[0]]
+
+
+@lru_cache(256)
+def _parts_of(mask: int) -> tuple[int, ...]:
+    """The parts that a mask names."""
+    return tuple(part for part in range(mask.bit_length()) if mask >> part & 1)
 
 
 def _header_to_send(key: Key, held: Held, own: Held) -> KeyframeHeader | None:

@@ -28,12 +28,16 @@ _NO_PART = -1
 
 @dataclass(slots=True)
 class _Keyframe:
-    """Decoded values of a keyframe. landmarks: (5, k) codes of u, v, inverse depth and octave by keypoint, and the
-    part that they came with, -1 where there is none; k is the last landmark's keypoint + 1.
+    """Decoded values of a keyframe. parts: keys of its new landmarks that were asked for. T_k_p: (4,4) inverse of its
+    header's motion. landmarks: (5, k) codes of u, v, inverse depth and octave by keypoint, and the part that they came
+    with, -1 where there is none; k is the last landmark's keypoint + 1.
     """
 
+    header_key: Key
+    parts: list[Key]
     header: KeyframeHeader | None = None
     header_version: int = 0
+    T_k_p: F64 | None = None
     part_versions: dict[int, int] = field(default_factory=dict)
     landmarks: I32 = field(default_factory=lambda: np.empty((5, 0), np.int32))
 
@@ -61,7 +65,7 @@ class Predictors:
     def _keyframe(self, keyframe: int) -> _Keyframe:
         entry = self._keyframes.get(keyframe)
         if entry is None:
-            entry = self._keyframes[keyframe] = _Keyframe()
+            entry = self._keyframes[keyframe] = _Keyframe(Key(KeyframeHeader.KIND, keyframe), [])
             if len(self._keyframes) > _CACHED_KEYFRAMES:
                 self._keyframes.popitem(last=False)
         else:
@@ -86,31 +90,46 @@ class Predictors:
         """Version, and header; of the keyframe of `sent`, that one as version 0."""
         if sent is not None and sent.keyframe == keyframe:
             return 0, sent
-        key = Key(KeyframeHeader.KIND, keyframe)
-        now = held(key)
+        entry = self._keyframe(keyframe)
+        now = held(entry.header_key)
         if now is None:
             return None
-        entry = self._keyframe(keyframe)
         if entry.header is None or entry.header_version != now[0]:
-            record = messages.decode(key, now[1])
+            record = messages.decode(entry.header_key, now[1])
             assert isinstance(record, KeyframeHeader)
-            entry.header, entry.header_version = record, now[0]
+            entry.header, entry.header_version, entry.T_k_p = record, now[0], None
         return entry.header_version, entry.header
+
+    def _to_parent(self, header: KeyframeHeader, sent: KeyframeHeader | None) -> F64:
+        """T_k_p (4,4) of the keyframe of a header."""
+        entry = None if header is sent else self._keyframe(header.keyframe)
+        if entry is not None and entry.T_k_p is not None:
+            return entry.T_k_p
+        T_k_p = np.empty((4, 4))
+        kernels.invert(np.ascontiguousarray(header.T_p_k), T_k_p)
+        if entry is not None:
+            entry.T_k_p = T_k_p
+        return T_k_p
 
     def landmarks(self, keyframe: int, held: Held) -> tuple[dict[int, int], I32]:
         """Versions by part of the new landmarks that both sides hold, and codes (5, k) as in `_Keyframe`."""
         versions: dict[int, int] = {}
         entry = self._keyframe(keyframe)
+        keys, decoded = entry.parts, entry.part_versions
         missing = 0
         for part in range(MASK_PARTS):
-            now = held(Key(NewLandmarks.KIND, keyframe, part))
+            try:
+                now = held(keys[part])
+            except IndexError:
+                keys.append(Key(NewLandmarks.KIND, keyframe, part))
+                now = held(keys[part])
             if now is None:
                 missing += 1
                 if missing == 2:
                     break
                 continue
             versions[part] = now[0]
-            if entry.part_versions.get(part) != now[0]:
+            if decoded.get(part) != now[0]:
                 entry.landmarks[4, entry.landmarks[4] == part] = _NO_PART
                 values = NewLandmarks.COLUMNS.read_codes(Reader(now[1]))
                 if values.shape[1]:
@@ -119,7 +138,7 @@ class Predictors:
                     entry.landmarks = _widened(entry.landmarks, int(values[0].max()) + 1)
                     entry.landmarks[:4, values[0]] = values[1:5]
                     entry.landmarks[4, values[0]] = part
-                entry.part_versions[part] = now[0]
+                decoded[part] = now[0]
         return versions, entry.landmarks
 
     def poses(self, keyframe: int, wanted: set[int], held: Held, sent: KeyframeHeader | None) -> Poses:
@@ -159,7 +178,7 @@ class Predictors:
         """Keyframe k, its parent, and so on until all wanted are found, with T_k_a (4,4) and the header's version; 0
         for the last one, whose header is not used.
         """
-        at, T_k_a, step = keyframe, np.eye(4), np.empty((4, 4))
+        at, T_k_a = keyframe, np.eye(4)
         left = len(wanted - {at})
         ancestors: list[tuple[int, F64, int]] = []
         for _ in range(MAX_GENERATIONS):
@@ -167,10 +186,9 @@ class Predictors:
             if header is None or header[1].parent == NO_KEYFRAME:
                 break
             ancestors.append((at, T_k_a, header[0]))
-            kernels.invert(np.ascontiguousarray(header[1].T_p_k), step)
-            T_k_p = np.empty((4, 4))
-            kernels.compose(T_k_a, step, T_k_p)
-            at, T_k_a = int(header[1].parent), T_k_p
+            T_k_parent = np.empty((4, 4))
+            kernels.compose(T_k_a, self._to_parent(header[1], sent), T_k_parent)
+            at, T_k_a = int(header[1].parent), T_k_parent
             left -= at in wanted
         ancestors.append((at, T_k_a, 0))
         return ancestors

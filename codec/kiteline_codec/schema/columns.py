@@ -17,6 +17,8 @@ from kiteline_core.ids import KEYPOINT_BITS, MAX_KEYPOINTS
 
 I64 = NDArray[np.int64]
 
+_LEAST = np.zeros(2, np.int64)  # of places in a table, and keypoints
+
 
 @dataclass(frozen=True, slots=True)
 class _Field:
@@ -143,16 +145,10 @@ def read_landmark_table(source: Reader, n: int) -> tuple[list[int], I64, I64]:
         if last > MAX_KEYFRAME_ID or (i and not step):
             raise WireError("keyframes of landmarks must increase and fit an id")
         keyframes.append(last)
-    place, keypoint = source.columns(2, n)
-    if (
-        not keyframes
-        or place.min() < 0
-        or place.max() >= len(keyframes)
-        or keypoint.min() < 0
-        or keypoint.max() >= MAX_KEYPOINTS
-    ):
+    table = source.columns(2, n)
+    if first_outside(table, _LEAST, np.array([len(keyframes) - 1, MAX_KEYPOINTS - 1], np.int64)) >= 0:
         raise WireError("a landmark id is out of range")
-    return keyframes, place, keypoint
+    return keyframes, table[0], table[1]
 
 
 def read_landmarks(source: Reader, n: int) -> I64:

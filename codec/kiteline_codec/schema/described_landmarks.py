@@ -62,12 +62,12 @@ class DescribedLandmarks(Record):
         raw = np.frombuffer(source.raw(size * n), np.uint8).reshape(n, size)
         if size < DESCRIPTOR_BYTES:
             raw = descriptors.unpacked(raw) if size else np.zeros((n, DESCRIPTOR_BYTES), np.uint8)
-        if n and size and (not raw.any() or (size == DESCRIPTOR_BYTES and descriptors.is_narrow(raw).all())):
+        if n and size and (not raw.any() or (size == DESCRIPTOR_BYTES and descriptors.all_narrow(raw))):
             raise WireError("descriptors are written in the fewest bytes that hold them")
         return cls(KeyframeId(key.id), key.part, descriptor=raw, **columns)
 
 
 def _write_descriptors(out: Writer, descriptor: U8) -> None:
     if descriptor.any():
-        narrow = descriptors.is_narrow(descriptor).all()
+        narrow = descriptors.all_narrow(descriptor)
         out.raw((descriptors.packed(descriptor) if narrow else descriptor).tobytes())

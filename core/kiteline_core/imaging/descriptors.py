@@ -18,6 +18,7 @@ _SELECTED = 0x43B29FCB63DD72E201DC8E461C26F9820714B970A6242A9F85399EC9566DD7F5
 DESCRIPTOR_BYTES = 32
 NARROW_BYTES = 16
 MASK: U8 = np.frombuffer(_SELECTED.to_bytes(DESCRIPTOR_BYTES, "little"), np.uint8)  # bit i: byte i // 8, bit i % 8
+_OUTSIDE: U8 = ~MASK
 BITS: NDArray[np.int64] = np.flatnonzero(np.unpackbits(MASK, bitorder="little"))  # (128,)
 
 
@@ -28,7 +29,12 @@ def narrowed(descriptors: U8) -> U8:
 
 def is_narrow(descriptors: U8) -> NDArray[np.bool_]:
     """Mask (n,) of narrow descriptors (n,32): no other bit is set, which does not happen in a wide one."""
-    return np.asarray(~(descriptors & ~MASK).any(axis=1))
+    return np.asarray(~(descriptors & _OUTSIDE).any(axis=1))
+
+
+def all_narrow(descriptors: U8) -> bool:
+    """True if all descriptors (n,32) are narrow."""
+    return not (descriptors & _OUTSIDE).any()
 
 
 def packed(descriptors: U8) -> U8:
