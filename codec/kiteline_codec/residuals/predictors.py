@@ -118,11 +118,9 @@ class Predictors:
         keys, decoded = entry.parts, entry.part_versions
         missing = 0
         for part in range(MASK_PARTS):
-            try:
-                now = held(keys[part])
-            except IndexError:
+            if part == len(keys):
                 keys.append(Key(NewLandmarks.KIND, keyframe, part))
-                now = held(keys[part])
+            now = held(keys[part])
             if now is None:
                 missing += 1
                 if missing == 2:
