@@ -246,7 +246,9 @@ class PublishConfig:
     batch_s: float = 2.0  # s that a thin link takes to carry a batch of corrections, about; the next one waits so long
     batch_values: int = 1000  # values of a batch: a loop over a large map moves all its keyframes
     step_values: int = 100  # values of a batch that are coded in one step, about 15 ms; the next steps code the others
-    batch_wait_s: float = 10.0  # s after which a batch that has not arrived is waited for no more: nobody listens
+    batch_wait_s: float = (
+        10.0  # s after which nobody listens: no batch is waited for, no tile or cached keyframe planned
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,6 +6,7 @@ Method: "DS-PTAM: a distributed stereo PTAM", the mapper of chapter 3, with the 
 from __future__ import annotations
 
 import itertools
+import math
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -192,6 +193,11 @@ class Mapper:
     def live(self, agent: AgentId) -> LivePose | None:
         """The newest live pose of an agent."""
         return self._intake.live.get(agent)
+
+    def silent_s(self, agent: AgentId, now_ns: int) -> float:
+        """Seconds since the last record of an agent; infinite before the first one."""
+        heard_ns = self._intake.last_contact_ns.get(agent)
+        return math.inf if heard_ns is None else (now_ns - heard_ns) * 1e-9
 
     def state(self) -> MapperState:
         """State to be saved, beside the values shared with the agents."""

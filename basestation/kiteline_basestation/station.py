@@ -113,8 +113,9 @@ class Station:
             replaced = self._batches[agent].without(key)
             self._put(agent, [] if replaced is None else [replaced])
         for agent, channel in sorted(self.channels.items()):
-            self.map_cache_planner.update(agent, self.mapper.live(agent), channel, now_ns)
-            self.tile_planner.update(agent, self.mapper.live(agent), channel, now_ns)
+            if self.mapper.silent_s(agent, now_ns) < self._publish.batch_wait_s:  # to others nothing would arrive
+                self.map_cache_planner.update(agent, self.mapper.live(agent), channel, now_ns)
+                self.tile_planner.update(agent, self.mapper.live(agent), channel, now_ns)
             if self.mapper.deleted and isinstance(channel, CodedChannel):
                 self._deleted_values[agent].remove_some(channel, self.mapper.deleted)
         sent = tuple((agent, tuple(channel.poll(now_ns))) for agent, channel in sorted(self.channels.items()))

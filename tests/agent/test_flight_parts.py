@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Iterator
 from dataclasses import replace
@@ -12,7 +13,7 @@ import pytest
 from kiteline_agent.governor.virtual_cpu import VirtualCpu
 from kiteline_agent.runtime.flight_log import estimate_from_json, estimate_to_json
 from kiteline_agent.runtime.frame_counts import CpuAccount, FrameCounts, live_line, odometry_line
-from kiteline_agent.runtime.frame_reader import FrameReader
+from kiteline_agent.runtime.frame_reader import SAMPLES, FrameReader
 from kiteline_agent.runtime.options import AgentOptions, agent_config
 from kiteline_agent.step import Estimate
 from kiteline_core import config as configuration
@@ -69,7 +70,7 @@ def test_decoding_is_measured_apart() -> None:
     ticks = iter(range(0, 10**9, 3_000_000))
     camera = FrameReader(source(), None, lambda: next(ticks))
     camera.take()
-    assert camera.decode_ms == [3.0, 3.0]
+    assert list(camera.decode_ms) == [3.0, 3.0]
     assert camera.decode_ns == 6_000_000
 
 
@@ -84,7 +85,17 @@ def accounted(whole: bool) -> list[float]:
         account.begin()
         account.end(with_frame)
         assert account.last_ns == round(account.ms[-1] * 1e6)
-    return account.ms
+    return list(account.ms)
+
+
+def test_cpu_times_of_days_take_no_memory() -> None:
+    ticks = itertools.count(0, 1_000_000)
+    camera = FrameReader((), None, lambda: next(ticks))
+    account = CpuAccount(lambda: next(ticks), camera, whole=True)
+    for _ in range(2 * SAMPLES):
+        account.end(with_frame=True)
+    assert len(account.ms) == SAMPLES and account.frames == 2 * SAMPLES
+    assert camera.decode_ms.maxlen == SAMPLES
 
 
 def test_a_frame_alone_in_its_process_costs_all_but_decoding() -> None:

@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pytest
 
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.job_kinds import run_job
@@ -56,6 +57,25 @@ def test_the_agent_holds_what_the_base_computes_with(make_flight: Callable[..., 
         assert np.array_equal(sparse_map.keypoints.offset[new_landmarks], record.offset)
     assert base_end.endpoint.digest_equal
     assert station.mapper.idle
+
+
+def test_nothing_is_planned_for_an_agent_that_has_left(
+    make_flight: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Plans take milliseconds a second of each agent, and a base keeps its agents for days."""
+    flight = make_flight(keyframes=4, turns=0.1)
+    base_end, agent_end = plain_pair()
+    station = Station(BaseConfig(), lambda agent: base_end)
+    fly(station, agent_end, flight)
+    planned: list[int] = []
+    for planner in (station.tile_planner, station.map_cache_planner):
+        monkeypatch.setattr(planner, "update", lambda agent, live, channel, now_ns: planned.append(now_ns))
+    for second in range(60):
+        station.step({}, (), (4 + second) * 10**9)
+    assert 0 < len(planned) <= 2 * BaseConfig().publish.batch_wait_s
+    agent_end.put(CameraIntrinsics(flight.agent, flight.camera))
+    station.step({flight.agent: agent_end.poll(70 * 10**9)}, (), 70 * 10**9)
+    assert planned[-1] == 70 * 10**9
 
 
 def test_plain_channels_and_order_of_agents(make_flight: Callable[..., Any]) -> None:

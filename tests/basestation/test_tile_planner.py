@@ -168,6 +168,20 @@ def test_an_agent_that_jumps_costs_no_more_than_one_that_flies() -> None:
     assert 0 < len(looked) < 1000
 
 
+def test_places_without_a_tile_are_not_measured() -> None:
+    """Some 190 places lie within reach of an agent and are looked up once a second: most have no tile."""
+    flight = Flight()
+    flight.fly(0.0)
+    flight.wait(3.0)
+    looked: list[Place] = []
+    planner = flight.planner
+    distance = planner._distance
+    planner._distance = lambda place, *ends: looked.append(place) or distance(place, *ends)  # type: ignore[method-assign,assignment,func-returns-value]
+    flight.wait(10.0)
+    touched = flight.updates.grid.touched
+    assert 0 < len(looked) <= 10 * 2 * len(touched) and set(looked) <= {*touched}
+
+
 @pytest.mark.parametrize("z", [1000.0, -1000.0])
 def test_a_drone_beyond_the_last_storey_gets_no_tiles(z: float) -> None:
     flight = Flight()

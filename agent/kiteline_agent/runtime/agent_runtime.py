@@ -21,7 +21,7 @@ from kiteline_agent.runtime.camera_reader import CameraReader
 from kiteline_agent.runtime.flight_log import STEP
 from kiteline_agent.runtime.flight_record import FlightRecord, metadata
 from kiteline_agent.runtime.frame_counts import CpuAccount, FrameCounts
-from kiteline_agent.runtime.frame_reader import FrameReader
+from kiteline_agent.runtime.frame_reader import SAMPLES, FrameReader
 from kiteline_agent.runtime.options import (
     LOG_STEM,
     AgentOptions,
@@ -52,7 +52,6 @@ from kiteline_hw.system.memory import release_memory, rss_mib
 from kiteline_hw.system.notices import Notices
 from kiteline_hw.system.vocabulary import shipped_vocabulary
 
-_SAMPLES = 1 << 15  # newest tracking times that are kept: half an hour of frames
 SAVE_FRAMES = 200  # frames between two looks at whether the rig file is up to date
 PROGRESS_FRAMES = 10  # frames between two reports of progress, and between two readings of the memory in use
 
@@ -117,7 +116,7 @@ class AgentRuntime:
         self._last_cpu_ns = 0  # of the last frame: modelled in lock-step, measured in a live flight
         self._live_clock = False
         self._core: VirtualCpu | CoreProcess = VirtualCpu(options.cpu_percent) if core is None else core
-        self._tracking_ms: deque[float] = deque(maxlen=_SAMPLES)  # until the pose: by the clock, or as modelled
+        self._tracking_ms: deque[float] = deque(maxlen=SAMPLES)  # until the pose: by the clock, or as modelled
         self.output: StepOutput | None = None  # of the last step
 
     def _open_record(self, config: AgentConfig) -> FlightRecord | None:
@@ -254,9 +253,9 @@ class AgentRuntime:
         self._account.end(frame is not None)
         if frame is not None and self._live_clock:
             self._last_cpu_ns = self._account.last_ns
-        if frame is not None and len(self._account.ms) % PROGRESS_FRAMES == 1:
+        if frame is not None and self._account.frames % PROGRESS_FRAMES == 1:
             self.rss_mib = max(self.rss_mib, rss_mib())
-        if frame is not None and len(self._account.ms) % SAVE_FRAMES == 0:
+        if frame is not None and self._account.frames % SAVE_FRAMES == 0:
             self._save_rig()  # a vehicle's power may be cut at any time
         return sent
 
@@ -279,9 +278,9 @@ class AgentRuntime:
             **self.agent.motion_reports(),
             "drain": {key: total[key] - self.flight_counts[key] for key in ("bytes_up", "bytes_down")},
             "timing": {
-                "cpu_ms_per_frame": self._account.ms,
+                "cpu_ms_per_frame": list(self._account.ms),
                 "tracking_ms": list(self._tracking_ms),
-                "decode_ms": self.reader.decode_ms,
+                "decode_ms": list(self.reader.decode_ms),
                 "warm_up_s": round(self.warm_s, 3),
                 "rss_mib": round(self.rss_mib, 1),
             },

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections import deque
 from typing import Protocol
 
-from kiteline_agent.runtime.frame_reader import PendingSamples
+from kiteline_agent.runtime.frame_reader import SAMPLES, PendingSamples
 from kiteline_core.frame import Frame, ImuBatch, OdometryBatch
 
 
@@ -21,7 +22,7 @@ class CameraReader(PendingSamples):
 
     def __init__(self, source: PolledCamera) -> None:
         super().__init__()
-        self.decode_ms: list[float] = []
+        self.decode_ms: deque[float] = deque(maxlen=SAMPLES)
         self.period_ns = 0  # between the last two frames that were taken
         self._source = source
         self._frame: Frame | None = None

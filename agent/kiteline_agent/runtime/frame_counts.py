@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol
@@ -9,6 +10,7 @@ from typing import Protocol
 from numpy import float64
 from numpy.typing import NDArray
 
+from kiteline_agent.runtime.frame_reader import SAMPLES
 from kiteline_agent.step import Estimate, PredictedPose
 from kiteline_core.geometry import tum
 from kiteline_core.ids import KeyframeId, SubmapId
@@ -107,7 +109,8 @@ class CpuAccount:
     """Measures the CPU time of each frame.
 
     clock: process CPU time in ns. whole: the agent is alone in its process, so that all CPU time between two frames
-    counts; otherwise only that inside its steps. ms: of each frame. last_ns: of the last one.
+    counts; otherwise only that inside its steps. ms: of the newest frames. frames: all that were counted. last_ns: of
+    the last one.
     """
 
     def __init__(self, clock: Callable[[], int], camera: Decoder, whole: bool) -> None:
@@ -117,7 +120,8 @@ class CpuAccount:
         self._mark_ns = clock()
         self._decode_mark_ns = camera.decode_ns
         self._spent_ns = 0
-        self.ms: list[float] = []
+        self.ms: deque[float] = deque(maxlen=SAMPLES)
+        self.frames = 0
         self.last_ns = 0
 
     def begin(self) -> None:
@@ -134,4 +138,5 @@ class CpuAccount:
         self._mark_ns, self._decode_mark_ns = end_ns, self._camera.decode_ns
         if with_frame:
             self.ms.append(self._spent_ns / 1e6)
+            self.frames += 1
             self.last_ns, self._spent_ns = self._spent_ns, 0

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterable
 
 import numpy as np
 
 from kiteline_core import odometry
 from kiteline_core.frame import Frame, ImuBatch, OdometryBatch, joined
+
+SAMPLES = 1 << 15  # newest CPU times that are kept: half an hour of frames, of a flight that may last for days
 
 
 class PendingSamples:
@@ -50,7 +53,7 @@ class FrameReader(PendingSamples):
         self, items: Iterable[Frame | ImuBatch | OdometryBatch], until_ns: int | None, cpu_clock: Callable[[], int],
     ) -> None:  # fmt: skip
         super().__init__()
-        self.decode_ms: list[float] = []
+        self.decode_ms: deque[float] = deque(maxlen=SAMPLES)
         self.decode_ns = 0  # process CPU spent on reading and decoding so far
         self.period_ns = 0  # between the last two frames that were read
         self._items = iter(items)

@@ -88,13 +88,17 @@ class TilePlanner:
     def _near(self, here: F64, ahead: F64, storey: int) -> dict[Place, float]:
         """Tiles of a storey within reach, and how far each lies from where the agent is or soon will be."""
         side, reach = SIDE * self._updates.grid.config.cell_m, self._config.reach_m
+        touched = self._updates.grid.touched
         out = {}
         for x, y in (here[:2], ahead[:2]):  # a box around both would have no bounds: an agent may jump
+            columns = range(math.floor((x - reach) / side), math.floor((x + reach) / side) + 1)
             for row in range(math.floor((y - reach) / side), math.floor((y + reach) / side) + 1):
-                for column in range(math.floor((x - reach) / side), math.floor((x + reach) / side) + 1):
+                for column in columns:
                     place = Place(storey, row, column)
+                    if place not in touched or place in out:
+                        continue  # most are not
                     distance = self._distance(place, here, ahead)
-                    if distance <= reach and place in self._updates.grid.touched:
+                    if distance <= reach:
                         out[place] = distance
         return dict(sorted(out.items(), key=lambda item: (item[1], item[0]))[: self._config.max_tiles])
 
