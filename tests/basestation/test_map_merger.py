@@ -55,7 +55,7 @@ def test_maps_of_two_agents_in_one_room_are_merged(make_flight: MakeFlight, word
 def test_maps_are_merged_whose_keyframes_have_few_corners_in_common(make_flight: MakeFlight, words: Any) -> None:
     a = make_flight(keyframes=10, turns=0.2, points=24000)  # of the points in view a keyframe has one in fifteen
     b = make_flight(keyframes=10, turns=0.2, start=0.1, variant=1, agent=1, T_w_m=ELSEWHERE, points=24000)
-    mapper = Mapper(BaseConfig(), words)
+    mapper = Mapper(WITHOUT_GRID, words)
     feed(mapper, [a, b])
     assert mapper.summary()["merges"] == 1
     assert np.sqrt(np.mean(joint_error_m(mapper, [a, b]) ** 2)) < 0.03

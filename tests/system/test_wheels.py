@@ -45,9 +45,8 @@ def resolve(requirements: list[str], python: str, folder: Path) -> list[str]:
 
 
 @pytest.mark.timeout(320)
-@pytest.mark.parametrize("python", ["3.12", "3.13"])
-def test_the_drone_installs_from_wheels_alone(python: str, tmp_path: Path) -> None:
-    names = resolve(PROJECT["dependencies"], python, tmp_path)
+def test_the_drone_installs_from_wheels_alone_on_the_newest_python(tmp_path: Path) -> None:
+    names = resolve(PROJECT["dependencies"], "3.13", tmp_path)
     assert len(names) >= len(PROJECT["dependencies"])
     assert all(name.endswith(("aarch64.whl", "-any.whl")) for name in names), names
 
