@@ -55,7 +55,6 @@ class Station:
         self.changed: dict[tuple[AgentId, bool, Key], bytes | None] | None = None  # see `track_changes`
         self.received = 0  # records of agents in the last step
         self.published = 0  # records for agents in the last step
-        self.unreadable = 0  # imported values whose code is no valid record
         self._open_channel = open_channel
 
     def join(self, agent: AgentId) -> RecordChannel:
@@ -151,7 +150,6 @@ class Station:
             try:
                 records.append(messages.decode(key, code))
             except WireError:
-                self.unreadable += 1
                 continue
             if key.kind == LivePose.KIND and self.mapper.live(order.agent) is not None:
                 records.pop()  # of an earlier flight

@@ -283,11 +283,11 @@ def test_what_is_free_beyond_the_range_is_no_error_if_it_was_in_sight_and_recall
 
     place = Place("strip", "", strip(9.0, wall=True), strip(6.0), strip(8.0), None)
     precision, recall = {}, {}
-    for free_m in (5.0, 6.0, 6.5, 8.0, 10.0):
+    for free_m in (5.0, 6.0, 8.0, 10.0):
         found = judged(place, strip(free_m), np.eye(3))[0]
         precision[free_m], recall[free_m] = found.precision, found.recall
-    assert precision[5.0] == precision[6.0] == precision[6.5] == precision[8.0] == 100.0 > precision[10.0]
-    assert recall[5.0] < 90.0 < recall[6.0] == recall[6.5] == recall[10.0] == 100.0
+    assert precision[5.0] == precision[6.0] == precision[8.0] == 100.0 > precision[10.0]
+    assert recall[5.0] < 90.0 < recall[6.0] == recall[8.0] == recall[10.0] == 100.0
 
 
 def test_the_truth_on_turned_cells_frees_fewer_of_them_as_a_whole() -> None:

@@ -60,15 +60,15 @@ def run(bench: Bench) -> list[Bar]:
     return consistency_bars(bench, FLIGHTS)
 
 
-def consistency_bars(bench: Bench, flights: int, scale: float = 1.0) -> list[Bar]:
-    """The bars over so many flights; scale: of the images."""
+def consistency_bars(bench: Bench, flights: int) -> list[Bar]:
+    """The bars over so many flights."""
     counts: dict[tuple[str, bool], Counts] = defaultdict(Counts)
     tilts: list[float] = []
     back_after: list[int] = []
     names = list(FAULTS_IN_MID_FLIGHT)[1:]
     for number in range(flights):
         bench.say(f"flight {number + 1} of {flights}")
-        flight = random_flight(number, Path(bench.source("trajectories")), bench.folder, scale)
+        flight = random_flight(number, Path(bench.source("trajectories")), bench.folder)
         chosen = [names[(_FAULTS_A_FLIGHT * number + k) % len(names)] for k in range(_FAULTS_A_FLIGHT)]
         for fault in dict.fromkeys(["none", *chosen, _BLACK]):
             recording = FAULTS_IN_MID_FLIGHT[fault](flight.recording)
@@ -89,7 +89,7 @@ def consistency_bars(bench: Bench, flights: int, scale: float = 1.0) -> list[Bar
     if tilts:
         bars.append(at_most(f"begun in motion: tilt after {_LEVEL_S:g} s, worst of {len(tilts)}",
                             float(np.degrees(max(tilts))), float(np.degrees(_LEVEL_RAD)), "degrees", 2))  # fmt: skip
-    bars += _no_texture(bench, scale)
+    bars += _no_texture(bench)
     bench.more.append(_table(counts))
     return bars
 
@@ -131,10 +131,10 @@ def _largest_tilt_rad(errors: list[PoseError]) -> float:
     return float(np.nan_to_num(np.array(late), nan=np.pi).max())
 
 
-def _no_texture(bench: Bench, scale: float) -> list[Bar]:
+def _no_texture(bench: Bench) -> list[Bar]:
     """Ten seconds of a blank wall, with and without IMU: the odometry goes on, its covariance grows."""
     bars = []
-    recording = random_flight(_LONG[0], Path(bench.source("trajectories")), bench.folder, scale, _LONG[1]).recording
+    recording = random_flight(_LONG[0], Path(bench.source("trajectories")), bench.folder, seconds=_LONG[1]).recording
     first, count = round(4e9 / recording.period_ns), round(10e9 / recording.period_ns)
     blind = changed(recording, first, first + count, wall)
     for inertial in (True, False):

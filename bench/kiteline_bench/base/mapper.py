@@ -160,9 +160,9 @@ def _least_ms(work: Any) -> float:
     return min(took)
 
 
-def row_of_cameras(cameras: int, points: int, free: int, seed: int = 0) -> BundleProblem:
+def row_of_cameras(cameras: int, points: int, free: int) -> BundleProblem:
     """Perturbed cameras along a wall; each point is seen by the nearest few. The last `free` may move."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     lens = np.tile([420.0, 420.0, 376.0, 240.0, 46.0], (cameras, 1))
     true = np.tile(np.eye(4), (cameras, 1, 1))
     true[:, 0, 3] = -0.25 * np.arange(cameras)  # T_c_m
@@ -187,9 +187,9 @@ def row_of_cameras(cameras: int, points: int, free: int, seed: int = 0) -> Bundl
     )  # fmt: skip
 
 
-def ring_of_poses(count: int, loops: int, seed: int = 0) -> GraphInputs:
+def ring_of_poses(count: int, loops: int) -> GraphInputs:
     """Four rounds of drifting odometry on a circle, with loop edges between them."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     turn = count // 4
     angle = 2 * np.pi * np.arange(count) / turn
     places = np.column_stack([40 * np.cos(angle), 40 * np.sin(angle), np.zeros(count)])
@@ -214,9 +214,9 @@ def ring_of_poses(count: int, loops: int, seed: int = 0) -> GraphInputs:
     )  # fmt: skip
 
 
-def queue_p95_s(cost_s: F64, seed: int = 0) -> float:
+def queue_p95_s(cost_s: F64) -> float:
     """95th percentile of a keyframe's wait and work at one server; each agent sends one a second, at its own phase."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     at = np.sort((rng.random(len(cost_s))[:, None] + np.arange(_SECONDS)).ravel())
     free_s, took = 0.0, []
     for arrival in at.tolist():

@@ -52,14 +52,14 @@ def live_shift_ns(agent_log_path: Path) -> int:
     return max(t_ns - now_ns for t_ns, now_ns in frames)
 
 
-def arrivals(base_folder: Path, agent: int, shift_ns: int) -> tuple[list[float], list[float]]:
-    """Delay of each header, and the gaps between live poses, in s. shift_ns: stamps less the base's clock."""
+def arrivals(base_folder: Path, shift_ns: int) -> tuple[list[float], list[float]]:
+    """Delays of headers of the first agent, and gaps between its live poses, in s. shift_ns: stamps less the clock."""
     headers: dict[int, float] = {}
     poses_ns: list[int] = []
     with LogReader(base_folder / "log.mcap") as reader:
         for step in steps(reader):
             now_ns = int(step.head["now_ns"])
-            for packet in step.blobs(base_log.packets_in(agent)):
+            for packet in step.blobs(base_log.packets_in(0)):
                 try:
                     _, items = parse(packet, 1 << 20)
                 except WireError:
@@ -76,8 +76,8 @@ def arrivals(base_folder: Path, agent: int, shift_ns: int) -> tuple[list[float],
     return list(headers.values()), gaps
 
 
-def link_use(folder: Path, agent: int, shift_ns: int, overhead_bytes: int) -> LinkUse:
-    """The traffic of an agent. shift_ns: stamps of frames less the clock of the flight."""
-    delays, gaps = arrivals(folder / "base", agent, shift_ns)
-    most = most_in_a_second(folder / f"agent{agent}" / "log.mcap", agent_log.PACKETS_OUT, overhead_bytes)
+def link_use(folder: Path, shift_ns: int, overhead_bytes: int) -> LinkUse:
+    """The traffic of the first agent. shift_ns: stamps of frames less the clock of the flight."""
+    delays, gaps = arrivals(folder / "base", shift_ns)
+    most = most_in_a_second(folder / "agent0" / "log.mcap", agent_log.PACKETS_OUT, overhead_bytes)
     return LinkUse(most, delays, gaps)

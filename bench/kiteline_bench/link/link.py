@@ -76,7 +76,7 @@ def _thin(reference: Reference) -> list[Bar]:
     """1000 B/s up, 500 B/s down, a tenth lost, 200 ms late; then 300 B/s."""
     thin = reference.fly("link_1000", profile="radio", up_bytes_s=1000, down_bytes_s=500, loss=0.1, delay_s=0.2)
     scarce = reference.fly("link_300", profile="radio", up_bytes_s=300, down_bytes_s=300).base
-    use = link_use(thin.folder, 0, _start_ns(reference.source), RADIO.overhead_bytes)
+    use = link_use(thin.folder, _start_ns(reference.source), RADIO.overhead_bytes)
     return [
         at_most("1000 B/s: bytes in any second, up", use.most_bytes_s, 1000, "B", 0),
         *_carried(reference, "1000 B/s", thin, use),
@@ -101,7 +101,7 @@ def _live(reference: Reference, name: str, folder: str, link: str, **options: An
     """The same on real clocks, between processes that a device or a relay joins."""
     flown = reference.fly(folder, link=link, realtime=True, profile="radio", **options)
     shift_ns = live_shift_ns(flown.folder / "agent0" / "log.mcap")
-    return _carried(reference, name, flown, link_use(flown.folder, 0, shift_ns, RADIO.overhead_bytes))
+    return _carried(reference, name, flown, link_use(flown.folder, shift_ns, RADIO.overhead_bytes))
 
 
 def _start_ns(name: str) -> int:

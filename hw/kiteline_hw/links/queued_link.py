@@ -20,11 +20,8 @@ class LinkCounters:
     """What a link carried and lost. Loss is no error, but it is counted."""
 
     sent_packets: int = 0
-    sent_bytes: int = 0
-    refused_packets: int = 0  # full outbox or no peer: send() returned False
     failed_packets: int = 0  # accepted by send(), then lost in the device
     received_packets: int = 0
-    received_bytes: int = 0
     overrun_packets: int = 0  # the oldest of a full inbox, and those that are no packets by their length
     reconnects: int = 0
     callback_errors: int = 0
@@ -60,7 +57,6 @@ class QueuedLink(Closing):
         """Queue one packet; False if no peer is there or the outbox is full. Never blocks."""
         with self._wake:
             if not self.connected or len(self._outbox) >= OUTBOX_PACKETS:
-                self._counters.refused_packets += 1
                 return False
             self._outbox.append(packet)
             self._wake.notify()
@@ -91,7 +87,6 @@ class QueuedLink(Closing):
     def count_sent(self, packet: bytes) -> None:
         """Count a packet that was handed to the device."""
         self._counters.sent_packets += 1
-        self._counters.sent_bytes += len(packet)
 
     def deliver(self, packet: bytes) -> None:
         """Put a packet that came in into the inbox; the oldest ones make room if it is full."""
@@ -108,4 +103,3 @@ class QueuedLink(Closing):
             self._inbox.append(packet)
             self._inbox_bytes += len(packet) + PACKET_BYTES
             self._counters.received_packets += 1
-            self._counters.received_bytes += len(packet)

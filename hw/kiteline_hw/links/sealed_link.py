@@ -31,14 +31,14 @@ class PacketDoor(Protocol):
 
 
 class SealedLink:
-    """A ByteLink to or from one agent. Packets that name another agent are dropped and counted, and so are those of
+    """A ByteLink to or from one agent. Packets that name another agent are dropped, and so are those of
     strangers beyond the first few: to open one costs as much as a sound packet.
     """
 
     def __init__(self, link: ByteLink, agent: int, sealer: PacketSealer | None, door: PacketDoor) -> None:
         """sealer: None where packets are not sealed."""
         self._link, self._agent, self._sealer, self._door = link, agent, sealer, door
-        self.misdirected = self.unopened = 0
+        self.unopened = 0
         self.heard = False  # whether a packet of the agent has opened
 
     def send(self, packet: bytes) -> bool:
@@ -57,10 +57,7 @@ class SealedLink:
             opened, answer = self._door.take(self._agent, arrived)
             if answer is not None:
                 self._link.send(answer)
-            if opened is None:
-                continue
-            if opened[0] != self._agent:
-                self.misdirected += 1
+            if opened is None or opened[0] != self._agent:
                 continue
             self.heard = True
             packets.append(opened[1])

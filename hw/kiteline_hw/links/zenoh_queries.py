@@ -54,7 +54,6 @@ class QueryServer:
         self._arrived: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._open: dict[int, Any] = {}
         self._number = 0
-        self.callback_errors = 0
         used = self._own_session if session is None else session
         assert used is not None
         try:
@@ -64,7 +63,7 @@ class QueryServer:
             raise LinkError(f"cannot answer questions on {prefix(service)}: {error}") from error
 
     def _on_query(self, query: Any) -> None:
-        try:
+        with contextlib.suppress(Exception):  # one bad question must not end the service
             given = query.payload
             if (0 if given is None else len(given)) + len(str(query.parameters)) > _MOST_BYTES:
                 _reply(query, False, json.dumps({"error": f"a question has at most {_MOST_BYTES} bytes"}))
@@ -72,8 +71,6 @@ class QueryServer:
                 _reply(query, False, json.dumps({"error": "too many questions wait; ask again"}))
             else:
                 self._arrived.put(query)
-        except Exception:
-            self.callback_errors += 1
 
     def questions(self) -> list[Question]:
         """The requests that came in since the last call. Never blocks."""

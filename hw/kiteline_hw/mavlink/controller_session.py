@@ -75,9 +75,7 @@ class SessionCounters:
     """Messages sent, and poses that were not sent, by reason."""
 
     odometry: int = 0
-    heartbeats: int = 0
     timesync_answers: int = 0
-    rate_limited: int = 0
     without_velocity: int = 0  # no earlier pose to take a velocity from
     invalid: int = 0  # not finite, or absurdly far away
     stale: int = 0  # not newer than the one before
@@ -139,7 +137,6 @@ class ControllerSession:
         out = []
         if self._next_heartbeat_ns is None or now_ns >= self._next_heartbeat_ns:
             self._next_heartbeat_ns = now_ns + self.config.heartbeat_ns
-            self.counters.heartbeats += 1
             out.append(self.codec.encode(Heartbeat()))
         if pose is not None:
             message = None if self._is_held(pose) else self._pose_message(pose, now_ns)
@@ -204,7 +201,6 @@ class ControllerSession:
             self.counters.without_velocity += 1  # ArduPilot would take NaN velocities into its filter
             return None
         if not self._is_due(now_ns):
-            self.counters.rate_limited += 1
             return None
         velocity, rate = self._rates(pose)
         armed = self._autopilot is not None and self._autopilot[0].armed

@@ -67,7 +67,6 @@ class SerialPort:
         os.set_blocking(self._wake_write, False)
         self._unwritten = b""  # rest of the frame that is being written
         self.opened = 0
-        self.cut_frames = 0  # frames that were not written in full when the port went away
         self.callback_errors = 0
         self.connected = False
         self.fault = ""  # why the port is not open
@@ -155,7 +154,6 @@ class SerialPort:
 
     def _hang_up(self, port: serial.Serial) -> None:
         self.connected = False
-        self.cut_frames += bool(self._unwritten)
         self._unwritten = b""
         with contextlib.suppress(*_ERRORS):
             port.close()

@@ -91,10 +91,10 @@ def _panels(figure: Figure, *, with_error: bool) -> tuple[Axes, Axes, Axes | Non
     height = figure.add_subplot(grid[0, 1] if with_error else grid[:, 1])
     error = figure.add_subplot(grid[1, 1], sharex=height) if with_error else None
     top.set_aspect("equal", adjustable="datalim")
-    _style(top, "from above, m", "", "")
-    _style(height, "height, m", "" if with_error else "time, s", "")
+    _style(top, "from above, m", "")
+    _style(height, "height, m", "" if with_error else "time, s")
     if error is not None:
-        _style(error, "", "time, s", "")
+        _style(error, "", "time, s")
     return top, height, error
 
 
@@ -108,10 +108,9 @@ def _draw_errors(axes: Axes, errors: Sequence[tuple[F64, F64, str]]) -> None:
     axes.set_ylim(bottom=0.0)
 
 
-def _style(axes: Axes, title: str, x: str, y: str) -> None:
+def _style(axes: Axes, title: str, x: str) -> None:
     axes.set_title(title, loc="left", fontsize=10, color=INK)
     axes.set_xlabel(x, fontsize=9, color=INK)
-    axes.set_ylabel(y, fontsize=9, color=INK)
     axes.grid(True, color="#e6e6e6", lw=0.7)
     axes.set_axisbelow(True)
     axes.tick_params(labelsize=8, color="#cccccc", labelcolor=INK)

@@ -12,6 +12,7 @@ from kiteline_hw.logs.mcap_log import LogReader, LogWriter
 from kiteline_hw.ports import SourceError
 
 _SECOND_NS = 1_000_000_000
+_RATE_HZ = 20.0  # steps a second
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,12 +42,12 @@ class Cuts:
     more: int
 
 
-def write_log(path: Path, seconds: float, most_bytes: int, rate_hz: float = 20.0) -> WrittenLog:
+def write_log(path: Path, seconds: float, most_bytes: int) -> WrittenLog:
     """Write steps with packets of random sizes up to most_bytes."""
     random, flushed, waiting_ns, late_ns = np.random.default_rng(5), list[tuple[int, int]](), list[int](), 0
     with LogWriter(path, {"role": "agent"}) as log:
-        for k in range(round(seconds * rate_hz)):
-            t_ns = round(k * _SECOND_NS / rate_hz)
+        for k in range(round(seconds * _RATE_HZ)):
+            t_ns = round(k * _SECOND_NS / _RATE_HZ)
             log.json("/step", t_ns, {"k": k})
             late_ns = _note_flush(path, 2 * k + 1, t_ns, waiting_ns, flushed, late_ns)
             log.blob("/packets/out", t_ns, random.bytes(int(random.integers(1, most_bytes))))

@@ -40,7 +40,6 @@ class MavlinkUdp:
         self._listens = url.kind == "udpin"
         self._peer: Any = None if self._listens else info[4]
         self._heard_s = 0.0
-        self.strangers = 0  # datagrams of other addresses
         if self._listens:
             try:
                 self.socket.bind(info[4])
@@ -76,7 +75,6 @@ class MavlinkUdp:
         if sender == peer or (peer is not None and sender[:2] == peer[:2]):
             self._heard_s = now_s
             return data, None
-        self.strangers += 1
         moved = peer is not None and sender[0] == peer[0] and now_s - self._heard_s > _SILENT_S
         return (data, sender) if self._listens and (peer is None or moved) else (b"", None)
 

@@ -66,11 +66,7 @@ BASE_END = TunnelConfig(system=255, peer_system=1, rate_bytes_s=500, is_base=Tru
 class TunnelCounters:
     """Packets of one end of a tunnel."""
 
-    sent_packets: int = 0
-    sent_bytes: int = 0  # on the wire
-    refused_packets: int = 0
     received_packets: int = 0
-    incomplete_packets: int = 0
     foreign: int = 0  # chunks of other payload types or for other targets
 
 
@@ -118,12 +114,10 @@ class TunnelEnd:
         size = self.config.chunk_bytes - _HEAD_BYTES
         chunks = [packet[i : i + size] for i in range(0, len(packet), size)] or [b""]
         if len(chunks) > _MAX_CHUNKS or len(self._outbox) + len(chunks) > _OUTBOX_CHUNKS:
-            self.counters.refused_packets += 1
             return False
         self._number = (self._number + 1) % 256
         for i, chunk in enumerate(chunks):
             self._outbox.append(bytes((self._number, i << 4 | (len(chunks) - 1))) + chunk)
-        self.counters.sent_packets += 1
         return True
 
     def poll(self, now_ns: int) -> list[bytes]:
@@ -153,7 +147,6 @@ class TunnelEnd:
             chunk = Tunnel(to, c.peer_component, c.payload_type, data)
             message = self.codec.encode(chunk)
             self._allowance -= len(message)
-            self.counters.sent_bytes += len(message)
             out.append(message)
         return out
 
@@ -234,5 +227,4 @@ class TunnelEnd:
             return b"".join(chunks[i] for i in range(count))
         while len(self._incomplete) > _INCOMPLETE_PACKETS:
             self._incomplete.pop(next(iter(self._incomplete)))
-            self.counters.incomplete_packets += 1
         return None

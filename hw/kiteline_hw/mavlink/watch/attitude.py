@@ -92,7 +92,6 @@ class AttitudeWatch:
         self._turns: deque[F64] = deque(maxlen=self.config.turns)  # (24,) chi2 of each rotation
         self._downs: deque[tuple[F64, float]] = deque(maxlen=self.config.downs)  # (24,) chi2; angle by the axes in use
         self._next_down_ns: int | None = None
-        self.jumps = 0  # rotations whose angles differed
 
     def restart(self) -> None:
         """Forget the samples: the controller or the odometry frame began anew."""
@@ -149,7 +148,6 @@ class AttitudeWatch:
             return added
         self._turn_start = t_ns, r_l_b, r_n_f
         if large - small > c.size_share * large + c.turn_sigma_rad:
-            self.jumps += 1
             return added
         errors = np.linalg.norm(_R_F_B @ w_b - w_f, axis=1)
         self._turns.append((errors / (c.turn_sigma_rad + c.turn_sigma_share * large)) ** 2)

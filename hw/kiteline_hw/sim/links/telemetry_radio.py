@@ -43,7 +43,6 @@ class _Side:
         self._waiting: deque[tuple[int, bytes, bool]] = deque()  # ns handed in, message, whether it is telemetry
         self._bytes = 0
         self._air_ns = 0  # until when the air is in use
-        self.lost = 0
         self.telemetry_delay_ns: list[int] = []
 
     @property
@@ -52,7 +51,6 @@ class _Side:
 
     def push(self, message: bytes, now_ns: int, telemetry: bool = False) -> None:
         if self._bytes + len(message) > self._config.buffer_bytes:
-            self.lost += 1
             return
         self._waiting.append((now_ns, message, telemetry))
         self._bytes += len(message)
