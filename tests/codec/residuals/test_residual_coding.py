@@ -245,6 +245,19 @@ def test_predicted_codes_are_those_of_plain_arithmetic() -> None:
         assert abs(int(out[2, i]) - int(code)) <= 1
 
 
+def test_the_motion_of_a_header_is_inverted_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The poses of ten keyframes are composed for each keyframe that is sent, from the same headers again and again."""
+    invert, inverted = prediction_kernels.invert, list[int]()
+    monkeypatch.setattr(prediction_kernels, "invert", lambda a, out: inverted.append(1) or invert(a, out))  # type: ignore[func-returns-value]
+    records = flight(3, keyframes=8)
+    values, coder, sizes = coded(records), ResidualCoder(), list[int]()
+    for key, (_, code) in values.items():
+        if key.kind == Observations.KIND:
+            form = coder.compress(key, code, values.get, values.get)
+            sizes.append(len(code if form is None else form))
+    assert len(sizes) == 8 and 0 < len(inverted) <= 8
+
+
 def test_a_keyframe_is_compressed_quickly() -> None:
     records = flight(4, keyframes=10, landmarks=160)
     values = coded(records)
