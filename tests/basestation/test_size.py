@@ -235,7 +235,9 @@ def test_counts_of_landmarks_and_observations_follow_the_map(make_flight: MakeFl
     height = len(sparse_map.keyframes.id)
 
     def check() -> None:
-        live = sparse_map.live_landmarks()
+        live, slots = sparse_map.live_landmarks(), np.arange(sparse_map.slots, dtype=np.int32)
+        assert [sparse_map.is_live_landmark(s) for s in slots.tolist()] == sparse_map.is_live(slots).tolist()
+        assert [sparse_map.has_position(s) for s in slots.tolist()] == sparse_map.positions(slots)[1].tolist()
         assert sparse_map.count_live() == len(live) == sum(sparse_map.live_by_submap().values())
         assert np.array_equal(sparse_map.keyframes.live, np.bincount(table.row[live], minlength=height))
         assert sparse_map.keyframes.usable.sum() == np.count_nonzero(table.usable[: sparse_map.slots])

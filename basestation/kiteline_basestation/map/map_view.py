@@ -187,6 +187,11 @@ class MapView:
         is_root = (table.kind[slots] == LANDMARK) & (table.root[slots] == slots)
         return np.asarray(is_root & (table.flags[slots] & CULLED == 0))
 
+    def is_live_landmark(self, slot: int) -> bool:
+        """The same of one slot, in a twentieth of the time."""
+        table = self.keypoints
+        return bool(table.kind[slot] == LANDMARK and table.root[slot] == slot and not table.flags[slot] & CULLED)
+
     def live_in(self, row: int) -> int:
         """Number of root landmarks of a keyframe that are not culled."""
         start = int(self.keyframes.start[row])
@@ -276,6 +281,13 @@ class MapView:
             keyframes.T_w_k, out,
         )  # fmt: skip
         return out, known
+
+    def has_position(self, landmark: int) -> bool:
+        """Whether `positions` knows where a landmark is."""
+        table, row = self.keypoints, self.keypoints.row[landmark]
+        inverse = (table.refined if table.flags[landmark] & REFINED else table.inv_depth)[landmark]
+        known = inverse > 0 and self.keyframes.pose_source[row] != NO_POSE and table.kind[landmark] == LANDMARK
+        return bool(known and self.keyframes.camera[row, 0] > 0)
 
     def project_into_anchor(self, landmarks: I32, positions: F64) -> tuple[F32, F32, Bool]:
         """The inverse of `positions`: inverse depths (n,), offsets (n,2) px, whether in front of the keyframe (n,)."""

@@ -224,13 +224,11 @@ class SparseMap(RigValues):
     def fuse(self, child: int, parent: int) -> list[KeyframeId]:
         """Fuse root landmark `child` into `parent`; the keyframes, sorted, of landmarks that have another root now."""
         table = self.keypoints
-        one = np.array([child], np.int32)
-        self.keyframes.live[table.row[child]] -= self.is_live(one)[0]
-        moved = np.empty(kernels.count(one, table.first, table.next), np.int32)
+        self.keyframes.live[table.row[child]] -= self.is_live_landmark(child)
+        moved = np.empty(kernels.count(np.array([child], np.int32), table.first, table.next), np.int32)
         kernels.fuse(child, parent, table.root, table.first, table.next, moved)
-        landmarks = moved[table.kind[moved] == LANDMARK]
-        rows = np.union1d(table.row[landmarks], table.row[one])
-        return [KeyframeId(k) for k in np.sort(self.keyframes.id[rows]).tolist()]
+        rows = {int(table.row[child]), *table.row[moved[table.kind[moved] == LANDMARK]].tolist()}
+        return sorted(KeyframeId(k) for k in self.keyframes.id[list(rows)].tolist())
 
     def unfuse(self, landmarks: I32) -> None:
         """Undo `fuse`: each landmark (n,) is a root again, with the observations that name it."""

@@ -146,13 +146,12 @@ def fuse_landmarks(sparse_map: SparseMap, a: int, b: int, publisher: Publisher) 
     """
     if a == b or sparse_map.observed_together(a, b):
         return False
-    pair = np.array([a, b], np.int32)
-    ids = sparse_map.landmark_ids(pair)
-    parent, child = pair[np.argsort(ids)]
-    xyz, known = sparse_map.positions(pair[np.argsort(ids)])
-    if not known[0] and known[1]:
+    ids = sparse_map.landmark_ids(np.array([a, b], np.int32))
+    parent, child = (a, b) if ids[0] < ids[1] else (b, a)
+    if not sparse_map.has_position(parent) and sparse_map.has_position(child):
         one = np.array([parent], np.int32)
-        inverse, offset, ahead = sparse_map.project_into_anchor(one, xyz[1:])
+        xyz, _ = sparse_map.positions(np.array([child], np.int32))
+        inverse, offset, ahead = sparse_map.project_into_anchor(one, xyz)
         if not ahead[0]:
             return False
         sparse_map.set_depths(one, inverse, offset)
@@ -161,6 +160,6 @@ def fuse_landmarks(sparse_map: SparseMap, a: int, b: int, publisher: Publisher) 
         publisher.mark_changed_slots(
             RefinedLandmarks.KIND, np.array([child], np.int32)
         )  # it leaves the RefinedLandmarks record of its keyframe
-    for keyframe in sparse_map.fuse(int(child), int(parent)):
+    for keyframe in sparse_map.fuse(child, parent):
         publisher.mark_changed(FusedLandmarks.KIND, keyframe)
     return True
