@@ -28,7 +28,6 @@ from kiteline_basestation.web.snapshot import PageSnapshot
 
 STATUS_PERIOD_S = 0.5  # s between two status messages: numbers that change faster cannot be read
 MAP_PERIOD_S = 1.0  # s between two maps at least: they are a hundred times larger
-WATCHED_S = 3.0  # s since the last request for which a page counts as watched
 RATE_SPAN_S = 2.0  # s over which byte rates are taken: two heartbeats
 MAX_VIEWERS = 16  # browsers at a time; each costs up to 100 kB/s
 TILES_A_MESSAGE = 64  # tiles of 4 kB
@@ -59,11 +58,6 @@ class Handle:
         self._thread = thread
         self.url = url
 
-    @property
-    def watched(self) -> bool:
-        """True if a browser shows the page; no snapshot is needed otherwise."""
-        return self._page.watched
-
     def close(self) -> None:
         """Close all connections and wait until the thread ends. May be called twice."""
         self._page.stop()
@@ -93,12 +87,7 @@ class _Page:
         self._end: asyncio.Event | None = None
         self._local = True
         self._viewers = 0
-        self._requested_s = -WATCHED_S
         self._recent: list[tuple[float, PageSnapshot]] = []  # the last RATE_SPAN_S of snapshots, shared by all viewers
-
-    @property
-    def watched(self) -> bool:
-        return self._viewers > 0 or time.monotonic() - self._requested_s < WATCHED_S
 
     def run(self, host: str, port: int) -> None:
         """The thread."""
@@ -196,7 +185,7 @@ class _Page:
 
     def _snapshots(self) -> tuple[PageSnapshot, PageSnapshot | None]:
         """The newest snapshot, taken at most twice a period for all viewers, and an older one for rates."""
-        now_s = self._requested_s = time.monotonic()
+        now_s = time.monotonic()
         if not self._recent or now_s - self._recent[-1][0] >= 0.5 * STATUS_PERIOD_S:
             self._recent.append((now_s, self._snapshot()))
         while len(self._recent) > 2 and now_s - self._recent[1][0] > RATE_SPAN_S:

@@ -86,7 +86,6 @@ class Traffic:
     bytes_sent: int = 0
     packets_sent: int = 0
     bytes_received: int = 0
-    packets_received: int = 0
     duplicates: int = 0
     restarts: int = 0
     mismatches: int = 0
@@ -102,7 +101,6 @@ class Traffic:
     def received(self, packet: bytes) -> None:
         """Count a packet that has arrived."""
         self.bytes_received += len(packet) + self.overhead_bytes
-        self.packets_received += 1
 
     def refuse(self, reason: str) -> None:
         """Count a packet, or a value in it, that was refused."""
@@ -118,7 +116,6 @@ class SyncStats:
     bytes_sent: int
     packets_sent: int
     bytes_received: int
-    packets_received: int
     lost: int  # packets
     duplicates: int  # packets received again, or too late
     rejected: int
@@ -127,12 +124,9 @@ class SyncStats:
     dirty: int  # own values that the peer is not known to hold
     in_flight: int  # packets
     values: int  # that the peer's session wrote
-    earlier_values: int  # that earlier sessions of the peer wrote and its present one has not replaced
-    peer_session: int | None  # None before the first packet of the peer
     restarts: int  # of the peer, noticed
     mismatches: int  # digests that differed: a defect, mended by sending everything again
     backlog_bytes: int = 0  # of own values that the peer is not known to hold
     resident_bytes: int = 0  # memory of values of keyframes, roughly
     archived: int = 0  # values that are kept out of memory
     dropped: int = 0  # values dropped for want of memory
-    throughput_bytes_s: int | None = None  # what the link delivered lately; None if nothing had to wait

@@ -146,11 +146,10 @@ class Endpoint:
         out, packets, traffic = self._out, self._out.packets, self._traffic
         reasons = tuple(sorted(traffic.reasons.items()))
         return SyncStats(
-            traffic.bytes_sent, traffic.packets_sent, traffic.bytes_received, traffic.packets_received, packets.lost,
-            traffic.duplicates, sum(n for _, n in reasons), reasons, self._round_trip.mean_ns, out.pending,
-            packets.in_flight, len(self._in), len(self.earlier.codes), self.peer_session, traffic.restarts,
-            traffic.mismatches, self.backlog_bytes, out.resident_bytes, out.archive.values, out.dropped,
-            self.throughput_bytes_s,
+            traffic.bytes_sent, traffic.packets_sent, traffic.bytes_received, packets.lost, traffic.duplicates,
+            sum(n for _, n in reasons), reasons, self._round_trip.mean_ns, out.pending, packets.in_flight,
+            len(self._in), traffic.restarts, traffic.mismatches, self.backlog_bytes, out.resident_bytes,
+            out.archive.values, out.dropped,
         )  # fmt: skip
 
     @property

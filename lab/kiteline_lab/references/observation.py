@@ -9,8 +9,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-NO_DIGEST = "-"
-
 
 @dataclass(frozen=True, slots=True)
 class Row:

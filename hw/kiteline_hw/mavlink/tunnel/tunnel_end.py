@@ -104,11 +104,6 @@ class TunnelEnd:
         """True if anything of the peer came in the last so many ns."""
         return self._peer is not None and now_ns - self._peer[1] <= ns
 
-    @property
-    def max_packet_bytes(self) -> int:
-        """The longest packet that fits."""
-        return _MAX_CHUNKS * (self.config.chunk_bytes - _HEAD_BYTES)
-
     def send(self, packet: bytes) -> bool:
         """Queue one packet; False if too much is queued already."""
         size = self.config.chunk_bytes - _HEAD_BYTES

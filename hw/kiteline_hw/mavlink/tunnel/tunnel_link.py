@@ -11,7 +11,7 @@ from dataclasses import replace
 from kiteline_hw.links.ends import LinkOptions
 from kiteline_hw.mavlink.transport.connection import Adopt, MavlinkConnection
 from kiteline_hw.mavlink.transport.url import parse_mavlink_url
-from kiteline_hw.mavlink.tunnel.tunnel_end import AGENT_END, BASE_END, TunnelConfig, TunnelCounters, TunnelEnd
+from kiteline_hw.mavlink.tunnel.tunnel_end import AGENT_END, BASE_END, TunnelConfig, TunnelEnd
 from kiteline_hw.ports import ByteLink, LinkHub
 from kiteline_hw.system.closing import Closing
 
@@ -56,11 +56,6 @@ class MavlinkTunnelLink(TunnelQueue, Closing):
             address, "mavlink-tunnel", self._on_data, self._on_tick, _TICK_S, 0, required=required
         )
         self._connection.start()
-
-    @property
-    def counters(self) -> TunnelCounters:
-        """Packets sent, received and lost so far."""
-        return self._end.counters
 
     @property
     def rate_bytes_s(self) -> float:
