@@ -253,12 +253,14 @@ def freed(
     whole = begun & ((distance <= least) | ((distance <= most) & (distance <= surface)))
     below = begun & ~whole & (distance <= columns["low"][i])
     bands = np.where(whole, 7, np.where(below, columns["under"][i].astype(int), 0))
+    ground = bands > 0
     if camera_band >= 0:
         bands |= np.where(distance <= columns["clear"][i], 1 << camera_band, 0)
     bands = np.where(place < n, bands & ~hits.astype(int), 0)
     seen = columns["start"][i] <= distance
     sure = distance <= np.maximum(columns["sure"][i], columns["start"][i])
-    value = np.where(seen & (distance <= columns["near"][i]), weights[0], np.where(sure, weights[1], weights[2]))
+    value = np.where(sure & (seen | ~ground), weights[1], weights[2])
+    value = np.where(seen & (distance <= columns["near"][i]), weights[0], value)
     out = np.zeros((4, *hits.shape), np.int64)
     out[0] = np.where(bands == 7, value, 0)
     for b in range(3):
@@ -371,8 +373,11 @@ def test_a_table_leaves_the_floor_below_it_and_nothing_is_known_behind_a_wall() 
     assert not grid.log_odds(Place(0, 0, 0))[:, 2, 42:].any()
 
 
-def test_cells_over_which_the_nearest_rays_to_the_ground_pass_low_are_free() -> None:
-    """Nothing that stands there is higher than the lowest band begins: the ray to the ground would end on it."""
+def test_cells_over_which_the_nearest_rays_to_the_ground_pass_low_are_free_by_two_views() -> None:
+    """Nothing that stands there is higher than the lowest band begins, or the ray would end on it; a pit may be there.
+
+    One view that sees the far edge of a pit at the lower border of its image does not free the pit.
+    """
     bare = ColumnScan(
         np.array([0.0, -1.0, 0.0]), -0.7 + 0.01, 0.02, np.full(70, 2.0), np.full(70, 4.0), np.full(70, np.inf),
         np.zeros(70, np.uint8), np.zeros(70), HEIGHT_M,
@@ -382,8 +387,10 @@ def test_cells_over_which_the_nearest_rays_to_the_ground_pass_low_are_free() -> 
     near, first = Place(0, 0, 0), 2.0 * (1.0 - CONFIG.bands_m[0] / HEIGHT_M)
     odds = grid.log_odds(near)[:, 1]
     columns = (np.arange(64) + 0.5) * 0.05
-    assert (odds[:, (columns > first + 0.05) & (columns < 1.95)] == -CONFIG.log_free_sure).all()
+    assert (odds[:, (columns > first + 0.05) & (columns < 1.95)] == -CONFIG.log_free_far).all()
     assert not odds[:, columns < first - 0.05].any()
+    assert grid.cells(near)[0][1, 38] == -1
+    grid.put(1, kept(bare), camera(0.01, 0.0, 0.3))
     assert grid.cells(near)[0][1, 38] == 0
 
 

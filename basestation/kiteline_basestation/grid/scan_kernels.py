@@ -169,8 +169,9 @@ def draw_free(
     Ranges in cells: begins, starts: (n,) from where the rays to the nearest seen ground are low, and from where the
     ground was seen. ends: (n,3) up to where all bands are free, at a column's lower edge, in its middle and at its
     upper edge; lows: (n,) up to where the bands `under` (n,) are free too. clears: (n,) up to where the line of sight
-    is clear, which frees camera_band (-1: none). weights: of seen ground up to nears (n,); beyond, up to sures (n,),
-    and where rays are low; and beyond that. Marked cells keep the bands of their obstacles.
+    is clear, which frees camera_band (-1: none). weights: of seen ground up to nears (n,); beyond, up to sures (n,);
+    and beyond that, and where rays are low but no ground was seen, as a pit may lie there. Marked cells keep the bands
+    of their obstacles.
     """
     rows, columns = hits.shape
     for i in range(ends.shape[0]):
@@ -197,6 +198,7 @@ def draw_free(
                     bands = ALL
                 elif begin2 <= distance2 <= low2:
                     bands = int(np.int64(under[i]))
+                ground = bands != 0
                 if distance2 <= clear2:
                     bands |= 1 << camera_band
                 bands &= ~int(np.int64(hits[row, column]))
@@ -205,7 +207,7 @@ def draw_free(
                 if tile != column >> _SHIFT:
                     slot, tile = _tile(row, column, slots, spare, used), column >> _SHIFT
                     touched[row >> _SHIFT, tile] = 1
-                value = weights[2] if distance2 > max(sure2, start2) else weights[1]
+                value = weights[2] if distance2 > max(sure2, start2) or (ground and distance2 < start2) else weights[1]
                 value = weights[0] if start2 <= distance2 <= near2 else value
                 _take(pool, slot, row, column, bands, -sign * value)
 

@@ -29,6 +29,7 @@ _FALSE = 0.5  # percent of free cells that may be occupied in truth: one minus t
 _UNSEEN = 3.0  # percent of free cells whose ground could not be seen at all, borders of cells aside
 _SHUTTER = Shutter(0.010)
 _GAIN, _NOISE = 185.0, (1.2, 0.02)
+_FALL_M = 0.1  # below other ground: vehicles on wheels pass half of it
 _BLOCK_PX = 16  # of the disparity that is missing at once
 _DRAWS = 12  # of what is missing: one draw says 0.1 % of what another one says 1.6 % of
 _FAR_M = 1000.0  # by which one keyframe is wrong
@@ -76,7 +77,36 @@ def run(bench: Bench) -> list[Bar]:
         bars += _bars(f"{floor}", case)
         found = _free_m2(case.grid()) / max(_true_free_m2(case.seen), 1e-9)
         bars.append(is_true(f"{floor}: free area over what was seen", ">= 0.7", found >= 0.7, f"{found:.2f}"))
+    for floor in ("pits", "steps"):
+        other = open_sim(f"room?floor={floor}", seed=_SEED, seconds=40.0)
+        bars += _falls(floor, _case(bench, floor, other, _along(other)))
     bars += _outlier(plain)
+    return bars
+
+
+def _falls(name: str, case: _Case) -> list[Bar]:
+    """Free cells that lie deeper than a cell in a fall, and free ways of five cells that lead over the edge of one."""
+    grid, world = case.grid(), case.seen.world
+    rows, columns = np.indices(grid.state.shape)
+    corner, free = np.array(grid.origin[:2]), grid.state == FREE
+
+    def depth_m(right: int, up: int) -> F64:
+        """Of cells that lie so many to the right and up."""
+        xy = corner + grid.cell_m * (np.stack([columns + right, rows + up], -1).reshape(-1, 2) + 0.5)
+        return np.asarray(world.floor_m - world.height(xy)).reshape(free.shape)
+
+    inside = np.min([depth_m(*at) for at in ((0, 0), (-1, 0), (1, 0), (0, -1), (0, 1))], axis=0) > _FALL_M
+    edges = ways = 0
+    for right, up in ((1, 0), (0, 1)):
+        over = np.abs(depth_m(-2 * right, -2 * up) - depth_m(2 * right, 2 * up)) > _FALL_M
+        passed = np.all([np.roll(free, (-k * up, -k * right), (0, 1)) for k in range(-2, 3)], axis=0)
+        known = np.any([np.roll(grid.state >= 0, (-k * up, -k * right), (0, 1)) for k in range(-2, 3)], axis=0)
+        edges, ways = edges + int(np.count_nonzero(over & known)), ways + int(np.count_nonzero(over & passed))
+    bars = [at_most(f"{name}: free ways over an edge, of edges beside known cells", 100.0 * ways / max(edges, 1),
+                    _FALSE, "%", 2)]  # fmt: skip
+    if name == "pits":  # the lower ground between steps may be free
+        wrong = 100.0 * int(np.count_nonzero(free & inside)) / max(int(np.count_nonzero(free)), 1)
+        bars.append(at_most(f"{name}: free cells that lie in one", wrong, _FALSE, "%", 2))
     return bars
 
 

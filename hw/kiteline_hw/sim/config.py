@@ -54,7 +54,7 @@ class SimConfig:
     repeated: float = 0.0  # share of the surfaces with a pattern that repeats every 0.3 m
     glossy: float = 0.0  # share of the surfaces that reflect lights
     objects: bool = False  # chairs, a table, cylinders, a half-open door and pillars beside the path, indoors
-    floor: str = "flat"  # or ramp, wave, bare (without texture), indoors
+    floor: str = "flat"  # or ramp, wave, pits, steps, bare (without texture), indoors
     texture_bits: int = 11  # log2 of a texture's side; less only for tests
 
     @property

@@ -71,7 +71,9 @@ def test_a_cylinder_is_round() -> None:
         assert ((nearest == 0.0) == inside).all()
 
 
-@pytest.mark.parametrize(("floor", "fall"), [("ramp", (0.3, 2.0)), ("wave", (0.1, 0.13))])
+@pytest.mark.parametrize(
+    ("floor", "fall"), [("ramp", (0.3, 2.0)), ("wave", (0.1, 0.13)), ("pits", (0.24, 0.26)), ("steps", (0.19, 0.21))]
+)
 def test_floors_fall_below_the_path_and_carry_the_furniture(floor: str, fall: tuple[float, float]) -> None:
     flat, source = flight("room", seed=1), flight("room", seed=1, floor=floor, objects=True)
     world, path = source.world, source.path.positions()
@@ -93,7 +95,7 @@ def test_floors_fall_below_the_path_and_carry_the_furniture(floor: str, fall: tu
     assert top[2] - top[5] - world.height(top[None, :2])[0] == pytest.approx(0.72, abs=0.02)
 
 
-@pytest.mark.parametrize("floor", ["ramp", "wave"])
+@pytest.mark.parametrize("floor", ["ramp", "wave", "pits", "steps"])
 def test_the_camera_sees_the_floor_where_it_is(floor: str) -> None:
     world = flight("room", seed=1, floor=floor).world
     camera = SimCamera(world, CameraModel(32, 24, 16.0, 16.0, 15.5, 11.5, Lens.NONE, ()), np.eye(4))
@@ -119,7 +121,7 @@ def test_a_bare_floor_shows_nothing() -> None:
 
 
 def test_unknown_floors_and_floors_of_streets_are_refused() -> None:
-    with pytest.raises(SourceError, match="ramp, wave, bare"):
+    with pytest.raises(SourceError, match="ramp, wave, pits, steps, bare"):
         open_sim("room?floor=lava")
     with pytest.raises(SourceError, match="indoor"):
         open_sim("street?floor=ramp")
