@@ -219,6 +219,10 @@ class InertialScaleConfig:
     bias_sigma: float = 0.3  # m/s^2; of the accelerometer's bias where a chain begins
     bias_walk: float = 0.03  # m/s^2 per sqrt(s); its slow errors: axes, vibration, temperature, as true poses show them
     agent_sigma: float = 0.03  # of the agent's scale
+    drift: float = 0.015  # of the scale by images per root of a view: 1 rad, or a motion as far as what is seen
+    most_drift: float = 3.0  # deviations of that from one knot to the next; 1.7 at most in whole maps, 5 in torn ones
+    knot_views: float = 1.0  # between the values of a scale that drifts
+    most_knots: int = 16  # such values of a map
     hold: float = 0.5  # deviations; a smaller change would only move the world under the vehicle
 
 

@@ -99,3 +99,18 @@ def test_corners_that_alignment_finds_again_count_where_flow_lost_them() -> None
                 np.testing.assert_array_equal(both.xy[k, i], corners.xy[k, i])
             elif again:
                 np.testing.assert_array_equal(both.xy[k, i], aligned.xy[k, at[0]])
+
+
+def test_windows_whose_keyframes_coincide_confirm_no_scale() -> None:
+    def at(places: np.ndarray[Any, Any]) -> Any:
+        solution: Any = SimpleNamespace(state=SimpleNamespace(p=places))
+        return inertial_start._Window((0, 1, 2, 3), np.zeros(0, np.int64), np.zeros((0, 3)), solution)
+
+    start = InertialStart(CAMERA, CALIBRATION, AgentConfig(), Work())
+    apart, together = np.arange(12.0).reshape(4, 3), np.ones((4, 3))
+    assert start._agrees(at(apart), at(1.01 * apart))
+    assert not start._agrees(at(apart), at(1.1 * apart))
+    with np.errstate(all="raise"):
+        assert not start._agrees(at(together), at(together))
+        assert not start._agrees(at(together), at(apart))
+        assert not start._agrees(at(apart), at(together))

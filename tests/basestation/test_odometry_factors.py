@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,10 +15,12 @@ from kiteline_basestation.mapper_state import map_state, restore_map
 from kiteline_basestation.refinement.bundle_window import bundle_window
 from kiteline_basestation.refinement.disparity_calibration import with_border
 from kiteline_basestation.refinement.odometry_factors import (
+    _units,
     median_depths,
     with_odometry_factors,
     without_odometry_factors,
 )
+from kiteline_codec.schema import InertialSteps
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, keyframe_id, submap_id
@@ -317,3 +321,43 @@ def test_median_depths_are_those_of_each_camera_s_disparities() -> None:
     for k in range(KEYFRAMES):
         disparity = measured[(problem.camera == k) & (measured[:, 2] > 0), 2]
         assert depth[k] == pytest.approx(CAMERA.bf / np.median(disparity) if k != 2 else 3.0, rel=1e-9)
+
+
+def test_where_accelerations_have_corrected_lengths_steps_are_as_long_as_the_map_has_them_now() -> None:
+    sparse_map, n, step = SparseMap(), 60, se3.from_rt(np.eye(3), [0.5, 0.0, 0.0])
+    sparse_map.set_camera(AgentId(0), replace(CAMERA, stereo=False))
+    sparse_map.metric_submaps.add(SUBMAP)
+    for k in range(n):
+        parent = keyframe_id(SUBMAP, k - 1) if k else NO_KEYFRAME
+        sparse_map.add_keyframe(keyframe_id(SUBMAP, k), k, parent, step if k else np.eye(4), 0)  # of equal weight
+    rows = np.array([sparse_map.rows[keyframe_id(SUBMAP, k)] for k in range(n)], np.int32)
+    number = {keyframe_id(SUBMAP, k): k for k in range(n)}
+    window: Any = SimpleNamespace(rows=rows)
+    assert np.array_equal(_units(sparse_map, window, number, 20), np.ones(n))
+    sparse_map.scale_submap(SUBMAP, 0.95)
+    grown = np.where(np.arange(n) < n // 2, 1.0, 0.95)  # the newest keyframes have another length
+    grown[10] = 40.0  # and one step is torn
+    sparse_map.keyframes.T_w_k[rows, 0, 3] = np.cumsum(np.r_[0.0, 0.5 * grown[1:]])
+    found = _units(sparse_map, window, number, 20)
+    assert np.allclose(found[1:20], 1.0) and np.allclose(found[40:], 0.95)
+    sparse_map.keyframes.T_w_k[rows, 0, 3] *= 3.0
+    assert _units(sparse_map, window, number, 20).max() < 1.1  # a map that is torn as a whole is not held
+
+
+def test_inertial_steps_tie_a_keyframe_without_a_parent() -> None:
+    sparse_map, _ = flight(noise_px=0.5)
+    config, keyframes = BaseConfig(), [keyframe_id(SUBMAP, k) for k in range(KEYFRAMES)]
+    window = bundle_window(sparse_map, keyframes, config.bundle_window, config.measurement)
+    assert window is not None
+    expected = with_odometry_factors(sparse_map, window, config.odometry_factors)
+    row = sparse_map.rows[keyframes[3]]
+    T_p_k = sparse_map.keyframes.T_p_k[row].copy()
+    sparse_map.keyframes.parent[row], sparse_map.keyframes.T_p_k[row] = NO_KEYFRAME, np.eye(4)
+    apart = with_odometry_factors(sparse_map, window, config.odometry_factors)
+    assert len(apart.points) < len(expected.points)
+    rest = np.zeros((1, 3))
+    sparse_map.inertial_steps[keyframes[3]] = InertialSteps(
+        keyframes[3], keyframes[2], 2e-3, np.ones(1), rest, T_p_k[None, :3, 3], rest, rest
+    )
+    tied = with_odometry_factors(sparse_map, window, config.odometry_factors)
+    assert np.allclose(tied.measured, expected.measured) and np.allclose(tied.points, expected.points)

@@ -244,6 +244,8 @@ class InertialStart:
             return False
         a, b = (w.solution.state.p[[w.t_ns.index(t) for t in common]] for w in (before, now))
         length_a, length_b = (float(np.linalg.norm(p - p.mean(axis=0))) for p in (a, b))
+        if min(length_a, length_b) <= 0.0:  # keyframes that coincide tell no scale
+            return False
         return bool(abs(np.log(length_b / length_a)) < self._config.inertial_start.agreement)
 
     def _points(self, ctx: FrameContext, corners: CornerObservations, solution: WindowSolution) -> MetricPoints | None:

@@ -27,14 +27,14 @@ _FOLLOW = (0.7, 1.4)  # factors by which it may
 class Segment:
     """Steps between keyframes `first` and `last` of a window, which number its poses.
 
-    T_c_b: (4,4). depth_m: median distance of what the camera sees. unit: metres that the agent told in one of w.
+    T_c_b: (4,4). depth_m: median distance of what the camera sees. metre: metres in a unit of the agent's map, as told.
     """
 
     first: int
     last: int
     T_c_b: F64
     depth_m: float
-    unit: float
+    metre: float
     steps: InertialSteps
 
 
@@ -44,7 +44,7 @@ class Path:
 
     R_w_b: (k,3,3) and camera: (k,3) m, at the nodes, lever: (k,3) m from body to camera, in w. fresh: (k,) True where
     a chain begins. by_bias: (n,2,3,3) what a bias of the accelerometer, which turns with the body, adds to velocity and
-    position. noise, depth_m, unit: (n,) of each step's segment.
+    position. noise, depth_m: (n,) of each step's segment.
     """
 
     begin: NDArray[np.int64]
@@ -58,11 +58,10 @@ class Path:
     by_bias: F64
     noise: F64
     depth_m: F64
-    unit: F64
 
 
 def segments_of(sparse_map: SparseMap, rows: I32, problem: BundleProblem) -> tuple[Segment, ...]:
-    """Segments of a bundle of the keyframes in `rows` (k,), in order of time; steps over culled ones are joined."""
+    """Segments of a bundle of the keyframes in `rows` (k,), by agent and time; steps over culled ones are joined."""
     table = sparse_map.keyframes
     number = {int(table.id[row]): i for i, row in enumerate(rows.tolist())}
     depth: F64 | None = None  # where any segment needs it
@@ -85,7 +84,7 @@ def segments_of(sparse_map: SparseMap, rows: I32, problem: BundleProblem) -> tup
         out.append(
             Segment(
                 number[at], i, se3.inverse(sparse_map.cameras[agent].T_b_c), float(depth[i]),
-                sparse_map.metres_per_unit.get(submap, 1.0) / sparse_map.scale(submap),
+                sparse_map.metres_per_unit.get(submap, 1.0),
                 replace(records[-1], since=at, **fields),
             )
         )  # fmt: skip
@@ -93,7 +92,7 @@ def segments_of(sparse_map: SparseMap, rows: I32, problem: BundleProblem) -> tup
     kept, n = len(out), 0
     while kept > 0 and n + len(out[kept - 1].steps.dt_s) <= _MAX_STEPS:
         kept, n = kept - 1, n + len(out[kept - 1].steps.dt_s)
-    return tuple(out[kept:])
+    return tuple(sorted(out[kept:], key=lambda s: agent_of_keyframe(s.steps.keyframe)))  # one path after the other
 
 
 _STEPS = ("dt_s", "turn", "moved", "velocity", "position")
@@ -131,16 +130,28 @@ def path_along(segments: tuple[Segment, ...], T_w_c: F64) -> Path:
         end = s.last
     sizes = [len(s.steps.dt_s) for s in segments]
     dt_s, velocity, position = (np.concatenate([getattr(s.steps, name) for s in segments]) for name in _BY_IMU)
-    of_segment = zip(*((s.steps.noise, s.depth_m, s.unit) for s in segments), strict=True)
-    noise, depth_m, unit = (np.repeat(values, sizes) for values in of_segment)
+    of_segment = zip(*((s.steps.noise, s.depth_m) for s in segments), strict=True)
+    noise, depth_m = (np.repeat(values, sizes) for values in of_segment)
     return Path(
         np.concatenate(begin), np.concatenate(R), np.concatenate(camera), np.concatenate(lever),
         np.concatenate(fresh), dt_s, velocity, position, np.concatenate([_by_bias(s) for s in segments]), noise,
-        depth_m, unit,
+        depth_m,
     )  # fmt: skip
 
 
 _BY_IMU = ("dt_s", "velocity", "position")
+
+
+def told_units(segments: tuple[Segment, ...], T_w_c: F64) -> float:
+    """Units of w in a metre by what the agents told: the lengths between keyframes T_w_c (k,4,4) over the told ones."""
+    here = told = 0.0
+    for s in segments:
+        T = np.eye(4)
+        for turn, moved in zip(s.steps.turn, s.steps.moved, strict=True):
+            T = T @ se3.from_rt(se3.so3_exp(turn), moved)
+        told += s.metre * float(np.linalg.norm((s.T_c_b @ T @ se3.inverse(s.T_c_b))[:3, 3]))
+        here += float(np.linalg.norm(T_w_c[s.last, :3, 3] - T_w_c[s.first, :3, 3]))
+    return here / told if min(here, told) > 0.0 else 1.0
 
 
 def _by_bias(s: Segment) -> F64:

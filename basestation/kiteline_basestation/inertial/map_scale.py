@@ -1,9 +1,10 @@
-"""The scale of a map by the accelerations of the whole flight.
+"""The scale along a map by the accelerations of the whole flight.
 
 Maximum a posteriori of position, velocity and accelerometer bias at the ends of short steps, of gravity's direction and
 of the scale, given rotations and the shape of the path by images. As in C. Campos et al., "Inertial-only optimization
 for visual-inertial initialization", 2020, but that positions are unknown too: images err by as much as a short step
-accelerates, and taken as exact they would make the scale too small.
+accelerates, and taken as exact they would make the scale too small. Nor is it one scale: it drifts as the view changes
+(`scale_drift`).
 """
 
 from __future__ import annotations
@@ -15,51 +16,51 @@ from numpy.typing import NDArray
 
 from kiteline_basestation.config import InertialScaleConfig
 from kiteline_basestation.inertial import band_kernels
-from kiteline_basestation.inertial.chain import Path, Segment, path_along
-from kiteline_core.optimisation.bundle import BundleResult
+from kiteline_basestation.inertial.chain import Path, Segment, path_along, told_units
+from kiteline_basestation.inertial.scale_drift import ScaleDrift, bent, drift_along, shared_landmarks
+from kiteline_core.optimisation.bundle import BundleProblem, BundleResult
 
 F64 = NDArray[np.float64]
 
 _NODE = 9  # unknowns of a node: position, velocity, accelerometer bias
-_SHARED = 3  # of the map: direction of gravity, units of w in a metre
+_SHARED = 2  # of the map: direction of gravity; and units of w in a metre at the knots of its drift
 _ROWS = 12  # of a step: velocity and position by the IMU, displacement by images, change of the bias
 _WIDTH = 2 * _NODE
 
 
 @dataclass(frozen=True, slots=True)
 class MapScale:
-    """metres: in one unit of w. sigma: standard deviation of its logarithm. chi2: mean squared residual by images."""
+    """metres: (k,) in one unit of w at each keyframe. sigma: standard deviation of the logarithm of their mean. chi2:
+    mean squared residual by images.
+    """
 
-    metres: float
+    metres: F64
     sigma: float
     chi2: float
 
 
 @dataclass(slots=True)
 class _State:
-    """node: (k,9). gravity: (3,) m/s^2 in w. units: of w in a metre."""
+    """node: (k,9). gravity: (3,) m/s^2 in w. units: (m,) of w in a metre, at the knots."""
 
     node: F64
     gravity: F64
-    units: float
+    units: F64
 
 
 def in_metres(
-    result: BundleResult, segments: tuple[Segment, ...], held: int, config: InertialScaleConfig
+    result: BundleResult, problem: BundleProblem, segments: tuple[Segment, ...], held: int, config: InertialScaleConfig
 ) -> BundleResult:  # fmt: skip
-    """The result of a bundle, scaled about the camera `held` by what the segments tell, if that matters."""
+    """The result of a bundle, scaled from the camera `held` on by what the segments tell, if that matters."""
     T_w_c: F64 = np.linalg.inv(result.T_c_m).astype(np.float64)
-    found = map_scale(segments, T_w_c, config)
+    shared = shared_landmarks(problem, result.inlier)
+    found = map_scale(segments, T_w_c, shared, config)
     if found is None:
         return result
     result = replace(result, scale_sigma=found.sigma)
-    if abs(np.log(found.metres)) < config.hold * found.sigma:
+    if np.abs(np.log(found.metres)).max() < config.hold * found.sigma:
         return result
-    centre = T_w_c[held, :3, 3].copy()
-    T_w_c[:, :3, 3] = centre + found.metres * (T_w_c[:, :3, 3] - centre)
-    T_c_w: F64 = np.linalg.inv(T_w_c).astype(np.float64)
-    T_c_w[held] = result.T_c_m[held]
-    return replace(result, T_c_m=T_c_w, points=centre + found.metres * (result.points - centre))
+    return bent(result, problem, shared, found.metres, held)
 
 
 def tells_scale(segments: tuple[Segment, ...], config: InertialScaleConfig) -> bool:
@@ -67,30 +68,40 @@ def tells_scale(segments: tuple[Segment, ...], config: InertialScaleConfig) -> b
     return sum(float(s.steps.dt_s.sum()) for s in segments) >= config.least_s
 
 
-def map_scale(segments: tuple[Segment, ...], T_w_c: F64, config: InertialScaleConfig) -> MapScale | None:
-    """The scale of keyframes at T_w_c (k,4,4); None without steps, and if they do not fit."""
+def map_scale(
+    segments: tuple[Segment, ...], T_w_c: F64, shared: F64, config: InertialScaleConfig
+) -> MapScale | None:  # fmt: skip
+    """The scale at keyframes T_w_c (k,4,4) that share landmarks (k,k).
+
+    None without steps, if they have no solution, and where the scale drifts by more than images allow: the map is torn.
+    """
     if not segments or not np.isfinite(T_w_c).all():
         return None
     path = path_along(segments, T_w_c)
-    state, weight = _start(path, config), np.ones(len(path.begin))
-    agent_units = 1.0 / float(np.average(path.unit, weights=path.dt_s))
+    drift = drift_along(segments, path, T_w_c, shared, config)
+    state, weight = _start(path, drift, config), np.ones(len(path.begin))
+    agent_units = told_units(segments, T_w_c)
     for _ in range(config.iterations):
-        J, e, chi2 = _linearised(path, state, weight, config)
-        solved = _solve(path, state, J, e, agent_units, config)
+        J, e, chi2 = _linearised(path, drift, state, weight, config)
+        solved = _solve(path, drift, state, J, e, agent_units, config)
         if solved is None:
             return None
         state, variance = solved
-        if not 0.5 < state.units < 2.0:
+        if not (state.units.min() > 0.5 and state.units.max() < 2.0):
             return None
         weight = np.minimum(1.0, config.huber / np.sqrt(np.maximum(chi2, 1e-12)))
+    if drift.largest_step(state.units) > config.most_drift:
+        return None
     typical = max(1.0, float(np.median(chi2)) / _MEDIAN_3)
-    return MapScale(1.0 / state.units, float(np.sqrt(variance * typical)) / state.units, float(np.mean(chi2)) / 3.0)
+    mean = float(drift.mean @ state.units)
+    metres = 1.0 / (drift.at_keyframes @ state.units)
+    return MapScale(metres, float(np.sqrt(variance * typical)) / mean, float(np.mean(chi2)) / 3.0)
 
 
 _MEDIAN_3 = 2.366  # of a chi-square with three degrees of freedom
 
 
-def _start(path: Path, config: InertialScaleConfig) -> _State:
+def _start(path: Path, drift: ScaleDrift, config: InertialScaleConfig) -> _State:
     a, dt = path.begin, path.dt_s
     place = path.camera - path.lever
     velocity = np.zeros_like(place)
@@ -99,7 +110,7 @@ def _start(path: Path, config: InertialScaleConfig) -> _State:
     velocity[first] = velocity[first + 1]
     force = np.einsum("nij,nj->i", path.R_w_b[a], path.velocity) - (velocity[a + 1] - velocity[a]).sum(axis=0)
     gravity = -config.gravity_m_s2 * force / max(float(np.linalg.norm(force)), 1e-9)
-    return _State(np.concatenate([place, velocity, np.zeros_like(place)], axis=1), gravity, 1.0)
+    return _State(np.concatenate([place, velocity, np.zeros_like(place)], axis=1), gravity, np.ones(len(drift.mean)))
 
 
 def _tangent(gravity: F64) -> F64:
@@ -110,14 +121,16 @@ def _tangent(gravity: F64) -> F64:
     return np.asarray(np.column_stack([x, np.cross(u, x)]) * np.linalg.norm(gravity))
 
 
-def _linearised(path: Path, state: _State, weight: F64, config: InertialScaleConfig) -> tuple[F64, F64, F64]:
-    """Jacobians (n,12,21) of whitened errors by two nodes and the shared unknowns, errors (n,12), and the squared
+def _linearised(
+    path: Path, drift: ScaleDrift, state: _State, weight: F64, config: InertialScaleConfig
+) -> tuple[F64, F64, F64]:  # fmt: skip
+    """Jacobians (n,12,20+m) of whitened errors by two nodes and the shared unknowns, errors (n,12), and the squared
     errors (n,) of the images in deviations.
     """
     a, dt = path.begin, path.dt_s
     n, x0, x1 = len(a), state.node[path.begin], state.node[path.begin + 1]
     back = np.swapaxes(path.R_w_b[a], 1, 2)
-    J = np.zeros((n, _ROWS, _WIDTH + _SHARED))
+    J = np.zeros((n, _ROWS, _WIDTH + _SHARED + len(drift.mean)))
     e = np.zeros((n, _ROWS))
     t = dt[:, None]
     dv = np.einsum("nij,nj->ni", back, x1[:, 3:6] - x0[:, 3:6] - t * state.gravity)
@@ -131,9 +144,10 @@ def _linearised(path: Path, state: _State, weight: F64, config: InertialScaleCon
     J[:, 3:6, :3], J[:, 3:6, 9:12], J[:, 3:6, 3:6] = -back, back, -dt[:, None, None] * back
     J[:, 3:6, 6:9], J[:, 3:6, 18:20] = by_bias_p, -0.5 * (dt * dt)[:, None, None] * tilt
     moved = x1[:, :3] - x0[:, :3] + path.lever[a + 1] - path.lever[a]
-    e[:, 6:9] = path.camera[a + 1] - path.camera[a] - state.units * moved
-    J[:, 6:9, :3], J[:, 6:9, 9:12] = state.units * np.eye(3), -state.units * np.eye(3)
-    J[:, 6:9, 20] = -moved
+    units = drift.at_steps @ state.units
+    e[:, 6:9] = path.camera[a + 1] - path.camera[a] - units[:, None] * moved
+    J[:, 6:9, :3], J[:, 6:9, 9:12] = units[:, None, None] * np.eye(3), -units[:, None, None] * np.eye(3)
+    J[:, 6:9, 20:] = -moved[:, :, None] * drift.at_steps[:, None]
     e[:, 9:] = x1[:, 6:] - x0[:, 6:]
     J[:, 9:, 6:9], J[:, 9:, 15:18] = -np.eye(3), np.eye(3)
     # whitening: L L^T = inverse covariance of [velocity, position] by white noise
@@ -155,13 +169,13 @@ def _linearised(path: Path, state: _State, weight: F64, config: InertialScaleCon
 
 
 def _solve(
-    path: Path, state: _State, J: F64, e: F64, agent_units: float, config: InertialScaleConfig
+    path: Path, drift: ScaleDrift, state: _State, J: F64, e: F64, agent_units: float, config: InertialScaleConfig
 ) -> tuple[_State, float] | None:
-    """A Gauss-Newton step, and the variance of the units; None if the system has no solution."""
-    k = len(path.fresh)
+    """A Gauss-Newton step, and the variance of the mean unit; None if the system has no solution."""
+    k, shared = len(path.fresh), _SHARED + len(drift.mean)
     H, g = np.swapaxes(J, 1, 2) @ J, -np.einsum("nri,nr->ni", J, e)
     diagonal, beside = np.zeros((k, _NODE, _NODE)), np.zeros((k, _NODE, _NODE))
-    border, rhs = np.zeros((k, _NODE, _SHARED)), np.zeros((k, _NODE))
+    border, rhs = np.zeros((k, _NODE, shared)), np.zeros((k, _NODE))
     a = path.begin
     for node, at in ((a, slice(0, _NODE)), (a + 1, slice(_NODE, _WIDTH))):  # each node once: plain indexing adds
         diagonal[node] += H[:, at, at]
@@ -174,24 +188,26 @@ def _solve(
     diagonal[first, 6:, 6:] += np.eye(3) / config.bias_sigma**2
     rhs[first, 6:] -= state.node[first, 6:] / config.bias_sigma**2
     corner, corner_rhs = H[:, _WIDTH:, _WIDTH:].sum(axis=0), g[:, _WIDTH:].sum(axis=0)
-    corner[2, 2] += 1.0 / (config.agent_sigma * agent_units) ** 2
-    corner_rhs[2] += (agent_units - state.units) / (config.agent_sigma * agent_units) ** 2
+    prior = np.outer(drift.mean, drift.mean) / (config.agent_sigma * agent_units) ** 2 + drift.information
+    corner[2:, 2:] += prior
+    corner_rhs[2:] += prior @ (agent_units - state.units)
     band = np.zeros((k, _NODE, _WIDTH))
     for r in range(_NODE):
         band[:, r, : _NODE - r] = diagonal[:, r, r:]
         band[:, r, _NODE - r : _WIDTH - r] = beside[:, r]
-    flat, flat_border, x = band.reshape(-1, _WIDTH), border.reshape(-1, _SHARED), rhs.reshape(-1)
+    flat, flat_border, x = band.reshape(-1, _WIDTH), border.reshape(-1, shared), rhs.reshape(-1)
     if not band_kernels.factor(flat, flat_border, corner, x, corner_rhs):
         return None
     try:
         cov = np.linalg.inv(corner)
     except np.linalg.LinAlgError:
         return None
-    shared = cov @ corner_rhs
-    band_kernels.substitute(flat, flat_border, x, shared)
-    if not (np.isfinite(x).all() and np.isfinite(cov).all() and cov[2, 2] > 0.0):
+    step = cov @ corner_rhs
+    band_kernels.substitute(flat, flat_border, x, step)
+    variance = float(drift.mean @ cov[2:, 2:] @ drift.mean)
+    if not (np.isfinite(x).all() and np.isfinite(cov).all() and variance > 0.0):
         return None
-    gravity = state.gravity + _tangent(state.gravity) @ shared[:2]
+    gravity = state.gravity + _tangent(state.gravity) @ step[:2]
     gravity *= config.gravity_m_s2 / float(np.linalg.norm(gravity))
-    moved = _State(state.node + x.reshape(k, _NODE), gravity, state.units + float(shared[2]))
-    return moved, float(cov[2, 2])
+    moved = _State(state.node + x.reshape(k, _NODE), gravity, state.units + step[2:])
+    return moved, variance

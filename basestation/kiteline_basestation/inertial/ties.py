@@ -77,12 +77,17 @@ class InertialTies:
         unit = sparse_map.metres_per_unit.get(before, 1.0)
         held = sparse_map.scale(before)
         metre = unit if held == 1.0 else 1.0
-        T_b_c = sparse_map.cameras[agent_of_keyframe(record.keyframe)].T_b_c
-        T_a_k = sim3.with_scaled_translation(se3.inverse(T_b_c) @ moved(record) @ T_b_c, held)
+        T_a_k = sim3.with_scaled_translation(moved_camera(sparse_map, record), held)
         S_older_newer = sim3.of(held / unit / sparse_map.scale(after), T_w_a @ T_a_k) @ se3.inverse(T_w_k)
         if newer < older:
             return InertialTie(older, newer, sim3.inverse(S_older_newer), 1.0)
         return InertialTie(newer, older, sim3.normalise(S_older_newer), metre)
+
+
+def moved_camera(sparse_map: SparseMap, record: InertialSteps) -> F64:
+    """Motion (4,4) of the camera along the steps, in the unit of the submap in which they began."""
+    T_b_c = sparse_map.cameras[agent_of_keyframe(record.keyframe)].T_b_c
+    return np.asarray(se3.inverse(T_b_c) @ moved(record) @ T_b_c)
 
 
 def moved(record: InertialSteps) -> F64:

@@ -15,7 +15,7 @@ _STEP_OPS = 90_000  # of an inertial step: 0.09 ms, as timed
 
 @dataclass(frozen=True, slots=True)
 class BundleInputs:
-    """A bundle adjustment problem and how to solve it. chain: scales the result, about camera `held`."""
+    """A bundle adjustment problem and how to solve it. chain: scales the result, from camera `held` on."""
 
     problem: BundleProblem
     config: BundleConfig
@@ -30,7 +30,7 @@ def _run(inputs: BundleInputs) -> BundleResult:
         return result
     steps = sum(len(segment.steps.dt_s) for segment in inputs.chain)
     result = replace(result, cost_ops=result.cost_ops + _STEP_OPS * steps)
-    return in_metres(result, inputs.chain, inputs.held, inputs.inertial_scale)
+    return in_metres(result, inputs.problem, inputs.chain, inputs.held, inputs.inertial_scale)
 
 
 def _cost_ops(inputs: BundleInputs, result: BundleResult) -> int:
