@@ -35,7 +35,7 @@ from kiteline_basestation.merging.merges import NOTHING, MergeResult
 from kiteline_basestation.refinement import culling, landmark_matching, triangulation
 from kiteline_basestation.refinement.bundle_job import FULL_BUNDLE, LOCAL_BUNDLE
 from kiteline_basestation.refinement.local_bundles import LocalBundles
-from kiteline_codec.schema import CulledLandmarks, DisparityCalibration, Key, LivePose, Record, SubmapPlacement
+from kiteline_codec.schema import DisparityCalibration, Key, LivePose, Record, SubmapPlacement
 from kiteline_core.geometry import sim3
 from kiteline_core.ids import AgentId, KeyframeId, SubmapId, agent_of_keyframe, agent_of_submap, submap_of_keyframe
 from kiteline_core.places.place_index import Vocabulary
@@ -361,7 +361,7 @@ class Mapper:
                 self.map.up.pop(keyframe, None)
                 self.map.set_flags(slots[self.map.keypoints.kind[slots] == LANDMARK], CULLED)
                 self.map.cull_keyframe(keyframe)
-                self._publisher.mark_changed(CulledLandmarks.KIND, keyframe)
+                self._publisher.mark_deleted(keyframe)
             self._placements.delete(submap)
             self.grid_updates.remove(keyframes)
             self.names.pop(submap, None)

@@ -297,6 +297,21 @@ def test_a_step_codes_a_part_of_a_batch_and_the_next_ones_the_rest(mapped: tuple
     assert publisher.unfinished == {agent} and [r.keyframe for r in records][-1] == live[-1]
 
 
+def test_what_moves_nothing_is_coded_over_several_steps_too(mapped: tuple[Any, Mapper]) -> None:
+    """A full bundle removes observations and landmarks of 800 keyframes at once."""
+    flight, mapper = mapped
+    publisher = Publisher(mapper.map, replace(PublishConfig(), step_values=8))
+    for keyframe in flight.keyframes:
+        publisher.mark_changed(CulledLandmarks.KIND, keyframe)
+    sent = [[r.keyframe for _, records in publisher.collect() for r in records] for _ in range(4)]
+    assert sent == [flight.keyframes[n : n + 8] for n in range(0, 32, 8)]
+    assert not publisher.waiting
+    for keyframe in flight.keyframes:
+        publisher.mark_deleted(keyframe)
+    ((_, records),) = publisher.collect()  # they are forgotten in the next step
+    assert [r.keyframe for r in records] == flight.keyframes
+
+
 def test_deleted_maps_leave_their_memory_to_the_next_ones(make_flight: MakeFlight, words: Any) -> None:
     stays = make_flight(keyframes=12, agent=1, seed=5)
     mapper, alone = Mapper(WITHOUT_GRID, words), Mapper(WITHOUT_GRID, words)

@@ -74,6 +74,7 @@ class Publisher:
         self._map = sparse_map
         self._config = config or PublishConfig()
         self._dirty: dict[_Mark, None] = {}
+        self._whole = False  # all of them are sent in the next call of `collect`
         self._moves: dict[AgentId, _Moves] = {}
         self._records: list[tuple[AgentId, Record]] = []
 
@@ -86,6 +87,11 @@ class Publisher:
         if moves is None:
             moves = self._moves[agent] = _Moves()
         moves.add(int(kind), keyframe)
+
+    def mark_deleted(self, keyframe: KeyframeId) -> None:
+        """Mark a keyframe as culled that will be forgotten once the next call of `collect` has told of it."""
+        self.mark_changed(CulledLandmarks.KIND, keyframe)
+        self._whole = True
 
     def mark_changed_slots(self, kind: int, slots: I32) -> None:
         """Mark a value of the keyframes that own slots (n,) as changed."""
@@ -147,7 +153,10 @@ class Publisher:
         """Take the changes of one step. A batch is chosen where there is room, and taken over several steps if it is
         large; in a room above 0 it has at least one change.
         """
-        taken, self._dirty = list(self._dirty), {}
+        most = None if self._whole else self._config.step_values
+        taken, self._whole = list(islice(self._dirty, most)), False  # what moves nothing: it waits for no other values
+        for mark in taken:
+            del self._dirty[mark]
         for agent, moves in self._moves.items():
             if not moves.batch and room.get(agent) != 0:
                 moves.batch = dict.fromkeys(self._choose(moves, room.get(agent)))
