@@ -14,19 +14,19 @@ from kiteline_bench.harness.run import TICK_NS, JointRun, Part, Scenario, fly_wi
 from kiteline_core.ids import AgentId
 
 
-def flown(data_dir: Path, **base: int) -> JointRun:
-    """Four seconds of the room, then the first of them again, by a new boot whose link ends."""
+def flown(data_dir: Path, seconds: float, **base: int) -> JointRun:
+    """Some seconds of the room, then the first of them again, by a new boot whose link is down for a moment."""
     room = str(data_dir / "room_flight.mcap")
     scenarios = [
-        Scenario(room, 0, parts=(Part(0.0, 4.0),)),
-        Scenario(room, 0, boot=1, begin_s=4.5, parts=(Part(0.5, 3.5),), outages=((7.0, 7.2),)),
+        Scenario(room, 0, parts=(Part(0.0, seconds),)),
+        Scenario(room, 0, boot=1, begin_s=seconds + 0.5, parts=(Part(0.5, seconds - 0.5),), outages=((7.0, 7.2),)),
     ]
     config = BaseConfig()
     return fly_with_base(scenarios, None, replace(config, map_cache=replace(config.map_cache, **base)))
 
 
 def test_a_new_boot_is_sent_the_old_boots_map_and_is_merged_with_it(data_dir: Path) -> None:
-    flight = flown(data_dir, local_keyframes=2)
+    flight = flown(data_dir, 4.0, local_keyframes=2)
     first, second = flight.agents
     assert (len(first.estimates), len(second.estimates)) == (80, 60)
     world = KeyframesInWorld(flight)
@@ -40,7 +40,7 @@ def test_a_new_boot_is_sent_the_old_boots_map_and_is_merged_with_it(data_dir: Pa
 
 
 def test_nothing_is_sent_where_the_cache_may_hold_nothing(data_dir: Path) -> None:
-    flight = flown(data_dir, max_keyframes=0)
+    flight = flown(data_dir, 2.5, local_keyframes=2, max_keyframes=0)
     assert not flight.station.map_cache_planner.cached(AgentId(0))
     assert flight.agents[1].cached_keyframes == 0
 
