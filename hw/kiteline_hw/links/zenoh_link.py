@@ -162,6 +162,7 @@ class ZenohLink(_PeerLink):
                 self.counters.callback_errors += 1
                 self._closed.wait(0.2)
             close_session(session)
+            self.alive = False  # a last packet may have come in meanwhile
 
     def _serve(self, publisher: zenoh.Publisher) -> None:
         """Send queued packets until the link is closed, or a base that is alive stays silent.
@@ -192,7 +193,7 @@ class ZenohLink(_PeerLink):
 
     def _declare(self, session: zenoh.Session) -> zenoh.Publisher:
         key = f"{self._prefix}/{self._agent}"
-        on_packet = _guarded(self.counters, lambda sample: self.deliver(sample.payload.to_bytes()))
+        on_packet = _guarded(self.counters, self._on_packet)
         on_base = _guarded(self.counters, self.on_liveliness)
         self._declared = [
             session.declare_subscriber(f"{key}/down", on_packet),
@@ -204,6 +205,10 @@ class ZenohLink(_PeerLink):
             session.liveliness().declare_subscriber(f"{self._prefix}/base", on_base, history=True),
         ]
         return _publisher(session, f"{key}/up")
+
+    def _on_packet(self, sample: Any) -> None:
+        self.alive = True  # also where what announces the base was lost
+        self.deliver(sample.payload.to_bytes())
 
     def close(self) -> None:
         """Leave, within 2 s whatever the base does. May be called twice."""

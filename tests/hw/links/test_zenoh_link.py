@@ -66,6 +66,20 @@ def test_a_base_whose_token_was_lost_over_udp_is_found(monkeypatch: pytest.Monke
         wait_for(lambda: hub.links()[3].receive() == [b"up"])
 
 
+def test_a_base_whose_packets_arrive_is_there_though_its_token_was_lost() -> None:
+    class TokenLost(ZenohLink):
+        def on_liveliness(self, sample: Any) -> None:
+            pass
+
+    endpoint = free_endpoint()
+    with ZenohHub(endpoint) as hub, TokenLost(endpoint, 3) as link:
+        wait_for(lambda: hub.alive() == {3})
+        assert not link.connected
+        wait_for(lambda: hub.links()[3].send(b"down") and link.receive())
+        assert link.connected and link.send(b"up")
+        wait_for(lambda: hub.links()[3].receive() == [b"up"])
+
+
 def test_an_agent_that_leaves_is_noticed_and_its_link_stays() -> None:
     endpoint = free_endpoint()
     with ZenohHub(endpoint) as hub:
