@@ -165,6 +165,22 @@ def test_a_batch_that_a_restart_cut_off_is_not_waited_for() -> None:
     assert after.release() is None
 
 
+def test_values_that_a_crash_left_out_of_the_store_hold_up_no_batch() -> None:
+    before, after, holder = (
+        CorrectionBatches(AGENT, PublishConfig()),
+        CorrectionBatches(AGENT, PublishConfig()),
+        Holder(),
+    )
+    saved = before.numbered([pose(1)], 0)
+    holder.take(saved, [])
+    assert not holder.take(before.numbered([pose(2), pose(3)], 0, unfinished=True), [])  # not in the store
+    for record in saved:
+        after.restore(record)
+    assert after.release() is None
+    assert [r.keyframe for r in holder.take(after.numbered([pose(3), pose(4)], 0), [])] == [2, 3, 4]
+    assert len(holder) == 0
+
+
 def replace_batch(record: KeyframePose, batch: int) -> KeyframePose:
     return KeyframePose(record.keyframe, record.T_m_k, batch)
 

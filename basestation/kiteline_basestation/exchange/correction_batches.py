@@ -25,6 +25,7 @@ from kiteline_codec.schema import (
 from kiteline_core.ids import AgentId
 
 MEMBERS = (KeyframePose, RefinedLandmarks, SubmapPlacement, DisparityCalibration)  # what moves the agent's map
+_UNSAVED = 100  # batches that an earlier process may have made after its store was written last; many in 0.25 s
 
 
 class CorrectionBatches:
@@ -105,11 +106,15 @@ class CorrectionBatches:
             self._members[messages.key(record)] = None
 
     def release(self) -> CorrectionBatch | None:
-        """The record that lets the agent wait for no more of a batch that an earlier process did not finish, if any."""
-        if self._closed == self._number:
-            return None
-        self._closed = self._number
-        return CorrectionBatch.of(self._agent, self._number, [])
+        """Number the next batch after `restore`. Returns the record that lets the agent wait for no more of a batch
+        that the earlier process did not finish, if any.
+
+        Numbers are skipped: an agent may hold values of batches that the store lacks, and would wait for ever for a
+        whole batch of the same number.
+        """
+        number, is_cut_off = self._number, self._closed != self._number
+        self._closed = self._number = number + _UNSAVED
+        return CorrectionBatch.of(self._agent, number, []) if is_cut_off else None
 
     @property
     def _key(self) -> Key:
