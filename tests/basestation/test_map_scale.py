@@ -268,7 +268,18 @@ def test_a_bent_loop_stays_closed_and_landmarks_move_with_their_views() -> None:
     assert gaps[1] > 0.08
     assert gaps[0] < 0.002
     even = bent(solved(problem), problem, beside, np.full(13, 1.1), 4)
-    assert np.allclose(even.points, points[4] * 0.0 + T_w_c[4, :3, 3] + 1.1 * (points - T_w_c[4, :3, 3]))
+    assert np.allclose(even.points, T_w_c[4, :3, 3] + 1.1 * (points - T_w_c[4, :3, 3]))
+
+
+def test_a_rejected_observation_moves_no_landmark() -> None:
+    T_w_c = np.tile(np.eye(4), (4, 1, 1))
+    T_w_c[:, 0, 3] = [0.0, 1.0, 2.0, 30.0]
+    problem = a_problem(T_w_c, np.array([[1.0, 0.0, 4.0]]))
+    result = solved(problem)
+    result = replace(result, inlier=problem.camera != 3)
+    growth = np.array([1.0, 1.0, 1.0, 1.05])
+    beside = np.eye(4, k=1) + np.eye(4, k=-1)
+    assert np.abs(bent(result, problem, beside, growth, 0).points - result.points).max() < 1e-3
 
 
 def test_shared_landmarks_are_counted() -> None:

@@ -22,10 +22,12 @@ F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
 _TURN_RAD = 1.0  # rad by which the view has changed: what a usual lens sees
+_CHAIN_VIEWS = 2.0  # from the end of a chain to the begin of the next one, wherever that is
 _RETURN_VIEWS = 2.0  # between two keyframes that share landmarks from which the path has come back
 _LEAST_SHARED = 20.0  # landmarks of two such keyframes
 _LEAST_VIEWS = 0.1  # between two keyframes: no two have exactly the same scale
 _WEAK = 1e-3  # landmarks by which a keyframe is tied to the next one beside those that they share
+_REJECTED = 1e-6  # weight of a rejected observation: a landmark without others has to move, too
 _NEAR_M = 0.01  # m; distance between keyframes below which all of them count alike
 
 
@@ -104,23 +106,24 @@ def bent(result: BundleResult, problem: BundleProblem, shared: F64, growth: F64,
     moved[rest] += np.linalg.solve(laplacian[np.ix_(rest, rest)], rhs[rest])
     T_w_c[:, :3, 3] = place[held] + moved
     point = np.repeat(np.arange(len(problem.points)), np.diff(problem.starts))
-    views = np.maximum(np.bincount(point, minlength=len(result.points)), 1)[:, None]
-    camera = problem.camera
-    seen_from = T_w_c[camera, :3, 3] + growth[camera, None] * (result.points[point] - place[camera])
-    points = np.zeros_like(result.points)
-    np.add.at(points, point, seen_from)
+    camera, believed = problem.camera, np.where(result.inlier, 1.0, _REJECTED)
+    seen = result.points[point] - place[camera]
+    offsets = T_w_c[camera, :3, 3] - place[camera] + (growth[camera, None] - 1.0) * seen
+    moves = np.zeros_like(result.points)
+    np.add.at(moves, point, believed[:, None] * offsets)
+    observed = np.maximum(np.bincount(point, believed, len(moves)), _REJECTED)[:, None]
     T_c_w: F64 = np.linalg.inv(T_w_c).astype(np.float64)
     T_c_w[held] = result.T_c_m[held]
-    return replace(result, T_c_m=T_c_w, points=points / views)
+    return replace(result, T_c_m=T_c_w, points=result.points + moves / observed)
 
 
 def _views(path: Path) -> F64:
     """How often the view has changed (k,) up to each node: by moving as far as what is seen, or by turning."""
-    turned = np.linalg.norm(_turns(path.R_w_b[:-1], path.R_w_b[1:]), axis=1)
-    moved = np.linalg.norm(np.diff(path.camera, axis=0), axis=1)
-    depth_m = np.ones(len(moved))
-    depth_m[path.begin] = path.depth_m
-    return np.concatenate([[0.0], np.cumsum(moved / depth_m + turned / _TURN_RAD)])
+    a, change = path.begin, np.full(len(path.camera) - 1, _CHAIN_VIEWS)
+    turned = np.linalg.norm(_turns(path.R_w_b[a], path.R_w_b[a + 1]), axis=1)
+    moved = np.linalg.norm(path.camera[a + 1] - path.camera[a], axis=1)
+    change[a] = moved / path.depth_m + turned / _TURN_RAD
+    return np.concatenate([[0.0], np.cumsum(change)])
 
 
 def _turns(R: F64, R_next: F64) -> F64:
