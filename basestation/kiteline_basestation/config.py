@@ -250,9 +250,7 @@ class PublishConfig:
     batch_s: float = 2.0  # s that a thin link takes to carry a batch of corrections, about; the next one waits so long
     batch_values: int = 1000  # values of a batch: a loop over a large map moves all its keyframes
     step_values: int = 100  # values of a batch, and as many others, coded in one step, in 15 ms; the next steps go on
-    batch_wait_s: float = (
-        10.0  # s after which nobody listens: no batch is waited for, no tile or cached keyframe planned
-    )
+    batch_wait_s: float = 10.0  # s after which nobody listens: no batch is waited for, nothing planned for the agent
 
 
 @dataclass(frozen=True, slots=True)
