@@ -1,19 +1,26 @@
-"""The bars of the sources themselves: structure, CPU beside an older build, compilation."""
+"""The bars of the sources themselves: structure, CPU beside an older build, compilation, time of the tests."""
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+import time
 from statistics import median
 from typing import Any
 
 from kiteline_agent.runtime.warm import WARMING as agent_modules
 from kiteline_basestation.runtime.warm import WARMING as base_modules
-from kiteline_bench.harness.bars import Bar, Bench, at_most, is_true
+from kiteline_bench.harness.bars import Bar, Bench, at_most, environment, is_true
+from kiteline_bench.reality.cpu import yardstick_ms
 from kiteline_bench.system.compile_time import measure, waiting_s
 from kiteline_bench.system.older_build import REVISION, Build, older_build, todays_build
 from kiteline_bench.system.structure import ROOT, Sources, by_sub_package, circles
 
 _MODULES, _LINES, _ALL_LINES = 14, 400, 38_000  # in a folder, in a file, in all rooms
 _COMPILE_S = 12.0
+_SUITE_S = 300.0  # on two cores
+_TESTS = (("-n", "4", "--dist", "loadfile", "--no-loadscope-reorder", "-m", "not alone"), ("-m", "alone"))
 _ROUNDS = 5
 _CPU_RATIO = 1.02
 
@@ -95,8 +102,37 @@ def _compile(bench: Bench) -> list[Bar]:
     return bars
 
 
+def _suite(bench: Bench) -> list[Bar]:
+    """Time of all tests, with kernels compiled before, as `make test` runs them. Raises RuntimeError if one fails."""
+    bench.warm()
+    begin_s, cpu_s = time.monotonic(), _children_s()
+    for options in _TESTS:
+        bench.say(f"pytest {' '.join(options)}")
+        done = subprocess.run(
+            [sys.executable, "-m", "pytest", "-q", *options], check=False, cwd=ROOT, env=environment(),
+            capture_output=True, text=True,
+        )  # fmt: skip
+        if done.returncode:
+            raise RuntimeError(f"the tests failed: {done.stdout[-600:]}")
+        bench.more.append(f"`-m '{options[-1]}'`: {done.stdout.splitlines()[-1]}.")
+    seconds, cpu_s = time.monotonic() - begin_s, _children_s() - cpu_s
+    unit_ms = median(yardstick_ms(bench.source("room_flight.mcap")))
+    bench.more.append(f"The yardstick of `reality/cpu`, ORB on one core, takes {unit_ms:.1f} ms on this machine.")
+    return [
+        at_most("all tests", seconds, _SUITE_S, "s", 0),
+        at_most("CPU of all tests, on two cores", cpu_s, 2 * _SUITE_S, "s", 0),
+    ]
+
+
+def _children_s() -> float:
+    """CPU time of all child processes that have ended."""
+    times = os.times()
+    return times.children_user + times.children_system
+
+
 PARTS = {
     "structure": ("Sources: structure", _structure),
     "cpu": ("Sources: CPU beside an older build", _cpu),
     "compile": ("Sources: compilation of kernels", _compile),
+    "suite": ("Sources: time of the tests", _suite),
 }
