@@ -23,6 +23,7 @@ from kiteline_core.frame import EncodedImage
 from kiteline_hw.sensors.images import U8, encode_image, store_image
 
 _REQUEST, _ANSWER = struct.Struct("<III"), struct.Struct("<II")
+END_S = 2.0  # s in which the process ends once its input has
 _HEADROOM = 4096  # bytes by which a stored PNG exceeds its pixels and rows
 
 
@@ -120,7 +121,7 @@ class EncoderProcess:
         if self._sent:
             self._give_up()
         try:
-            self._process.wait(2.0)
+            self._process.wait(END_S)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
