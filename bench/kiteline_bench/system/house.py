@@ -54,8 +54,8 @@ def _cpu(bench: Bench) -> list[Bar]:
     """CPU of this build over that of an older one, flown in alternation; also without the scans the older one lacks."""
     older, today = older_build(bench), todays_build(bench)
     for build in (older, today):
-        bench.say("compiling kernels")
-        build.warm()
+        bench.say(f"compiling kernels of {build.root.name}")
+        build.warm(bench.source("room_flight.mcap"), bench.folder.resolve() / "cpu_warm")
     builds: dict[str, tuple[Build, list[str]]] = {
         "older": (older, []), "today": (today, []), "without scans": (today, ["--grid", "off"]),
     }  # fmt: skip

@@ -18,6 +18,7 @@ from kiteline_hw.ports import SourceError
 
 REVISION = "384637ec35adaf05e73532fa9ac33b0a977b2137"  # before the rooms were cut into sub-packages
 _TIMEOUT_S = 900.0
+_ATTEMPTS = 10  # to fly while kernels are compiled
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,10 +39,18 @@ class Build:
         if done.returncode:
             raise RuntimeError(f"{' '.join(arguments[:4])}: {done.stderr[-300:]}")
 
-    def warm(self) -> None:
-        """Compile all kernels: on a slow machine that takes longer than a flight of the older build waits for it."""
+    def warm(self, source: str, out: Path) -> None:
+        """Compile all kernels, then fly until a flight succeeds: the older build gives up while its base compiles.
+
+        Raises RuntimeError if none does.
+        """
         with contextlib.suppress(RuntimeError):  # doctor also judges the machine
             self.run(["-m", "kiteline_cli", "doctor", "--warm"])
+        for _ in range(_ATTEMPTS - 1):
+            with contextlib.suppress(RuntimeError):  # what was compiled is kept
+                self.fly([source], out)
+                return
+        self.fly([source], out)
 
     def fly(self, sources: Sequence[str], out: Path, *options: str) -> dict[str, Any]:
         """Fly as `kiteline fly` does; the report. Raises RuntimeError."""
