@@ -21,8 +21,7 @@ _FALL_SIGMAS = 3.0  # the same in standard deviations of its height
 _FALL_BINS = 2  # before the ray on which a fall is seen: matched blocks carry an edge on by half their rows
 _SOME_FALL = 3  # pixels of a column below the ground, no farther than its end, from which a fall is near
 _STEP_M = 0.06  # by which ground falls within _STEP_OVER_M, beyond a slope of _STEP_SLOPE: a step, no ramp
-_STEP_SLOPE = 0.15
-_STEP_OVER_M = 0.8
+_STEP_SLOPE, _STEP_OVER_M = 0.15, 0.8
 _STEP_PIXELS = 8  # that tell a height on either side of it
 _NOTHING, _WALL, _FALL = 0, 1, 2  # before which ground ends
 _LEAST_BINS = 3  # of disparity over which ground is seen, at least: less is a wall's foot
@@ -106,8 +105,7 @@ def label_points(  # type: ignore[no-untyped-def]
 def _surface(counts, least, lowest):  # type: ignore[no-untyped-def]
     """Bin of the nearest surface in counts (bins,) from bin `lowest` on; -1 if there is none."""
     bins = len(counts)
-    half = int(_PX / BIN_PX)
-    behind = int(_BEHIND_PX / BIN_PX)
+    half, behind = int(_PX / BIN_PX), int(_BEHIND_PX / BIN_PX)
     j = bins - 1
     while j >= lowest:
         n = 0
@@ -230,10 +228,7 @@ def refine_surfaces(left, right, rotation, camera, bf, offset, x, z, column, lab
 
 @njit
 def _mark_falls(grounds, falls, least, fell):  # type: ignore[no-untyped-def]
-    """Mark bins (bins,) in which as many pixels as lie on the ground, and at least so many, lie below it.
-
-    And the bins right before: matched blocks carry an edge on.
-    """
+    """Mark bins (bins,) where as many pixels lie below the ground as on it, `least` or more, and the bins before."""
     bins, total = len(grounds), 0
     for j in range(bins):
         fell[j] = False
