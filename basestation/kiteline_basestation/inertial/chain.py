@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from kiteline_basestation.inertial.ties import moved
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_codec.schema import InertialSteps
 from kiteline_core.geometry import se3
@@ -146,10 +147,7 @@ def told_units(segments: tuple[Segment, ...], T_w_c: F64) -> float:
     """Units of w in a metre by what the agents told: the lengths between keyframes T_w_c (k,4,4) over the told ones."""
     here = told = 0.0
     for s in segments:
-        T = np.eye(4)
-        for turn, moved in zip(s.steps.turn, s.steps.moved, strict=True):
-            T = T @ se3.from_rt(se3.so3_exp(turn), moved)
-        told += s.metre * float(np.linalg.norm((s.T_c_b @ T @ se3.inverse(s.T_c_b))[:3, 3]))
+        told += s.metre * float(np.linalg.norm((s.T_c_b @ moved(s.steps) @ se3.inverse(s.T_c_b))[:3, 3]))
         here += float(np.linalg.norm(T_w_c[s.last, :3, 3] - T_w_c[s.first, :3, 3]))
     return here / told if min(here, told) > 0.0 else 1.0
 
@@ -169,8 +167,8 @@ def _shape(s: Segment, T_w_first: F64, T_w_last: F64) -> tuple[F64, F64]:
     T_b_c = se3.inverse(s.T_c_b)
     T = np.eye(4)
     relative = [np.eye(4)]
-    for turn, moved in zip(s.steps.turn, s.steps.moved, strict=True):
-        T = T @ se3.from_rt(se3.so3_exp(turn), moved)
+    for turn, step in zip(s.steps.turn, s.steps.moved, strict=True):
+        T = T @ se3.from_rt(se3.so3_exp(turn), step)
         relative.append(s.T_c_b @ T @ T_b_c)
     chain = np.array(relative)
     target = se3.inverse(T_w_first) @ T_w_last
