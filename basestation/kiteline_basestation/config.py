@@ -325,10 +325,8 @@ class GridConfig:
     gap_sigmas: float = 3.0  # standard deviations before an obstacle within which ground is not freed
     log_hit: int = 6  # 1/16; log-odds of one near view of an obstacle (p = 0.59); in inverse proportion to the range
     log_free: int = 3  # 1/16; of one near view of free space (p = 0.45): half, as an edge is seen beside itself
-    log_free_sure: int = (
-        2  # 1/16; the same of a far view well before what it sees, and where rays to the ground pass low
-    )
-    log_free_far: int = 1  # 1/16; the same of a far view elsewhere: a far box and the wall behind it are one surface
+    log_free_sure: int = 2  # 1/16; the same of a far view well before what it sees
+    log_free_far: int = 1  # 1/16; of a far view elsewhere (box and wall may be one surface), and before seen ground
     sure_sigmas: float = (
         2.0  # standard deviations beyond gap_sigmas from which on a far view is well before what it sees
     )
