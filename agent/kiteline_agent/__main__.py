@@ -8,14 +8,8 @@ from pathlib import Path
 
 from kiteline_agent.runtime.live import fly_live
 from kiteline_agent.runtime.lockstep import fly_lockstep
-from kiteline_agent.runtime.options import (
-    AgentOptions,
-    options_of,
-    parser,
-    unused_by_filter,
-)
+from kiteline_agent.runtime.options import AgentOptions, check, options_of, parser
 from kiteline_core import config as configuration
-from kiteline_core.ids import MAX_AGENTS
 from kiteline_hw.links.kinds import MAVLINK_FORMS, link_forms
 from kiteline_hw.links.sealing import sealing_of
 from kiteline_hw.ports import LinkError, SourceError
@@ -34,12 +28,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         process.exit_now(
             process.run_child(options.link, partial(fly_lockstep, options), partial(fly_live, options), expected)
         )
-    if not a.source:
-        p.error("a SOURCE is required")
-    if not 0 <= a.agent < MAX_AGENTS:
-        p.error(f"--agent {a.agent}: expected 0 to {MAX_AGENTS - 1}")
-    if unused := unused_by_filter(a):
-        p.error(f"--tracker ekf uses no {' and no '.join(unused)}: leave them out, or fly --tracker map")
+    check(p, a)
     sealing = sealing_of(a.link, "agent", a.agent, a.key, insecure=a.insecure)
     a.key, a.told = sealing.key, sealing.lines
     kept = process.kept_folder(f"agent{a.agent}")

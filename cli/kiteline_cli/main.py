@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import difflib
+import errno
 import importlib
 import os
 import pkgutil
@@ -27,6 +28,16 @@ _IMPORTER = "<frozen importlib._bootstrap>"  # the file of frames that load a mo
 
 # Which extra brings a package that the plain install leaves out.
 EXTRAS = {"gtsam": "base", "websockets": "base", "matplotlib": "lab"}
+
+# What a user can do about an error of the file system, where its own words do not say it.
+_MENDS = {
+    errno.ENOTDIR: "a file stands where a folder is expected; name another place",
+    errno.EISDIR: "expected a file",
+    errno.EACCES: "name another place, or change who may read and write this one",
+    errno.EPERM: "name another place, or change who may read and write this one",
+    errno.EROFS: "name a place on another disk",
+    errno.ENOSPC: "free some, or name a place on another disk",
+}
 
 _EXAMPLES = """\
 examples:
@@ -146,7 +157,8 @@ def explanation(error: Exception) -> str | None:
         extra = EXTRAS[(error.name or "").split(".")[0]]
         return f"{error.name} is not installed; this needs: pip install 'kiteline[{extra}]'"
     if isinstance(error, OSError) and error.filename is not None:
-        return f"{error.filename}: {error.strerror}"
+        mend = _MENDS.get(error.errno or 0)
+        return f"{error.filename}: {error.strerror}" + (f": {mend}" if mend else "")
     return None
 
 

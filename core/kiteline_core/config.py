@@ -5,6 +5,7 @@ The unit and the reason of a value are in the comment beside its default; a tabl
 
 from __future__ import annotations
 
+import difflib
 import json
 import math
 import tomllib
@@ -38,7 +39,9 @@ def apply(config: T, table: Mapping[str, object], path: str = "") -> T:
     changes: dict[str, object] = {}
     for key, value in table.items():
         if key not in known:
-            raise ConfigError(f"unknown key {key!r} in {_section(path)}; known are: {', '.join(sorted(known))}")
+            near = difflib.get_close_matches(key, known, 1)
+            hint = f"did you mean {f'{path}.{near[0]}'.strip('.')}? " if near else ""
+            raise ConfigError(f"unknown key {key!r} in {_section(path)}; {hint}known are: {', '.join(sorted(known))}")
         old = getattr(config, key)
         inner = f"{path}.{key}" if path else key
         if is_dataclass(old):

@@ -21,3 +21,17 @@ def test_what_the_filter_has_no_use_for_is_refused(given: list[str], capsys: pyt
     with pytest.raises(SystemExit, match="2"):
         main(["nothing", "--tracker", "ekf", *given])
     assert f"--tracker ekf uses no {' '.join(given).removesuffix(' controller')}" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        (["--cpu", "-5"], "--cpu -5.0: expected 0"),
+        (["--up-bytes", "-1"], "--up-bytes -1: expected 0"),
+        (["--obstacles"], "expected --mavlink URL"),
+    ],
+)
+def test_what_has_no_meaning_is_refused(given: list[str], words: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main(["nothing", *given])
+    assert words in capsys.readouterr().err

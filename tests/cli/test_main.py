@@ -67,6 +67,8 @@ def test_arguments_after_the_command_are_handed_on_untouched(monkeypatch: pytest
     [
         (CalibrationError("baseline is 0 m:\n expected more"), "baseline is 0 m: expected more"),
         (FileNotFoundError(2, "No such file or directory", "gone.tum"), "gone.tum: No such file or directory"),
+        (NotADirectoryError(20, "Not a directory", "out.txt/base"), "a file stands where a folder is expected"),
+        (PermissionError(13, "Permission denied", "/root/out"), "name another place"),
         (ModuleNotFoundError("No module named 'matplotlib'", name="matplotlib.figure"), "pip install 'kiteline[lab]'"),
     ],
 )

@@ -59,6 +59,7 @@ def test_unknown_key_names_key_section_and_what_is_known() -> None:
     with pytest.raises(ConfigError) as caught:
         apply(Config(), {"inner": {"tracker": {"point": 3}}})
     text = str(caught.value)
+    assert "did you mean inner.tracker.points?" in text
     assert "'point'" in text
     assert "[inner.tracker]" in text
     assert "points, sigma_px" in text

@@ -80,6 +80,14 @@ def test_a_wrong_word_ends_with_usage(words: list[str], capsys: pytest.CaptureFi
     assert "usage" in capsys.readouterr().err
 
 
+def test_a_file_is_no_folder_for_a_flight(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    taken = tmp_path / "taken.txt"
+    taken.touch()
+    with pytest.raises(SystemExit, match="2"):
+        options(["a.mcap", "--out", str(taken)])
+    assert "name a folder" in capsys.readouterr().err
+
+
 def test_clearing_takes_only_what_a_flight_leaves(tmp_path: Path) -> None:
     for name in ("agent0/live.tum", "agent1/log.mcap", "base/agent0.tum", "base/map.ply", "report.json", "notes.txt",
                  "agent0/mine.txt", "base/mine.ply"):  # fmt: skip

@@ -114,14 +114,6 @@ def is_filter(config: str, tracker: str) -> bool:
     return agent_config(config, tracker=tracker).tracker == "ekf"
 
 
-def unused_by_filter(a: argparse.Namespace) -> list[str]:
-    """Arguments that the Kalman filter has no use for: it makes no scans and reads no IMU. Raises ConfigError."""
-    if not is_filter(a.config, a.tracker):
-        return []
-    given = {"--obstacles": a.obstacles, "--imu": bool(a.imu), "--grid base": a.grid == "base"}
-    return [name for name, is_given in given.items() if is_given]
-
-
 def channel_for(options: AgentOptions, link: LinkTraits, spill: Spill | None = None) -> RecordChannel:
     """The agent's end of the codec, or a channel to nowhere without a base.
 
@@ -146,11 +138,39 @@ def parser(forms: str = "") -> argparse.ArgumentParser:
         description="The onboard half: tracks a camera, sends poses to a flight controller and thin diffs to a base.",
         epilog=forms,
     )
+    p.set_defaults(told=())
     p.add_argument("source", metavar="SOURCE", nargs="?")
-    p.add_argument("--link", metavar="LINK", default="none", help="the way to the base (default: none)")
-    p.add_argument(
-        "--agent", metavar="N", type=int, default=0, help=f"number of this agent in its group, 0 to {MAX_AGENTS - 1}"
-    )
+    _add_tracking(p)
+    _add_link(p.add_argument_group("link to the base"))
+    _add_controller(p.add_argument_group("flight controller"))
+    p.add_argument("--spec", metavar="JSON", default="", help=argparse.SUPPRESS)
+    return p
+
+
+def check(p: argparse.ArgumentParser, a: argparse.Namespace) -> None:
+    """End the program with a usage line where an argument has no meaning, or none beside the others."""
+    if not a.source:
+        p.error("a SOURCE is required")
+    if not 0 <= a.agent < MAX_AGENTS:
+        p.error(f"--agent {a.agent}: expected 0 to {MAX_AGENTS - 1}")
+    for name in ("--cpu", "--up-bytes", "--log-mib"):
+        if (value := getattr(a, name[2:].replace("-", "_"))) < 0:
+            p.error(f"{name} {value}: expected 0 (no limit) or more")
+    if unused := _unused_by_filter(a):
+        p.error(f"--tracker ekf uses no {' and no '.join(unused)}: leave them out, or fly --tracker map")
+    if a.obstacles and not a.mavlink:
+        p.error("--obstacles tells a flight controller: expected --mavlink URL beside it")
+
+
+def _unused_by_filter(a: argparse.Namespace) -> list[str]:
+    """Arguments that the Kalman filter has no use for: it makes no scans and reads no IMU. Raises ConfigError."""
+    if not is_filter(a.config, a.tracker):
+        return []
+    given = {"--obstacles": a.obstacles, "--imu": bool(a.imu), "--grid base": a.grid == "base"}
+    return [name for name, is_given in given.items() if is_given]
+
+
+def _add_tracking(p: argparse.ArgumentParser) -> None:
     p.add_argument("--config", metavar="F", default="", help="a TOML file with an [agent] section")
     p.add_argument(
         "--rig", metavar="FILE", default="",
@@ -160,6 +180,43 @@ def parser(forms: str = "") -> argparse.ArgumentParser:
         "--calibration", metavar="FILE[,FILE]", default="",
         help="cameras, extrinsics and IMU noise in place of the source's: kiteline, Kalibr, EuRoC, ROS or OpenCV YAML",
     )  # fmt: skip
+    p.add_argument("--mono", action="store_true", help="the left camera alone")
+    p.add_argument("--no-imu", action="store_true", help="without inertial samples")
+    p.add_argument(
+        "--tracker", choices=TRACKERS, default="",
+        help="map (default), or ekf: a Kalman filter over pose and landmarks, for one camera with odometry and hardly "
+        "any CPU; it makes no scans and reads no IMU",
+    )  # fmt: skip
+    p.add_argument(
+        "--grid", choices=GRIDS, default="agent",
+        help="who looks for ground and obstacles: the agent, where CPU time is left (default); the base, in images of "
+        "some 25 kB that a wide link carries (else the agent; obstacles for a flight controller then come from the "
+        "base's grid); or nobody",
+    )  # fmt: skip
+    p.add_argument(
+        "--cpu", metavar="PERCENT", type=float, default=0.0, help="limit to so much of one core (default: no limit)"
+    )
+    p.add_argument("--log", metavar="DIR", default="", help="log each start to DIR/agentN/bootNNNNN.mcap, …_1.mcap")
+    p.add_argument(
+        "--log-mib", metavar="N", type=int, default=LOG_MIB,
+        help="MiB that the logs of all starts may take: the oldest are deleted, also in flight (default: %(default)s; "
+        "0: no limit)",
+    )  # fmt: skip
+
+
+def _add_link(p: argparse._ArgumentGroup) -> None:
+    p.add_argument("--link", metavar="LINK", default="none", help="the way to the base (default: none)")
+    p.add_argument(
+        "--agent", metavar="N", type=int, default=0, help=f"number of this agent in its group, 0 to {MAX_AGENTS - 1}"
+    )
+    p.add_argument("--up-bytes", metavar="N", type=int, default=0, help="B/s that may be sent, headers included")
+    p.add_argument("--profile", choices=("wifi", "radio"), default="", help="default: as the link allows")
+    p.add_argument("--key", metavar="FILE", default="", help="seal packets; take none but sealed ones "
+                   "(default: the file of `kiteline keys pair`)")  # fmt: skip
+    p.add_argument("--insecure", action="store_true", help="use the link without seals")
+
+
+def _add_controller(p: argparse._ArgumentGroup) -> None:
     p.add_argument("--mavlink", metavar="URL", default="", help="send poses to a flight controller")
     p.add_argument(
         "--odometry", metavar="WHAT", default="",
@@ -191,32 +248,4 @@ def parser(forms: str = "") -> argparse.ArgumentParser:
         "--obstacles", action="store_true",
         help="send distances to obstacles around the vehicle (OBSTACLE_DISTANCE)",
     )  # fmt: skip
-    p.add_argument(
-        "--grid", choices=GRIDS, default="agent",
-        help="who looks for ground and obstacles: the agent, where CPU time is left (default); the base, in images of "
-        "some 25 kB that a wide link carries (else the agent; obstacles for a flight controller then come from the "
-        "base's grid); or nobody",
-    )  # fmt: skip
-    p.add_argument(
-        "--tracker", choices=TRACKERS, default="",
-        help="map (default), or ekf: a Kalman filter over pose and landmarks, for one camera with odometry and hardly "
-        "any CPU; it makes no scans and reads no IMU",
-    )  # fmt: skip
     p.add_argument("--mavlink-key", metavar="FILE", default="", help="sign MAVLink messages, and take none unsigned")
-    p.add_argument("--log", metavar="DIR", default="", help="log each start to DIR/agentN/bootNNNNN.mcap, …_1.mcap")
-    p.add_argument(
-        "--log-mib", metavar="N", type=int, default=LOG_MIB,
-        help="MiB that the logs of all starts may take: the oldest are deleted, also in flight (default: %(default)s; "
-        "0: no limit)",
-    )  # fmt: skip
-    p.add_argument("--cpu", metavar="PERCENT", type=float, default=0.0, help="limit to so much of one core")
-    p.add_argument("--up-bytes", metavar="N", type=int, default=0, help="B/s that may be sent, headers included")
-    p.add_argument("--key", metavar="FILE", default="", help="seal packets; take none but sealed ones "
-                   "(default: the file of `kiteline keys pair`)")  # fmt: skip
-    p.set_defaults(told=())
-    p.add_argument("--insecure", action="store_true", help="use the link without seals")
-    p.add_argument("--profile", choices=("wifi", "radio"), default="", help="default: as the link allows")
-    p.add_argument("--mono", action="store_true", help="the left camera alone")
-    p.add_argument("--no-imu", action="store_true", help="without inertial samples")
-    p.add_argument("--spec", metavar="JSON", default="", help=argparse.SUPPRESS)
-    return p

@@ -21,7 +21,14 @@ from kiteline_core.ids import MAX_AGENTS
 from kiteline_hw.links.ends import LinkOptions
 from kiteline_hw.links.queued_link import INBOX_BYTES, MOST_PACKET_BYTES, LinkCounters, QueuedLink
 from kiteline_hw.links.zenoh_access import Instances, access_of_base
-from kiteline_hw.links.zenoh_session import close_session, direct, no_stop_at_exit, open_session, stop_at_exit
+from kiteline_hw.links.zenoh_session import (
+    check_port,
+    close_session,
+    direct,
+    no_stop_at_exit,
+    open_session,
+    stop_at_exit,
+)
 from kiteline_hw.ports import ByteLink, LinkError
 from kiteline_hw.system.closing import Closing
 
@@ -324,10 +331,12 @@ class ZenohHub(Closing):
 
 
 def open_agent_end(address: str, options: LinkOptions) -> ZenohLink:
-    """Connect to the base at an endpoint, in the background."""
+    """Connect to the base at an endpoint, in the background. Raises LinkError for one without a port."""
+    check_port(address)
     return ZenohLink(address, options.agent, group=options.group, logins=options.logins)
 
 
 def open_base_end(address: str, options: LinkOptions) -> ZenohHub:
     """Listen on an endpoint. Raises LinkError."""
+    check_port(address)
     return ZenohHub(address, group=options.group, logins=options.logins)

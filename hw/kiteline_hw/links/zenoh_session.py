@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import re
 import tempfile
 import threading
 import time
@@ -28,8 +29,16 @@ _EXIT_TIMEOUT_S = 6.0  # s for sessions that are closed at the end of the proces
 CONNECT_TIMEOUT_MS = 4000  # ms of one attempt to connect: two round trips with 900 ms of delay each way
 _RETRY_S = 0.1  # s between two attempts to connect
 _ROUTER = "router/"  # before a locator: a Zenoh router listens there, and both sides connect
+_WITHOUT_PORT = re.compile(r"(?P<host>(tcp|udp|tls|quic|ws)/(\[[^]]*\]|[^:?#]*)):?([?#].*)?")
 
 Role = Literal["client", "base"]
+
+
+def check_port(endpoint: str) -> None:
+    """Raise LinkError for an endpoint of an IP protocol without a port, which Zenoh tries in vain without a word."""
+    found = _WITHOUT_PORT.fullmatch(endpoint.removeprefix(_ROUTER))
+    if found is not None:
+        raise LinkError(f"{endpoint!r} has no port: write {found['host']}:7447, or the port at which the base listens")
 
 
 def session_config(

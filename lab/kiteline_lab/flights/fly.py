@@ -50,7 +50,7 @@ def parser() -> argparse.ArgumentParser:
         metavar="PERCENT",
         type=float,
         default=0.0,
-        help="of one core: for each agent, or for all together with --mode local or monolith",
+        help="of one core: for each agent, or for all together with --mode local or monolith; default: all there is",
     )
     p.add_argument("--mono", action="store_true", help="the left camera alone")
     p.add_argument("--no-imu", action="store_true", help="without inertial samples")
@@ -67,7 +67,9 @@ def parser() -> argparse.ArgumentParser:
                    help="map (default), or ekf: a Kalman filter for one camera with odometry and hardly any CPU; it "
                    "makes no scans and reads no IMU")  # fmt: skip
     p.add_argument("--seed", metavar="N", type=int, default=0, help="of the link model")
-    p.add_argument("--seconds", metavar="S", type=float, default=0.0, help="fly only so much of the source")
+    p.add_argument(
+        "--seconds", metavar="S", type=float, default=0.0, help="fly only so much of the source; default: all"
+    )
     p.add_argument("--store", metavar="DIR", default="", help="the base keeps its map here, and goes on from it")
     for hook in ("--kill-base-at", "--restart-base-at", "--kill-agent-at"):
         p.add_argument(hook, metavar="S", type=float, help=argparse.SUPPRESS)
@@ -90,6 +92,8 @@ def options(argv: list[str]) -> Options:
         p.error("--rig is the file of one rig: it goes with one SOURCE")
     if a.cpu < 0.0 or a.seconds < 0.0:
         p.error("--cpu and --seconds must not be negative")
+    if a.out.exists() and not a.out.is_dir():
+        p.error(f"--out {a.out} is a file: name a folder")
     return Options(
         tuple(a.sources), a.out, a.mode, a.link, a.profile, a.link_delay, up, down, a.link_loss, a.cpu, a.mono,
         not a.no_imu, a.realtime,

@@ -72,7 +72,7 @@ def steps(log: LogReader) -> Iterator[Step]:
 def check_replayable(log: LogReader, role: str) -> None:
     """Raise SourceError unless this is the log of an agent or a base ("role") whose packets are in it."""
     if log.metadata.get("role") != role:
-        raise SourceError(f"no log of an {role}: a recording is flown with `kiteline fly`, not replayed")
+        raise SourceError("no log of an agent or a base: a recording is flown with `kiteline fly`, not replayed")
     if log.metadata.get("channel") == "PlainChannel":
         raise SourceError("this is a monolith's log: its agent and base exchanged no packets, so they are not in it")
     if part := log.metadata.get("part"):

@@ -67,7 +67,8 @@ def check(text: str) -> list[Problem]:
         try:
             in_range(apply(ROOTS[root], _nested(rest, value) if rest else value, root), ROOTS[root], root)
         except ConfigError as error:
-            problems.append(Problem(_line_of(text, name), f"{error}{'' if name in known else _near(name)}"))
+            hint = "" if name in known or "did you mean" in str(error) else _near(name)
+            problems.append(Problem(_line_of(text, name), f"{error}{hint}"))
     return problems
 
 
@@ -90,7 +91,8 @@ def _explain(name: str) -> int:
     by_section = [o for o in options.values() if o.section == name or o.section.endswith(f".{name}")]
     found = exact or by_section or [o for n, o in options.items() if name in n]
     if not found:
-        print(f"kiteline config: no option is called {name!r}{_near(name)}", file=sys.stderr)
+        hint = _near(name) or "; `kiteline config` prints all"
+        print(f"kiteline config: no option is called {name!r}{hint}", file=sys.stderr)
         return 2
     purposes = {s.name: s.purpose for s in sections()}
     for i, o in enumerate(found):

@@ -72,6 +72,7 @@ def test_none() -> None:
         ("none:x", "unknown link"),
         ("carrier-pigeon:7", "unknown link 'carrier-pigeon:7'"),
         ("mavlink:pigeon:1", "expected udp:HOST:PORT"),
+        ("zenoh:tcp/127.0.0.1", "has no port: write tcp/127.0.0.1:7447"),
         ("serial:/dev/ttyNONE", "expected DEVICE:BAUD"),
         ("serial:/dev/ttyNONE:57600", "cannot open serial port /dev/ttyNONE"),
     ],
