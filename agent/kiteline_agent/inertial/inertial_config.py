@@ -12,7 +12,7 @@ from kiteline_agent.inertial.fixed_lag import FixedLagConfig
 class ScaleFilterConfig:
     """How the scale of a monocular map is watched after its start."""
 
-    interval_s: float = 0.39  # between two compared poses, and of inertial steps: it accelerates more than images err
+    interval_s: float = 0.39  # between two compared poses, and of inertial steps: velocity changes more than images err
     start_scale: float = 0.022  # relative deviation of the start's scale: that of a first window, as those below
     start_gravity_m_s2: float = 0.1  # deviation of gravity at the start
     start_velocity_m_s: float = 0.1  # deviation of the velocity at the start
