@@ -21,10 +21,10 @@ IN_CI = os.environ.get("CI", "").lower() in ("1", "true")
 
 gc.disable()  # until all tests are collected: nearly all that is made till then stays
 cv2.setNumThreads(1)
-settings.register_profile("default", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.register_profile(
-    "ci", parent=settings.get_profile("default"), derandomize=True, database=None, max_examples=40
+    "default", deadline=None, suppress_health_check=[HealthCheck.too_slow], max_examples=40
 )  # `kiteline bench fuzz` makes the long runs
+settings.register_profile("ci", parent=settings.get_profile("default"), derandomize=True, database=None)
 settings.load_profile("ci" if IN_CI else "default")
 
 

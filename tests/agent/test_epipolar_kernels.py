@@ -86,7 +86,7 @@ def test_scores_are_those_of_plain_numpy() -> None:
     b[90:150, 70:190] = a[90:150, 70:190]
     uv = np.array([[100.0, 110.0], [150.0, 130.0]])
     start, end = uv - [7.0, 0.0], uv + [7.0, 0.0]
-    out, found = search((a,), (b,), uv, start, end)
+    out, found = search(build_pyramid(a, 4), build_pyramid(b, 4), uv, start, end)
     assert (found == 1).all()
     for i in range(len(uv)):
         x0, y0 = uv[i].astype(int)

@@ -19,6 +19,7 @@ from kiteline_core.geometry.cameras import CameraModel, CameraRig, Lens, Rectifi
 
 U8 = NDArray[np.uint8]
 NO_GRID = np.zeros((0, 0, 2), np.float32)
+LEVELS = 4  # as in flights: kernels are compiled for each number of levels
 WIDTH, HEIGHT, FOCAL, DEPTH_M = 640, 400, 420.0, 3.0
 T_C_R = se3.from_rt(np.eye(3), np.array([0.11, 0.0, 0.0]))
 TURNED = np.array([2.5e-3, -1e-3, 1.5e-3])  # rad: pitch, yaw and roll of the right camera
@@ -65,13 +66,12 @@ def flight(lens: Lens, turned: NDArray[np.float64]) -> tuple[Rectifier, U8, U8]:
 
 def measured(rectifier: Rectifier, left: U8, right: U8) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Row offsets of UV."""
-    pyramid = build_pyramid(rectifier.left(left), 3)
+    eyes = [build_pyramid(eye, LEVELS) for eye in (rectifier.left(left), right)]
     grid = NO_GRID if rectifier.right_grid is None else rectifier.right_grid
     disparity = np.full(len(UV), rectifier.camera.bf / DEPTH_M)
     offset, found = np.zeros(len(UV)), np.zeros(len(UV), np.bool_)
-    row_kernels.measure_rows(
-        pyramid, build_pyramid(right, 3), grid, UV, np.zeros(len(UV), np.uint8), disparity, 10, 3.5, 0.9, offset, found
-    )
+    octave = np.zeros(len(UV), np.uint8)
+    row_kernels.measure_rows(eyes[0], eyes[1], grid, UV, octave, disparity, 10, 3.5, 0.9, offset, found)
     return offset, found
 
 
@@ -100,7 +100,11 @@ def test_a_turned_right_camera_is_read_at_its_rows(lens: Lens) -> None:
     rows = RowAlignment(rectifier, RowConfig())
     disparity = np.full(len(UV), rectifier.camera.bf / DEPTH_M)
     rows.add(
-        build_pyramid(rectifier.left(left), 3), build_pyramid(right, 3), UV, np.zeros(len(UV), np.uint8), disparity
+        build_pyramid(rectifier.left(left), LEVELS),
+        build_pyramid(right, LEVELS),
+        UV,
+        np.zeros(len(UV), np.uint8),
+        disparity,
     )
     assert rows.apply() > 0.5
     assert len(rows.take_events()) == 1
@@ -117,7 +121,7 @@ def test_a_true_rig_is_left_alone(lens: Lens) -> None:
     grid = rectifier.right_grid
     rows = RowAlignment(rectifier, RowConfig())
     disparity = np.full(len(UV), rectifier.camera.bf / DEPTH_M)
-    pyramids = build_pyramid(rectifier.left(left), 3), build_pyramid(right, 3)
+    pyramids = build_pyramid(rectifier.left(left), LEVELS), build_pyramid(right, LEVELS)
     rows.add(*pyramids, UV, np.zeros(len(UV), np.uint8), disparity)
     assert rows.apply() == 0.0
     assert rectifier.right_grid is grid
@@ -137,7 +141,7 @@ def test_rows_tell_whether_a_rig_is_worn(lens: Lens, turned: NDArray[np.float64]
     rows = RowAlignment(rectifier, RowConfig())
     assert rows.worn_evidence == 0.0
     disparity = np.full(len(UV), rectifier.camera.bf / DEPTH_M)
-    pyramids = build_pyramid(rectifier.left(left), 3), build_pyramid(right, 3)
+    pyramids = build_pyramid(rectifier.left(left), LEVELS), build_pyramid(right, LEVELS)
     rows.add(*pyramids, UV, np.zeros(len(UV), np.uint8), disparity)
     assert least < rows.worn_evidence < most
     assert rows.roll_px is not None
@@ -154,12 +158,12 @@ def test_offsets_of_few_points_or_without_texture_count_for_nothing() -> None:
     few = UV[:20]
     disparity = np.full(len(few), rectifier.camera.bf / DEPTH_M)
     octave = np.zeros(len(UV), np.uint8)
-    rows.add(build_pyramid(left, 3), build_pyramid(right, 3), few, octave[:20], disparity)
-    grey = build_pyramid(np.full_like(left, 90), 3)
+    rows.add(build_pyramid(left, LEVELS), build_pyramid(right, LEVELS), few, octave[:20], disparity)
+    grey = build_pyramid(np.full_like(left, 90), LEVELS)
     rows.add(grey, grey, UV, octave, np.full(len(UV), 10.0))
     assert rows.apply() == 0.0
     off = RowAlignment(rectifier, replace(RowConfig(), on=False))
-    off.add(build_pyramid(left, 3), build_pyramid(right, 3), UV, octave, np.full(len(UV), 15.0))
+    off.add(build_pyramid(left, LEVELS), build_pyramid(right, LEVELS), UV, octave, np.full(len(UV), 15.0))
     assert off.apply() == 0.0
 
 
@@ -184,7 +188,7 @@ def test_terms_describe_small_rotations() -> None:
 
 def test_the_next_flight_begins_with_the_rows_and_measures_on() -> None:
     rectifier, left, right = flight(Lens.RADTAN, TURNED)
-    pyramids = build_pyramid(rectifier.left(left), 3), build_pyramid(right, 3)
+    pyramids = build_pyramid(rectifier.left(left), LEVELS), build_pyramid(right, LEVELS)
     octave, disparity = np.zeros(len(UV), np.uint8), np.full(len(UV), rectifier.camera.bf / DEPTH_M)
     first = RowAlignment(rectifier, RowConfig())
     assert not first.known

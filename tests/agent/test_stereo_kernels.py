@@ -13,6 +13,7 @@ from kiteline_core.geometry.se3 import from_rt, so3_exp
 
 RADIUS = stereo_kernels.RADIUS
 RECTIFIED = np.zeros((0, 0, 2), np.float32)
+LEVELS = 4  # as in flights: kernels are compiled for each number of levels
 
 
 def pair(
@@ -36,7 +37,7 @@ SURE = np.zeros(len(UV), np.bool_)
 
 def test_search_then_refinement_recover_the_disparity() -> None:
     for disparity in (3.3, 17.62, 41.5):
-        left, right = (build_pyramid(i, 3) for i in pair(5, disparity))
+        left, right = (build_pyramid(i, LEVELS) for i in pair(5, disparity))
         octave = (np.arange(len(UV)) % 2).astype(np.uint8)
         found_px, found = np.empty(len(UV)), np.zeros(len(UV), np.bool_)
         stereo_kernels.search_rows(left, right, UV, octave, 80.0, 1.15, found_px)
@@ -59,7 +60,7 @@ def reference_search(left: NDArray[np.uint8], right: NDArray[np.uint8], x: int, 
 
 
 def test_search_is_the_plain_search() -> None:
-    left, right = (build_pyramid(i, 3) for i in pair(6, 21.0))
+    left, right = (build_pyramid(i, LEVELS) for i in pair(6, 21.0))
     out = np.empty(len(UV))
     stereo_kernels.search_rows(left, right, UV, np.zeros(len(UV), np.uint8), 80.0, 1.0, out)
     assert (out >= 0).mean() > 0.9
@@ -70,7 +71,7 @@ def test_search_is_the_plain_search() -> None:
 
 def test_repetition_is_not_trusted() -> None:
     stripes = np.tile(((np.arange(320) // 8 % 2) * 120 + 60).astype(np.uint8), (200, 1))
-    pyramid = build_pyramid(stripes, 3)
+    pyramid = build_pyramid(stripes, LEVELS)
     out = np.empty(len(UV))
     stereo_kernels.search_rows(pyramid, pyramid, UV, np.zeros(len(UV), np.uint8), 80.0, 1.15, out)
     assert (out < 0).all()
@@ -81,9 +82,8 @@ def test_unrelated_rows_are_not_refined() -> None:
     _, right = pair(8, 10.0)
     guess, found = np.full(len(UV), 10.0), np.zeros(len(UV), np.bool_)
     stereo_kernels.refine_rows(
-        build_pyramid(left, 3), RECTIFIED, build_pyramid(right, 3), RECTIFIED, UV, np.zeros(len(UV), np.uint8), SURE, 6,
-        3.0, 0.85,
-        guess, found,
+        build_pyramid(left, LEVELS), RECTIFIED, build_pyramid(right, LEVELS), RECTIFIED, UV,
+        np.zeros(len(UV), np.uint8), SURE, 6, 3.0, 0.85, guess, found,
     )  # fmt: skip
     assert found.mean() < 0.05
 
@@ -94,12 +94,12 @@ def test_strips_of_the_raw_image_say_what_the_rectified_one_says() -> None:
     rectifier = Rectifier(rig)
     assert rectifier.right_grid is not None
     raw_left, raw_right = pair(9, 12.4)
-    left = build_pyramid(rectifier.left(raw_left), 3)
+    left = build_pyramid(rectifier.left(raw_left), LEVELS)
     octave = (np.arange(len(UV)) % 2).astype(np.uint8)
     results = []
     for right, grid in (
-        (build_pyramid(rectifier.right(raw_right), 3), RECTIFIED),
-        (build_pyramid(raw_right, 3), rectifier.right_grid),
+        (build_pyramid(rectifier.right(raw_right), LEVELS), RECTIFIED),
+        (build_pyramid(raw_right, LEVELS), rectifier.right_grid),
     ):
         guess, found = np.full(len(UV), 12.0), np.zeros(len(UV), np.bool_)
         stereo_kernels.refine_rows(left, RECTIFIED, right, grid, UV, octave, SURE, 6, 3.0, 0.8, guess, found)
@@ -117,9 +117,9 @@ def test_a_raw_left_image_says_what_the_rectified_one_says() -> None:
     rectifier = Rectifier(rig)
     assert rectifier.left_grid is not None
     raw_left, raw_right = pair(9, 12.4)
-    whole, right = (build_pyramid(i, 3) for i in (rectifier.left(raw_left), rectifier.right(raw_right)))
+    whole, right = (build_pyramid(i, LEVELS) for i in (rectifier.left(raw_left), rectifier.right(raw_right)))
     octave, results = np.zeros(len(UV), np.uint8), []
-    for left, grid in ((whole, RECTIFIED), (build_pyramid(raw_left, 3), rectifier.left_grid)):
+    for left, grid in ((whole, RECTIFIED), (build_pyramid(raw_left, LEVELS), rectifier.left_grid)):
         guess, found = np.full(len(UV), 12.0), np.zeros(len(UV), np.bool_)
         stereo_kernels.refine_rows(left, grid, right, RECTIFIED, UV, octave, SURE, 6, 3.0, 0.8, guess, found)
         results.append((guess, found))

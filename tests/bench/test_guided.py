@@ -3,22 +3,28 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from kiteline_agent.config import AgentConfig, KnownRigConfig
+from kiteline_agent.inertial.calibration.known_imu import KnownImuConfig
 from kiteline_agent.runtime import rig_file
+from kiteline_agent.runtime.options import AgentOptions
 from kiteline_bench.vehicle import guided
 from kiteline_core.geometry import se3
 from kiteline_hw.calibration import own
 from kiteline_hw.calibration.told import ToldCalibration
 from kiteline_hw.ports import SourceError
 from kiteline_hw.sources.open import open_source
-from kiteline_lab.calibration import calibrate
+from kiteline_lab.calibration import calibrate, imu
 from kiteline_lab.calibration.imu import NoImu
-from kiteline_lab.calibration.imu_guide import rotation_deg
+from kiteline_lab.calibration.imu_guide import ImuProgress, rotation_deg
 
+Look = tuple[ImuProgress, KnownRigConfig | None]
 TURNS = ((0.2, 2.4, 0, 0.3, 0.9), (2.4, 4.6, 1, 0.3, 0.9), (4.6, 6.8, 2, 0.5, 0.9))
 
 
@@ -29,8 +35,17 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_camera_that_was_mounted_by_a_ruler_is_found_by_turns(
-    flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    looks: list[Look] = []
+    follow = imu.follow
+
+    def noted(options: AgentOptions, config: AgentConfig) -> Iterator[Look]:
+        for look in follow(options, config):
+            looks.append(look)
+            yield look
+
+    monkeypatch.setattr(imu, "follow", noted)
     source = open_source(str(flight))
     assert source.rig.right is not None and source.rig.T_c_r is not None
     T_b_c = source.rig.T_b_c.copy()
@@ -54,8 +69,18 @@ def test_a_camera_that_was_mounted_by_a_ruler_is_found_by_turns(
     assert rotation_deg(gyro) == pytest.approx(rotation_deg(wanted), abs=0.5)
     assert np.sqrt(np.mean(((gyro - wanted).ravel() / np.array(known.gyro_sigma)) ** 2)) < 4.0
 
-    assert calibrate.main(command) == 0  # again: it begins without the IMU of the file
+    begun: list[AgentConfig] = []
+
+    def again(_: AgentOptions, config: AgentConfig) -> Iterator[Look]:
+        begun.append(config)
+        yield from looks
+
+    monkeypatch.setattr(imu, "follow", again)
+    assert calibrate.main(command) == 0
     assert "usable" in capsys.readouterr().out and rig_file.load(str(rig)).imu == known
+    (config,) = begun
+    assert config.known_rig.imu == KnownImuConfig()  # it begins without the IMU of the file
+    assert config.known_rig == replace(rig_file.load(str(rig)), imu=KnownImuConfig())  # and with all else of it
 
 
 def test_a_recording_without_an_imu_is_refused(recording: Path, tmp_path: Path) -> None:

@@ -10,11 +10,13 @@ of the arithmetic. The results are the same on every machine, as no library's or
 from __future__ import annotations
 
 import math
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 F64 = NDArray[np.float64]
+_Number = TypeVar("_Number", float, F64)
 
 _SMALL_RAD = 1e-7  # below this angle the series is exact to double precision
 
@@ -158,16 +160,44 @@ def quaternion_numbers(r: F64) -> tuple[float, float, float, float]:
 
 def rotation_from_quaternion(q: F64) -> F64:
     """Rotation matrix (3,3) of a quaternion [w, x, y, z]; it is normalised first."""
-    w, x, y, z = q / np.sqrt(q @ q)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    w, x, y, z = (q / np.sqrt(q @ q)).tolist()
+    return np.array(_rotation_numbers(w, x, y, z)).reshape(3, 3)
+
+
+def _rotation_numbers(w: _Number, x: _Number, y: _Number, z: _Number) -> tuple[_Number, ...]:
+    """Rows of the rotation matrix of a unit quaternion, one after the other."""
+    return (
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    )  # fmt: skip
 
 
 def from_quaternion(q: F64, t: F64) -> F64:
     """T (4,4) of a quaternion [w, x, y, z] and a translation (3,) in metres."""
     return from_rt(rotation_from_quaternion(q), t)
+
+
+def from_quaternions(q: F64, t: F64) -> F64:
+    """`from_quaternion` of many: T (n,4,4) of quaternions (n,4) and translations (n,3), to the same bits."""
+    lengths = np.sqrt([one @ one for one in np.ascontiguousarray(q)])
+    out = np.tile(np.eye(4), (len(q), 1, 1))
+    out[:, :3, :3] = np.stack(_rotation_numbers(*(q / lengths[:, None]).T), 1).reshape(-1, 3, 3)
+    out[:, :3, 3] = t
+    return out
+
+
+def quaternions_from_rotations(r: F64) -> F64:
+    """`quaternion_from_rotation` of many: (n,4) of rotation matrices (n,3,3), to the same bits."""
+    (a, b, c), (d, e, f), (g, h, k) = np.moveaxis(r, 0, 2)
+    trace = a + e + k
+    x_first, y_first, z_first = 1.0 + a - e - k, 1.0 - a + e - k, 1.0 - a - e + k
+    largest = np.argmax([trace, a, e, k], axis=0)
+    cases = np.array([
+        [1.0 + trace, h - f, c - g, d - b], [h - f, x_first, b + d, c + g], [c - g, b + d, y_first, f + h],
+        [d - b, c + g, f + h, z_first],
+    ])  # fmt: skip
+    out = cases[largest, :, np.arange(len(r))]
+    w, x, y, z = out.T
+    n = np.sqrt(w * w + x * x + y * y + z * z)
+    return np.asarray(out / np.where(w < 0.0, -n, n)[:, None])

@@ -33,7 +33,7 @@ def spectrum_slope(image: np.ndarray) -> float:
 
 def test_textures_have_natural_spectra_and_edges() -> None:
     names = tuple(name for name in MAKERS if name not in ("clouds", "detail"))
-    pool = make_pool(names, 4, 10)
+    pool = make_pool(names, 4, 9)
     slopes = {name: spectrum_slope(pool.image(name)) for name in names}
     assert all(-2.9 < slope < -1.3 for slope in slopes.values()), slopes
     assert -2.7 < np.mean(list(slopes.values())) < -1.5

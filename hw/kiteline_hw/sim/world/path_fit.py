@@ -27,7 +27,7 @@ def fit(t_s: F64, poses: F64, knot_s: float, smoothing: float) -> Path:
 
     smoothing: weight of the squared third differences of the coefficients, relative to one mean data row per knot.
     """
-    q = np.array([se3.quaternion_from_rotation(r) for r in poses[:, :3, :3]])
+    q = se3.quaternions_from_rotations(poses[:, :3, :3])
     signs = np.cumprod(np.concatenate([[1.0], np.where((q[1:] * q[:-1]).sum(1) < 0, -1.0, 1.0)]))
     data = np.concatenate([poses[:, :3, 3], q * signs[:, None]], 1)
     length = float(t_s[-1])
@@ -97,5 +97,5 @@ def read_trajectory(file: FilePath, camera_in_body: F64) -> Path:
     t = rows[:, 0] - rows[0, 0]
     if not (np.diff(t) > 0).all():
         raise SourceError(f"trajectory {file}: times must increase from row to row")
-    poses = np.array([se3.from_quaternion(r[[7, 4, 5, 6]], r[1:4]) for r in rows])
+    poses = se3.from_quaternions(rows[:, [7, 4, 5, 6]], rows[:, 1:4])
     return fit(t, poses, max(0.08, 1.5 * float(np.median(np.diff(t)))), 0.02)
