@@ -76,14 +76,6 @@ def test_similar_rooms_are_not_merged(
     assert mapper.summary()["maps"] == 2
 
 
-def test_repetitive_corridor_is_not_merged(make_flight: MakeFlight, corridor: Any, words: Any) -> None:
-    a = make_flight(keyframes=26, turns=0.6, scene=corridor)
-    b = make_flight(keyframes=26, turns=0.6, start=0.35, scene=corridor, variant=1, agent=1)
-    mapper = Mapper(WITHOUT_GRID, words)
-    feed(mapper, [a, b])
-    assert mapper.summary()["merges"] == 0
-
-
 @pytest.mark.parametrize(("predecessors", "merges"), [(0, 0), (4, 1)])
 def test_predecessors_of_a_matched_keyframe_are_verified(
     make_flight: MakeFlight, words: Any, predecessors: int, merges: int
