@@ -52,26 +52,15 @@ def placed_map(sparse_map: SparseMap, placements: Mapping[SubmapId, F64]) -> Pla
                 metric.append(metres)
     number = np.full(sparse_map.height, -1, np.int64)
     number[rows] = np.arange(len(rows))
-    points = sparse_map.live_landmarks()
-    xyz, known = sparse_map.positions(points)
-    known &= number[sparse_map.keypoints.row[points]] >= 0
-    points, xyz = points[known], xyz[known]
-    starts, slots = sparse_map.observations(points)
-    views = np.diff(starts)
-    which = np.repeat(np.arange(len(points)), views)
-    keep = (views >= 2)[which] & (number[sparse_map.keypoints.row[slots]] >= 0)
-    renumber = np.cumsum(views >= 2) - 1
-    pairs = np.stack([number[sparse_map.keypoints.row[slots[keep]]], renumber[which[keep]]], 1).astype(np.int64)
-    points, xyz = points[views >= 2], xyz[views >= 2]
-    for submap in sorted(placements):
-        inside = sparse_map.landmark_ids(points) >> (SEQUENCE_BITS + KEYPOINT_BITS) == submap
-        T = placements[submap] @ sim3.inverse(sparse_map.submap_pose(submap))
-        xyz[inside] = xyz[inside] @ T[:3, :3].T + T[:3, 3]
+    landmarks, points, starts, slots = _in_world(sparse_map, placements, sparse_map.live_landmarks())
+    which = np.repeat(np.arange(len(landmarks)), np.diff(starts))
+    observer = number[sparse_map.keypoints.row[slots]]
+    pairs = np.stack([observer, which], 1)[observer >= 0]
     return PlacedMap(
         sparse_map.keyframes.id[rows].copy(),
         np.array(positions).reshape(-1, 3),
-        sparse_map.landmark_ids(points),
-        xyz,
+        sparse_map.landmark_ids(landmarks),
+        points,
         pairs,
         np.array(metric, np.bool_),
     )
@@ -84,15 +73,24 @@ def some_landmarks(sparse_map: SparseMap, placements: Mapping[SubmapId, F64], mo
     """
     slots = np.arange(0, sparse_map.slots, max(1, -(-sparse_map.slots // most)), dtype=np.int32)
     slots = sparse_map.sorted_by_id(slots[sparse_map.is_live(slots)])
-    submap = sparse_map.landmark_ids(slots) >> (SEQUENCE_BITS + KEYPOINT_BITS)
+    landmarks, points, _, _ = _in_world(sparse_map, placements, slots)
+    return landmarks, points
+
+
+def _in_world(sparse_map: SparseMap, placements: Mapping[SubmapId, F64], landmarks: I32) -> tuple[I32, F64, I32, I32]:
+    """Those of root landmarks (n,) in placed submaps that have a position and two observations or more.
+
+    Returns their slots (m,), positions in w (m,3), and observations as `SparseMap.observations` does: starts, slots.
+    """
+    submap = sparse_map.landmark_ids(landmarks) >> (SEQUENCE_BITS + KEYPOINT_BITS)
     placed = np.isin(submap, sorted(placements))
-    slots, submap = slots[placed], submap[placed]
-    starts, _ = sparse_map.observations(slots)
-    xyz, known = sparse_map.positions(slots)
+    landmarks, submap = landmarks[placed], submap[placed]
+    xyz, known = sparse_map.positions(landmarks)
+    starts, _ = sparse_map.observations(landmarks)
     known &= np.diff(starts) >= 2
-    slots, submap, xyz = slots[known], submap[known], xyz[known]
-    for one in np.unique(submap).tolist():
+    landmarks, submap, xyz = landmarks[known], submap[known], xyz[known]
+    for one in map(SubmapId, np.unique(submap).tolist()):
         inside = submap == one
-        T = placements[SubmapId(one)] @ sim3.inverse(sparse_map.submap_pose(SubmapId(one)))
+        T = placements[one] @ sim3.inverse(sparse_map.submap_pose(one))
         xyz[inside] = xyz[inside] @ T[:3, :3].T + T[:3, 3]
-    return slots, xyz
+    return landmarks, xyz, *sparse_map.observations(landmarks)
