@@ -6,6 +6,7 @@ from pathlib import Path
 
 from kiteline_bench.benchmark import BENCHMARKS, parts
 from kiteline_bench.harness.bars import Bench
+from kiteline_bench.system.house import runs_of_make_test
 from kiteline_bench.system.structure import ROOT, Sources, by_sub_package, circles
 
 
@@ -59,3 +60,8 @@ def test_the_structure_of_these_sources_is_measured(tmp_path: Path) -> None:
 def test_each_benchmark_is_found() -> None:
     assert len(BENCHMARKS) > 8
     assert all(parts(name) for name in BENCHMARKS)
+
+
+def test_the_suite_is_timed_as_make_runs_it() -> None:
+    runs = runs_of_make_test((ROOT / "Makefile").read_text(encoding="utf-8"))
+    assert [run[-2:] for run in runs] == [["-m", "not alone"], ["-m", "alone"]]

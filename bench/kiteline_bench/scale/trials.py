@@ -12,7 +12,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.jobs import JobDone
 from kiteline_basestation.management import Command
+from kiteline_basestation.merging.map_merger import MapMerger
 from kiteline_basestation.runtime.warm import warm, warm_graphs
 from kiteline_basestation.runtime.worker import LockstepJobs, Workers
 from kiteline_basestation.station import Station, StationOutput
@@ -34,7 +35,7 @@ from kiteline_codec.channel import coded_channel
 from kiteline_codec.schema import LivePose, Record
 from kiteline_codec.sync.resumption import agent_session
 from kiteline_core.geometry import se3
-from kiteline_core.ids import AgentId
+from kiteline_core.ids import AgentId, SubmapId
 from kiteline_hw.system.memory import return_large_arrays, rss_mib
 from kiteline_hw.system.vocabulary import shipped_vocabulary
 
@@ -101,6 +102,11 @@ class LargeMap:
     error_m: tuple[float, float] = (float("inf"), float("inf"))
     built_s: float = 0.0
 
+    def sample(self, keyframes: int) -> None:
+        """Note the memory of the process with so many keyframes."""
+        self.keyframes.append(keyframes)
+        self.rss_mib.append(rss_mib())
+
 
 class _Flown:
     """A station that one agent's records reach, and the jobs that it starts, on the modelled or on the real clock."""
@@ -109,7 +115,7 @@ class _Flown:
         self.station, self.link, self.worker = station, link, worker
         self.now_ns = 0
         self.step_ms: list[float] = []
-        self.open = 0
+        self.begin_s = time.monotonic()
 
     def step(self, records: Sequence[Record]) -> StationOutput:
         """One step; jobs that are done by now are taken in."""
@@ -131,80 +137,99 @@ def large_map(flight: RecordedFlight, keyframes: int, flown_last: int | None = N
     """
     station, worker = empty_station(), Workers()
     flown = _Flown(station, Link(AgentId(0), coded_channel(1, 0, "wifi", bounded=True)), worker)
-    places = max(3, round(keyframes / len(flight.keyframes)))
-    angle = 2.0 * np.pi * np.arange(places) / (places - 1)
-    radius = PLACE_M * (places - 1) / (2.0 * np.pi)
-    shift = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), np.zeros(places)])
+    n = len(flight.keyframes)
+    places = max(3, round(keyframes / n))
+    boundary = (places - 1) * n  # the next keyframe is the first one's place again
+    begin, end = Name(AgentId(0), 0, 0, mask_of(0)), Name(AgentId(0), 0, boundary, mask_of(0))
+    copied = 0 if flown_last is None else max(0, places - 2 - round(flown_last / n))
+    given = rounds(flight, AgentId(0), 0, places, _around(places), se3.exp(ERROR))
     found = LargeMap([], [], [], [], [])
-    begin_s = time.monotonic()
+    merger = station.mapper.merger
+    assert merger is not None
     count = edges = 0
     loop_begin_s: float | None = None
-    n = len(flight.keyframes)
-    boundary = (places - 1) * n
-    begin, end = Name(AgentId(0), 0, 0, mask_of(0)), Name(AgentId(0), 0, boundary, mask_of(0))
-    mapper, map_id = station.mapper, begin.submap
-    assert mapper.merger is not None
-    copied = 0 if flown_last is None else max(0, places - 2 - round(flown_last / n))
-    given = rounds(flight, AgentId(0), 0, places, shift, se3.exp(ERROR))
     try:
         for group in given:
             if count == n and copied:
-                for _ in range(_SETTLING):
-                    flown.step(())
-                    time.sleep(0.05)
-                copies = PlaceCopies(station, flown.link, begin)
-                here = [group, *itertools.islice(given, n - 1)]
-                for number in range(1, copied + 1):
-                    name = Name(AgentId(0), 0, number * n, mask_of(number))
-                    flown.now_ns = copies.add(name, here, flown.now_ns)
-                    count += n
-                    found.keyframes.append(count)
-                    found.rss_mib.append(rss_mib())
-                    found.step_ms += [0.0] * n
-                    found.most_ms += [0.0] * n
-                    if number % 20 == 0:
-                        _tell(count, begin_s)
-                    here = list(itertools.islice(given, n)) if number < copied else []
-                copies.finish()
+                count = _copy_places(flown, begin, copied, [group, *itertools.islice(given, n - 1)], given, found)
                 continue
-            about = () if count else map_all(flight.about, begin)
-            records = [*about, *group]
-            flown.step_ms.clear()
-            flown.step(records)
-            deadline_s = time.monotonic() + _WORKER_S
-            while not worker.idle and time.monotonic() < deadline_s:  # it keeps up, as at one keyframe a second
-                time.sleep(0.002)
-            for _ in range(3):  # takes the result of the last keyframe's bundle, and begins this one's
-                flown.step(())
+            _fly_keyframe(flown, [*(() if count else map_all(flight.about, begin)), *group])
             count += 1
             found.step_ms.append(float(np.mean(flown.step_ms)))
             found.most_ms.append(max(flown.step_ms))
-            if count > boundary - _LAST and count <= boundary:
+            if boundary - _LAST < count <= boundary:
                 found.last_ms += flown.step_ms
             if count % 100 == 0 or count == boundary:
-                found.keyframes.append(count)
-                found.rss_mib.append(rss_mib())
-                _tell(count, begin_s)
-            if any(e.new >= end.keyframe(0) and e.old < begin.keyframe(n) for e in mapper.merger.edges[edges:]):
+                found.sample(count)
+                _tell(count, flown.begin_s)
+            if any(e.new >= end.keyframe(0) and e.old < begin.keyframe(n) for e in merger.edges[edges:]):
                 loop_begin_s = time.monotonic()
                 break
-            edges = len(mapper.merger.edges)
-        found.built_s = time.monotonic() - begin_s
+            edges = len(merger.edges)
+        found.built_s = time.monotonic() - flown.begin_s
         found.loops = int(loop_begin_s is not None)
         if loop_begin_s is not None:
             before_m = _error_m(station, begin, end, count - boundary)
-            flown.step_ms.clear()
-            while time.monotonic() < loop_begin_s + 120.0:
-                flown.step(())
-                if not mapper.merger.is_busy(map_id):
-                    found.loop_s = time.monotonic() - loop_begin_s
-                    break
-                time.sleep(0.005)
-            found.loop_step_ms = max(flown.step_ms)
+            _close_loop(flown, merger, begin.submap, loop_begin_s, found)
             found.error_m = before_m, _error_m(station, begin, end, count - boundary)
     finally:
         worker.close()
     return found
+
+
+def _around(places: int) -> F64:
+    """Positions (places,3) on a circle, PLACE_M from one to the next; the last one is the first."""
+    angle = 2.0 * np.pi * np.arange(places) / (places - 1)
+    radius = PLACE_M * (places - 1) / (2.0 * np.pi)
+    return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), np.zeros(places)])
+
+
+def _copy_places(
+    flown: _Flown, of: Name, copies: int, here: Sequence[Sequence[Record]], given: Iterator[Sequence[Record]],
+    found: LargeMap,
+) -> int:  # fmt: skip
+    """Add copies of the place `of`, which was flown; how many keyframes the map has then.
+
+    here: the agent's records of the first copy; those of the others are taken from `given`.
+    """
+    n = len(here)
+    for _ in range(_SETTLING):
+        flown.step(())
+        time.sleep(0.05)
+    places = PlaceCopies(flown.station, flown.link, of)
+    for number in range(1, copies + 1):
+        flown.now_ns = places.add(Name(of.agent, 0, number * n, mask_of(number)), here, flown.now_ns)
+        found.sample((number + 1) * n)
+        found.step_ms += [0.0] * n
+        found.most_ms += [0.0] * n
+        if number % 20 == 0:
+            _tell((number + 1) * n, flown.begin_s)
+        here = list(itertools.islice(given, n)) if number < copies else []
+    places.finish()
+    return (copies + 1) * n
+
+
+def _fly_keyframe(flown: _Flown, records: Sequence[Record]) -> None:
+    """The steps of one keyframe: the worker keeps up, as at one keyframe a second."""
+    flown.step_ms.clear()
+    flown.step(records)
+    deadline_s = time.monotonic() + _WORKER_S
+    while not flown.worker.idle and time.monotonic() < deadline_s:
+        time.sleep(0.002)
+    for _ in range(3):  # takes the result of the last keyframe's bundle, and begins this one's
+        flown.step(())
+
+
+def _close_loop(flown: _Flown, merger: MapMerger, map_id: SubmapId, begin_s: float, found: LargeMap) -> None:
+    """Step until pose graph and bundle of a loop are applied, or two minutes have passed since `begin_s`."""
+    flown.step_ms.clear()
+    while time.monotonic() < begin_s + 120.0:
+        flown.step(())
+        if not merger.is_busy(map_id):
+            found.loop_s = time.monotonic() - begin_s
+            break
+        time.sleep(0.005)
+    found.loop_step_ms = max(flown.step_ms)
 
 
 def _tell(keyframes: int, begin_s: float) -> None:

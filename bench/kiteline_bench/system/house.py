@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import subprocess
 import sys
 import time
@@ -20,7 +21,6 @@ from kiteline_bench.system.structure import ROOT, Sources, by_sub_package, circl
 _MODULES, _LINES, _ALL_LINES = 14, 400, 38_000  # in a folder, in a file, in all rooms
 _COMPILE_S = 12.0
 _SUITE_S = 300.0  # on two cores
-_TESTS = (("-n", "4", "--dist", "loadfile", "--no-loadscope-reorder", "-m", "not alone"), ("-m", "alone"))
 _ROUNDS = 5
 _CPU_RATIO = 1.02
 
@@ -102,11 +102,17 @@ def _compile(bench: Bench) -> list[Bar]:
     return bars
 
 
+def runs_of_make_test(makefile: str) -> list[list[str]]:
+    """What `make test` gives pytest after -q, for each of its runs."""
+    runs = [line.partition("-m pytest -q ")[2] for line in makefile.splitlines()]
+    return [shlex.split(options) for options in runs if options]
+
+
 def _suite(bench: Bench) -> list[Bar]:
     """Time of all tests, with kernels compiled before, as `make test` runs them. Raises RuntimeError if one fails."""
     bench.warm()
     begin_s, cpu_s = time.monotonic(), _children_s()
-    for options in _TESTS:
+    for options in runs_of_make_test((ROOT / "Makefile").read_text(encoding="utf-8")):
         bench.say(f"pytest {' '.join(options)}")
         done = subprocess.run(
             [sys.executable, "-m", "pytest", "-q", *options], check=False, cwd=ROOT, env=environment(),
