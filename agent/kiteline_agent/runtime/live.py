@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import os
 import threading
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 from kiteline_agent.onboard import OnboardAgent
 from kiteline_agent.runtime.agent_runtime import PROGRESS_FRAMES, AgentRuntime, channel_with_spill, opened
@@ -30,7 +31,7 @@ from kiteline_codec.sync.resumption import agent_session, order_of
 from kiteline_codec.transport.framing import StreamFramer
 from kiteline_codec.transport.seal import Direction, Opener, Sealer, suite_for
 from kiteline_codec.transport.seal_watch import SealWatch
-from kiteline_core.frame import ImuBatch, OdometryBatch
+from kiteline_core.frame import Frame, ImuBatch, OdometryBatch
 from kiteline_hw.links.kinds import link_traits
 from kiteline_hw.links.open import open_link
 from kiteline_hw.links.sealed_link import SealedLink
@@ -75,84 +76,186 @@ def fly_live(
         stack.callback(runtime.close)
         clock = MonotonicClock()
         controller = controller_link(options, source, clock, stack)
-        shared = None if controller is None else controller.tunnel_link()
-        link = shared or open_link(
+        end = (None if controller is None else controller.tunnel_link()) or open_link(
             options.link, "agent", options.agent, framer=StreamFramer, required=False,
             logins=None if key is None else login_of(options.agent, key),
         )  # fmt: skip
-        stack.callback(link.close)
-        sealer: Sealer | None = None
-        session = agent_session(options.order, options.boot)
-        if key is not None:
-            sealer = Sealer(key, options.agent, session, Direction.UP, suite_for(link_traits(options.link)))
-        watch = SealWatch(Direction.UP, None if key is None else Opener({options.agent: key}, Direction.DOWN))
-        end, doubled = link, False
-        link = SealedLink(link, options.agent, sealer, watch)
-        follower = _SessionFollower(session, sealer, numbers)
+        stack.callback(end.close)
+        base = _BaseEnd(options, end, key, numbers)
         if options.cpu_percent > 0.0:
             stack.enter_context(CpuQuota(options.cpu_percent)).add(os.getpid())
         if parent is not None:
             parent.send_event("ready", frames=source.frame_count)
         process.notify("READY=1")
-        status = StatusMessages()
         if parent is None:
             process.print_lines([f"flying {source.name}, {_link_text(options)}", *options.told])
-        begin_ns = clock.now_ns()
+        flight = _LiveFlight(runtime, base, controller, clock, parent, stop)
+        flight.fly()
+        if parent is None:
+            process.print_lines([f"over: {summary(runtime.counts)}", *runtime.take_notices(), *runtime.log_notes()])
+        flight.drain()
+        if parent is not None:
+            parent.send_event("result", report=runtime.report())
+
+
+class _Due(NamedTuple):
+    """What a step of a live flight is given.
+
+    captured_ns: of the frame on the clock of the process, or the time of the step. predict_ns: of a pose between
+    frames, as stamps of frames.
+    """
+
+    captured_ns: int
+    frame: Frame | None = None
+    imu: ImuBatch | None = None
+    odometry: OdometryBatch | None = None
+    predict_ns: int | None = None
+
+
+class _LiveFlight:
+    """The loop of a live flight: waits for frames and poses that are due, steps the agent, sends and tells."""
+
+    def __init__(
+        self, runtime: AgentRuntime, base: _BaseEnd, controller: ControllerLink | None, clock: MonotonicClock,
+        parent: process.Parent | None, stop: process.StopSignal,
+    ) -> None:  # fmt: skip
+        self._runtime, self._base, self._controller = runtime, base, controller
+        self._clock, self._parent, self._stop = clock, parent, stop
+        self._status = StatusMessages()
+        options = runtime.options
+        self._begin_ns = begin_ns = clock.now_ns()
         runtime.begin_at(begin_ns)
         if controller is not None:
             controller.take_imu(begin_ns)  # drop what was measured before the flight
         own_hz = 0.0 if controller is None else pose_rate_hz(options)
         obstacles_hz = OBSTACLES_HZ if controller is not None and options.obstacles else 0.0
-        predictions, around = PoseSchedule(own_hz or obstacles_hz, begin_ns), PoseSchedule(obstacles_hz, begin_ns)
-        shift_ns = runtime.options.start_ns - begin_ns
-        while not stop and not runtime.over:
-            told = _wait(runtime, begin_ns, predictions.next_ns, clock, stop)
-            if stop:
+        # Poses have a rate of their own, or are those of the frames: predictions may be for obstacles alone.
+        self._predicts_poses = own_hz > 0.0
+        self._predictions, self._obstacles = (
+            PoseSchedule(own_hz or obstacles_hz, begin_ns), PoseSchedule(obstacles_hz, begin_ns)
+        )  # fmt: skip
+        self._shift_ns = runtime.options.start_ns - begin_ns  # from the clock to the stamps of frames
+
+    def fly(self) -> None:
+        """Step until the source or the process ends."""
+        runtime, controller = self._runtime, self._controller
+        while not self._stop and not runtime.over:
+            told = self._wait()
+            if self._stop:
                 break
-            now_ns = captured_ns = clock.now_ns()
-            if parent is None:
+            now_ns = self._clock.now_ns()
+            if self._parent is None:
                 told += runtime.take_notices()
-                process.print_lines(f"{(now_ns - begin_ns) / 1e9:8.1f} s  {line}" for line in told)
-            frame = imu = odometry = predict_ns = None
-            if runtime.next_ns is not None and now_ns >= begin_ns + runtime.next_ns:
-                if not runtime.drop_stale(now_ns - begin_ns):
-                    break
-                captured_ns = begin_ns + runtime.next_ns
-                frame, imu, odometry = runtime.reader.take()
-                if controller is not None:
-                    odometry = _measured(controller.take_odometry(captured_ns), odometry, shift_ns)
-                    imu = _measured(controller.take_imu(captured_ns), imu, shift_ns)  # late samples: next frame
-            elif controller is not None and predictions.take_due(now_ns):
-                predict_ns = now_ns + shift_ns
-                imu = runtime.reader.take_imu(predict_ns)
-                imu = _measured(controller.take_imu(now_ns) if options.imu_of else None, imu, shift_ns)
+                process.print_lines(f"{(now_ns - self._begin_ns) / 1e9:8.1f} s  {line}" for line in told)
+            due = self._due(now_ns)
+            if due is None:
+                break
             push = None
-            # Poses have a rate of their own, or are those of the frames: predictions may be for obstacles alone.
-            if controller is not None and (own_hz > 0.0) == (frame is None):
-                push = partial(_push, controller, runtime.agent, captured_ns, options.boot, clock)
-            sent = runtime.step(frame, imu, link.receive(), now_ns, odometry, predict_ns, push)
-            follower.follow(runtime.session)
-            for packet in sent:
-                link.send(packet)
+            if controller is not None and self._predicts_poses == (due.frame is None):
+                push = partial(_push, controller, runtime.agent, due.captured_ns, runtime.options.boot, self._clock)
+            received = self._base.receive()
+            sent = runtime.step(due.frame, due.imu, received, now_ns, due.odometry, due.predict_ns, push)
+            self._base.send(sent, runtime.session)
             if controller is not None:
-                push_obstacles(controller, runtime.agent, runtime.output, around, now_ns)
+                push_obstacles(controller, runtime.agent, runtime.output, self._obstacles, now_ns)
             process.notify("WATCHDOG=1")
-            process.print_lines(watch.lines())
-            if not doubled and getattr(end, "doubled", False):
-                doubled = True
-                process.print_lines([f"another agent has number {options.agent} too: give each its own --agent N"])
-            if parent is None:
-                found = [] if controller is None else [f.line for f in controller.take_findings()]
-                process.print_lines(
-                    status.lines(runtime.output, runtime.counts, now_ns - begin_ns, found) if runtime.output else ()
-                )
-            elif runtime.counts.frames % PROGRESS_FRAMES == 0:
-                parent.send_event("progress", frames=runtime.counts.frames, tracked=runtime.counts.tracked)
-        if parent is None:
-            process.print_lines([f"over: {summary(runtime.counts)}", *runtime.take_notices(), *runtime.log_notes()])
-        _drain_live(runtime, link, clock, parent, stop, follower)
-        if parent is not None:
-            parent.send_event("result", report=runtime.report())
+            process.print_lines(self._base.lines())
+            self._report(now_ns)
+
+    def drain(self) -> None:
+        """After the last frame: step until both sides hold the same values, or _DRAIN_S have passed."""
+        runtime = self._runtime
+        runtime.end_of_frames()
+        if self._parent is not None:
+            self._parent.send_event("frames_over")
+        now_ns = quiet_ns = self._clock.now_ns()
+        end_ns = now_ns + round(_DRAIN_S * 1e9)
+        while not self._stop and now_ns < end_ns and now_ns - quiet_ns < _QUIET_S * 1e9:
+            self._stop.wait(_IDLE_TICK_S / 2)
+            now_ns = self._clock.now_ns()
+            self._base.send(runtime.step(None, None, self._base.receive(), now_ns), runtime.session)
+            if not all(settled(runtime.channel)):
+                quiet_ns = now_ns
+            process.notify("WATCHDOG=1")
+
+    def _wait(self) -> list[str]:
+        """Wait for the next frame, the next pose, or one idle tick; what a camera has to tell."""
+        runtime, now_ns = self._runtime, self._clock.now_ns()
+        until_ns = now_ns + round(_IDLE_TICK_S * 1e9)
+        if self._predictions.next_ns is not None:
+            until_ns = min(until_ns, self._predictions.next_ns)
+        if runtime.camera is not None:
+            return runtime.await_frame(until_ns)
+        if runtime.next_ns is not None:
+            until_ns = min(until_ns, self._begin_ns + runtime.next_ns)
+        if until_ns > now_ns:
+            self._stop.wait((until_ns - now_ns) / 1e9)
+        return []
+
+    def _due(self, now_ns: int) -> _Due | None:
+        """What is due: a frame, a pose between frames, or nothing but packets; None at the end of the source."""
+        runtime, controller = self._runtime, self._controller
+        if runtime.next_ns is not None and now_ns >= self._begin_ns + runtime.next_ns:
+            if not runtime.drop_stale(now_ns - self._begin_ns):
+                return None
+            captured_ns = self._begin_ns + runtime.next_ns
+            frame, imu, odometry = runtime.reader.take()
+            if controller is not None:
+                odometry = _measured(controller.take_odometry(captured_ns), odometry, self._shift_ns)
+                imu = _measured(controller.take_imu(captured_ns), imu, self._shift_ns)  # late samples: next frame
+            return _Due(captured_ns, frame, imu, odometry)
+        if controller is None or not self._predictions.take_due(now_ns):
+            return _Due(now_ns)
+        predict_ns = now_ns + self._shift_ns
+        own = controller.take_imu(now_ns) if runtime.options.imu_of else None
+        imu = _measured(own, runtime.reader.take_imu(predict_ns), self._shift_ns)
+        return _Due(now_ns, imu=imu, predict_ns=predict_ns)
+
+    def _report(self, now_ns: int) -> None:
+        """Tell the terminal, or the parent, how the flight goes."""
+        runtime, controller = self._runtime, self._controller
+        if self._parent is None:
+            found = [] if controller is None else [f.line for f in controller.take_findings()]
+            if runtime.output:
+                lines = self._status.lines(runtime.output, runtime.counts, now_ns - self._begin_ns, found)
+                process.print_lines(lines)
+        elif runtime.counts.frames % PROGRESS_FRAMES == 0:
+            self._parent.send_event("progress", frames=runtime.counts.frames, tracked=runtime.counts.tracked)
+
+
+class _BaseEnd:
+    """The agent's end of the link to the base: seals, the session that the base may raise, what there is to tell."""
+
+    def __init__(self, options: AgentOptions, end: ByteLink, key: bytes | None, numbers: StartNumbers | None) -> None:
+        """end: the link without seals. key: None: packets are not sealed. numbers: see `_SessionFollower`."""
+        self._end, self._agent = end, options.agent
+        session = agent_session(options.order, options.boot)
+        sealer = opener = None
+        if key is not None:
+            sealer = Sealer(key, options.agent, session, Direction.UP, suite_for(link_traits(options.link)))
+            opener = Opener({options.agent: key}, Direction.DOWN)
+        self._watch = SealWatch(Direction.UP, opener)
+        self._link = SealedLink(end, options.agent, sealer, self._watch)
+        self._follower = _SessionFollower(session, sealer, numbers)
+        self._doubled_told = False
+
+    def receive(self) -> list[bytes]:
+        """Packets that have arrived since the last call."""
+        return self._link.receive()
+
+    def send(self, packets: Sequence[bytes], session: int) -> None:
+        """Send packets of a session."""
+        self._follower.follow(session)
+        for packet in packets:
+            self._link.send(packet)
+
+    def lines(self) -> list[str]:
+        """What there is to tell of seals, and of another agent with this number, each once."""
+        lines = list(self._watch.lines())
+        if not self._doubled_told and getattr(self._end, "doubled", False):
+            self._doubled_told = True
+            lines.append(f"another agent has number {self._agent} too: give each its own --agent N")
+        return lines
 
 
 def _measured(by_controller: _Batch | None, by_source: _Batch | None, shift_ns: int) -> _Batch | None:
@@ -174,22 +277,6 @@ def _push(
     pose = pose_sample(agent, output, captured_ns, boot)
     if pose is not None:
         controller.push(pose, clock.now_ns())
-
-
-def _wait(
-    runtime: AgentRuntime, begin_ns: int, pose_ns: int | None, clock: MonotonicClock, stop: process.StopSignal
-) -> list[str]:
-    """Wait for the next frame, the next pose, or one idle tick; what a camera has to tell. pose_ns: None: no poses."""
-    now_ns = clock.now_ns()
-    until_ns = now_ns + round(_IDLE_TICK_S * 1e9)
-    until_ns = until_ns if pose_ns is None else min(until_ns, pose_ns)
-    if runtime.camera is not None:
-        return runtime.await_frame(until_ns)
-    if runtime.next_ns is not None:
-        until_ns = min(until_ns, begin_ns + runtime.next_ns)
-    if until_ns > now_ns:
-        stop.wait((until_ns - now_ns) / 1e9)
-    return []
 
 
 def _link_text(options: AgentOptions) -> str:
@@ -234,29 +321,3 @@ class _SessionFollower:
         if self._numbers is not None:  # beside the flight, which cannot wait for a disk
             threading.Thread(target=self._numbers.raise_to, args=(order,), name="start-number", daemon=True).start()
         process.print_lines(["the base knows a later start of this agent: state lost, or two agents with one number?"])
-
-
-def _drain_live(
-    runtime: AgentRuntime,
-    link: ByteLink,
-    clock: MonotonicClock,
-    parent: process.Parent | None,
-    stop: process.StopSignal,
-    follower: _SessionFollower,
-) -> None:
-    """After the last frame: step until both sides hold the same values, or _DRAIN_S have passed."""
-    runtime.end_of_frames()
-    if parent is not None:
-        parent.send_event("frames_over")
-    now_ns = quiet_ns = clock.now_ns()
-    end_ns = now_ns + round(_DRAIN_S * 1e9)
-    while not stop and now_ns < end_ns and now_ns - quiet_ns < _QUIET_S * 1e9:
-        stop.wait(_IDLE_TICK_S / 2)
-        now_ns = clock.now_ns()
-        sent = runtime.step(None, None, link.receive(), now_ns)
-        follower.follow(runtime.session)
-        for packet in sent:
-            link.send(packet)
-        if not all(settled(runtime.channel)):
-            quiet_ns = now_ns
-        process.notify("WATCHDOG=1")
