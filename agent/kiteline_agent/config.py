@@ -332,7 +332,6 @@ class GovernorConfig:
     cpu_percent: float = 0.0  # percent of one core, over any window; 0: no budget
     window_s: float = 1.0  # s: window in which the budget has to hold
     margin: float = 0.97  # share of the budget that is planned; the rest is for what was not expected
-    tight: float = 1.0  # share of the budget above which effort falls
     fill: float = 1.05  # share up to which frames are tracked between two rows: keyframes are not always due
     comfort: float = 0.86  # share below which the load at the next better effort must stay before effort rises
     grace_s: float = 2.0  # s at the start that do not count: a map has to be begun
@@ -342,11 +341,7 @@ class GovernorConfig:
     carried_gap_s: float = 0.8  # s: the same with an IMU, whose prediction counts as tracking for 1 s
     blind_s: float = 1.0  # s without a tracked frame, after which one is tracked whatever it costs
     doubt: float = 0.1  # relative error of the expected cost of a frame, at least
-    learning: float = 0.15  # gain of the expected cost of frames
-    keyframe_learning: float = 0.4  # gain of the expected rate of keyframes
-    first_keyframes: float = 2.0  # 1/s: expected rate of keyframes at the start
     first_frame_ms: float = 3.5  # ms: expected cost of a tracked frame at full effort at the start: 752x480 on a laptop
-    first_period_s: float = 0.05  # s: expected time between frames at the start
     settling_s: float = 1.0  # s at the start in which effort follows the load without hysteresis
 
 

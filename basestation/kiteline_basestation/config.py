@@ -168,8 +168,6 @@ class GraphConfig:
     loop_sigma_rad: float = 0.003  # rad; of a loop edge
     level_inflation: float = 4.5  # of deviations of gravity, whose errors are the same over some 20 keyframes
     huber: float = 3.0  # standard deviations; loop edges with larger residuals weigh less
-    iterations: int = 8  # of Gauss-Newton
-    scale_iterations: int = 30  # of Levenberg-Marquardt, with scales: these graphs bend farther
     stop: float = 1e-4  # relative decrease of the error below which the solver stops
     first_full: int = 3  # keyframes of a map at its first full bundle: a worn rig is seen in it
     full_share: float = 0.03  # of the worker's time for scheduled full bundles: one of 100 keyframes every 3 s

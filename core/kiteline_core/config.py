@@ -79,6 +79,17 @@ def load(config: T, text: str, root: str, name: str) -> T:
         raise ConfigError(f"{name}: {error}") from error
 
 
+def of_log(config: T, text: str) -> T:
+    """`config` with the values that a log holds as TOML. Raises ConfigError if a build with other options wrote it."""
+    try:
+        return apply(config, tomllib.loads(text))
+    except ConfigError as error:
+        raise ConfigError(
+            f"another build wrote this log ({error}): replay it with that build, or fly its images with this one "
+            "by `kiteline fly LOG`"
+        ) from error
+
+
 def in_range(config: T, default: T, path: str) -> T:
     """`config`, if all its numbers are finite and not negative where those of `default` are not; else ConfigError."""
     for f in fields(config):  # type: ignore[arg-type]

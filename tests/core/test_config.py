@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kiteline_core.config import ConfigError, apply, describe
+from kiteline_core.config import ConfigError, apply, describe, of_log
 
 
 class Mode(Enum):
@@ -107,3 +107,9 @@ def test_description_reads_as_sections() -> None:
     assert "[inner]\ngain = 0.5\n" in text
     assert "[inner.tracker]\npoints = 300\n" in text
     assert "# limit is not set" in text
+
+
+def test_the_log_of_another_build_is_told_from_a_wrong_file() -> None:
+    assert of_log(Config(), describe(Config(9.0))) == Config(9.0)
+    with pytest.raises(ConfigError, match=r"another build wrote this log \(unknown key 'points'.*kiteline fly LOG"):
+        of_log(Config(), "points = 3")

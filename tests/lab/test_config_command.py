@@ -49,7 +49,7 @@ def test_a_check_names_line_and_expectation_of_every_problem(
     path = tmp_path / "rig.toml"
     path.write_text(
         '[agent.keyframe]\nmin_shar = 0.5\nmax_gap_s = "3"\nmin_cover = -1.0\n\n[agen.x]\ny = 1\n'
-        "[base]\ngraph.iterations = 1.5\n[base.gird]\ncell_m = 0.2\n[agent]\nstereo = 1\n"
+        "[base]\ngraph.first_full = 1.5\n[base.gird]\ncell_m = 0.2\n[agent]\nstereo = 1\n"
     )
     assert command.main(["--check", str(path)]) == 2
     lines = capsys.readouterr().err.splitlines()

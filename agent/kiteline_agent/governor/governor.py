@@ -71,6 +71,8 @@ _GUESS = {Extra.KEYFRAME: 1.7, Extra.SEARCH: 3.0, Extra.SUBMAP: 3.0, Extra.SCAN:
 _OUTLIER = 1.5  # cost of a frame, in usual frames, above which it is clipped
 _SPREAD = 2.0  # mean deviations that cover nine of ten frames
 _LEAST = 0.1  # least share of the budget for frames
+_LEARNING, _KEYFRAME_LEARNING = 0.15, 0.4  # gains of the expected cost of frames and rate of keyframes
+_FIRST_KEYFRAMES_S, _FIRST_PERIOD_S = 2.0, 0.05  # expected at the start: keyframes a second, s between frames
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,10 +133,10 @@ class Governor:
         self._scatter = 0.0  # mean relative deviation of frames from their expected cost
         self._idle_ns = 0.0  # cost of a skipped frame
         self._extra_ns = dict.fromkeys(Extra, 0.0)  # expected extra cost of each
-        self._keyframes_s = config.first_keyframes  # requested per second
+        self._keyframes_s = _FIRST_KEYFRAMES_S  # requested per second
         self._keyframe_t_ns = 0  # of the last one
         self._asked_t_ns: int | None = None  # of the first pending request
-        self._period_ns = config.first_period_s * 1e9  # between frames
+        self._period_ns = _FIRST_PERIOD_S * 1e9  # between frames
         self._first_t_ns = 0
         self._last_t_ns: int | None = None
         self._tracked_t_ns = 0  # of the last tracked frame
@@ -234,7 +236,7 @@ class Governor:
         if not self._early(self._last_t_ns):
             self._spent.append((self._last_t_ns, cpu_ns))
             self._window_ns += cpu_ns
-        gain = self._config.learning
+        gain = _LEARNING
         if not self._last_tracked:
             self._idle_ns += (cpu_ns - self._idle_ns) * (gain if self._idle_ns else 1.0)
             return
@@ -290,7 +292,7 @@ class Governor:
         asked_t_ns = t_ns if self._asked_t_ns is None else self._asked_t_ns
         apart_ns = max(asked_t_ns - self._keyframe_t_ns, self._period_ns)
         if self._keyframe_t_ns:
-            self._keyframes_s += (1e9 / apart_ns - self._keyframes_s) * self._config.keyframe_learning
+            self._keyframes_s += (1e9 / apart_ns - self._keyframes_s) * _KEYFRAME_LEARNING
         self._keyframe_t_ns, self._asked_t_ns = t_ns, None
 
     def _affordable(self, t_ns: int, *, lost: bool) -> bool:
@@ -371,7 +373,7 @@ class Governor:
         if t_ns - self._first_t_ns < config.settling_s * 1e9:  # no stable load yet
             self._set_level(t_ns, self._best_affordable(0))
             return
-        if self._load(self.level) > config.tight and t_ns - self._level_since_ns >= config.down_s * 1e9:
+        if self._load(self.level) > 1.0 and t_ns - self._level_since_ns >= config.down_s * 1e9:
             level = self._best_affordable(self.level)
             if level != self.level:
                 self._set_level(t_ns, level)
@@ -384,7 +386,7 @@ class Governor:
     def _best_affordable(self, best: int) -> int:
         """The best row from `best` on that fits the budget, else the last one."""
         rows = range(best, len(self._ladder))
-        return next((row for row in rows if self._load(row) <= self._config.tight), rows[-1])
+        return next((row for row in rows if self._load(row) <= 1.0), rows[-1])
 
     def _set_level(self, t_ns: int, level: int) -> None:
         self._change_row(self._ladder, level)

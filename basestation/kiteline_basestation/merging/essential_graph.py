@@ -25,6 +25,8 @@ Bools = NDArray[np.bool_]
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
+_ITERATIONS = 8  # of Gauss-Newton
+_SCALE_ITERATIONS = 30  # of Levenberg-Marquardt, with scales: these graphs bend farther
 _FREE = 1e3  # rad, and units of lengths: a deviation that holds nothing
 
 
@@ -98,7 +100,7 @@ def _rigid(inputs: GraphInputs) -> GraphResult:
             known: gtsam.noiseModel.Base = gtsam.noiseModel.Isotropic.Sigma(2, inputs.config.level_inflation * sigma)
             graph.add(gtsam.AttitudeFactorPose3(i, up_w, known, kept))
     params = gtsam.GaussNewtonParams()
-    params.setMaxIterations(inputs.config.iterations)
+    params.setMaxIterations(_ITERATIONS)
     params.setRelativeErrorTol(inputs.config.stop)
     optimiser = gtsam.GaussNewtonOptimizer(graph, start, params)
     values = optimiser.optimize()
@@ -136,7 +138,7 @@ def _with_scale(inputs: GraphInputs, scaled: Scaled) -> GraphResult:
             tilt = _tilt_noise(pose[:3, :3].T @ inputs.level.up_w, config.level_inflation * sigma)
             graph.add(gtsam.PriorFactorSimilarity3(i, _similarity(pose, 1.0), tilt))
     params = gtsam.LevenbergMarquardtParams()
-    params.setMaxIterations(config.scale_iterations)
+    params.setMaxIterations(_SCALE_ITERATIONS)
     params.setRelativeErrorTol(config.stop)
     optimiser = gtsam.LevenbergMarquardtOptimizer(graph, start, params)
     values = optimiser.optimize()

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, fields, is_dataclass
 from typing import Any, Protocol
@@ -55,7 +54,7 @@ def station_of(
     metadata: Mapping[str, str], words: Vocabulary | None, link_traits: Callable[[str], LinkTraits]
 ) -> Station:
     """A station as the one of a base's log was. link_traits: of a kind of link."""
-    config = configuration.apply(BaseConfig(), tomllib.loads(metadata["config"]))
+    config = configuration.of_log(BaseConfig(), metadata["config"])
     logged = {k: v for k, v in json.loads(metadata["spec"]).items() if k in BaseOptions.__dataclass_fields__}
     spec = configuration.from_json(BaseOptions, json.dumps({"folder": "", **logged}))
     return Station(config, coded_channels(spec, link_traits(spec.link)), words)

@@ -15,6 +15,8 @@ U8 = NDArray[np.uint8]
 U64 = NDArray[np.uint64]
 
 _CELL_PX = 32  # of the guided search; it changes its speed alone
+_TURN_BINS = 16  # of the histogram of rotations between the two views; 22.5 degrees each
+_TURN_BINS_KEPT = 3  # neighbours share a rotation between them
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,8 +25,6 @@ class MatchConfig:
 
     max_hamming: int = 64  # bits of 256: unrelated descriptors differ in 128 +- 8, true matches in 20 to 60
     ratio: float = 0.85  # of the best to the second-best distance: above it, the match is ambiguous
-    turn_bins: int = 16  # bins of the histogram of rotations between the two views; 22.5 degrees each
-    turn_kept: int = 3  # bins that are kept: neighbours share a rotation between them
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +45,7 @@ def match(a: U8, angle_a: U8, b: U8, angle_b: U8, config: MatchConfig) -> Matche
     """Match descriptors (n,32) and (m,32) by brute force, one to one. Angles in 1/256 turns."""
     best, distance = np.empty(len(a), np.int32), np.empty(len(a), np.int32)
     kernels.match_all(words(a), words(b), config.max_hamming, config.ratio, best, distance)
-    kernels.keep_common_rotation(best, angle_a, angle_b, config.turn_bins, config.turn_kept)
+    kernels.keep_common_rotation(best, angle_a, angle_b, _TURN_BINS, _TURN_BINS_KEPT)
     return _pairs(best, distance)
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import tempfile
-import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -96,7 +95,7 @@ def agent_of_log(log: LogReader) -> OnboardAgent:
     if log.metadata.get("channel") == "CodedChannel":
         spill = SpillFile(Path(tempfile.gettempdir())) if options.log_name else None
         channel = coded_channel_for(options, link_traits(options.link), spill)
-    config = configuration.apply(AgentConfig(), tomllib.loads(log.metadata["config"]))
+    config = configuration.of_log(AgentConfig(), log.metadata["config"])
     return onboard_agent(
         rig, imu, config, Identity(AgentId(options.agent), options.boot, options.submap), channel, shipped_vocabulary()
     )
