@@ -112,9 +112,15 @@ def similar(p: F64, q: F64) -> tuple[float, float]:
     return scale, float(np.sqrt(((b - scale * a @ (u @ np.diag(d) @ vt).T) ** 2).sum(axis=1).mean()))
 
 
-def test_a_room_is_followed_at_a_scale_of_its_own() -> None:
+@pytest.fixture(scope="module")
+def flown() -> tuple[Agent, list[Estimate]]:
+    """A flight of 60 frames through the room, and its agent at the end."""
     one = agent()
-    estimates = [step(one, frame(k)) for k in range(60)]
+    return one, [step(one, frame(k)) for k in range(60)]
+
+
+def test_a_room_is_followed_at_a_scale_of_its_own(flown: tuple[Agent, list[Estimate]]) -> None:
+    _, estimates = flown
     first = next(i for i, e in enumerate(estimates) if e.tracked)
     assert 4 <= first <= 15
     assert all(e.tracked for e in estimates[first:])
@@ -131,11 +137,11 @@ def test_a_room_is_followed_at_a_scale_of_its_own() -> None:
     assert np.linalg.norm(moves, axis=1).max() < 0.15 / scale
 
 
-def test_bearings_find_their_true_depth() -> None:
-    one = agent()
+def test_bearings_find_their_true_depth(flown: tuple[Agent, list[Estimate]]) -> None:
+    one, estimates = flown
     made: dict[int, int] = {}  # the frame of which each keyframe was made
-    for k in range(60):
-        made.setdefault(int(step(one, frame(k)).keyframe), k)
+    for k, estimate in enumerate(estimates):
+        made.setdefault(int(estimate.keyframe), k)
     ratios = []
     for slot in np.flatnonzero(one.map.keyframe != NO_KEYFRAME):
         if int(one.map.keyframe[slot]) in made:  # all but the first, whose points two views gave

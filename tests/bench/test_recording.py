@@ -22,6 +22,7 @@ from kiteline_bench.harness.result import busiest_window
 from kiteline_bench.harness.run import fly_alone
 from kiteline_bench.reality.cpu import yardstick_ms
 from kiteline_core.frame import ImuBatch, joined
+from kiteline_hw.ports import SourceError
 from kiteline_hw.system.cpu import CpuQuota
 
 
@@ -182,15 +183,17 @@ def test_start_to_first_pose_is_measured(recording: Path) -> None:
 
 
 def test_memory_is_measured_over_minutes(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    trial = ["soak", str(recording), "--minutes", "0.03"]
-    assert processes.main(trial) == 0
-    here = json.loads(capsys.readouterr().out.splitlines()[-1])
-    for found in (here, processes.start(*trial, "--link")):
+    for link in ((), ("--link",)):
+        assert processes.main(["soak", str(recording), "--minutes", "0.03", *link]) == 0
+        found = json.loads(capsys.readouterr().out.splitlines()[-1])
         assert found["rss_mib"] == [] and found["lost"] == 0  # not one whole minute
 
 
-def test_trial_that_fails_says_why(tmp_path: Path) -> None:
-    with pytest.raises(RuntimeError, match="first-pose"):
+def test_trial_that_fails_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(SourceError):
+        processes.main(["first-pose", str(tmp_path / "nothing")])
+    monkeypatch.setattr(processes, "_MODULE", "json.tool")  # any program that fails: this one starts at once
+    with pytest.raises(RuntimeError, match=r"(?s)^first-pose .*nothing: .*No such file"):
         processes.start("first-pose", str(tmp_path / "nothing"))
 
 

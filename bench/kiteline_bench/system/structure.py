@@ -11,6 +11,8 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[3]
 ROOMS = ("core", "codec", "hw", "agent", "basestation", "lab", "bench", "cli")
 
+_BLOCKS = ("body", "orelse", "finalbody", "handlers", "cases")  # fields of a statement that hold statements
+
 Graph = Mapping[str, set[str]]
 
 
@@ -48,8 +50,11 @@ class Sources:
         }
 
     def _imported(self, path: Path) -> set[str]:
-        found = set()
-        for node in ast.walk(ast.parse(path.read_text())):
+        found, nodes = set(), list[ast.AST](ast.parse(path.read_text()).body)
+        while nodes:
+            node = nodes.pop()
+            # statements alone: most of a tree is expressions, in which nothing is imported
+            nodes += [one for block in _BLOCKS for one in getattr(node, block, ())]
             names = []
             if isinstance(node, ast.Import):
                 names = [alias.name for alias in node.names]

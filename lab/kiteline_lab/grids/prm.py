@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_lab.grids.files import FREE, GridFile
-from kiteline_lab.grids.prm_kernels import roads_free
+from kiteline_lab.grids.prm_kernels import roads_free, spaced_places
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -134,11 +134,6 @@ def draw_nodes(free: Bool, config: GridEvalConfig, rng: np.random.Generator) -> 
     """Draw nodes (n,2), column and row in cells, at random in free cells and at least the spacing apart."""
     row, column = np.nonzero(free)
     apart = config.spacing * np.sqrt(len(row) / config.nodes)
-    chosen = np.zeros((0, 2))
-    for i in rng.permutation(len(row)):
-        place = np.array([column[i] + 0.5, row[i] + 0.5])
-        if not len(chosen) or ((chosen - place) ** 2).sum(axis=1).min() >= apart**2:
-            chosen = np.concatenate([chosen, place[None]])
-            if len(chosen) == config.nodes:
-                break
-    return chosen
+    places = np.asarray(np.column_stack([column, row]) + 0.5, np.float64)[rng.permutation(len(row))]
+    chosen = np.empty((config.nodes, 2))
+    return chosen[: spaced_places(places, apart, chosen)]

@@ -1,4 +1,4 @@
-"""Kernel that checks straight roads on a grid. Arrays in, caller's arrays out."""
+"""Kernels of road maps on a grid: places at a distance, straight roads. Arrays in, caller's arrays out."""
 
 from __future__ import annotations
 
@@ -10,6 +10,28 @@ from kiteline_core.jit import njit
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 Bool = NDArray[np.bool_]
+
+
+@njit
+def spaced_places(places: F64, apart: float, chosen: F64) -> int:
+    """Choose from places (n,2), in their order, those that lie at least `apart` from all chosen before.
+
+    chosen: (m,2), filled until it is full. Returns how many were chosen.
+    """
+    count = 0
+    for i in range(places.shape[0]):
+        if count == chosen.shape[0]:
+            break
+        near = False
+        for k in range(count):
+            dx, dy = places[i, 0] - chosen[k, 0], places[i, 1] - chosen[k, 1]
+            if dx * dx + dy * dy < apart * apart:
+                near = True
+                break
+        if not near:
+            chosen[count, 0], chosen[count, 1] = places[i, 0], places[i, 1]
+            count += 1
+    return count
 
 
 @njit

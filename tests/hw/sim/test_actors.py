@@ -27,7 +27,7 @@ def casts(source: SimSource, k: int) -> tuple[np.ndarray, np.ndarray, np.ndarray
 def test_people_cover_what_is_behind_them_and_nothing_else() -> None:
     crowd, empty = (open_sim("room", seconds=8.0, people=n, **SMALL) for n in (5, 0))
     seen = 0
-    for k in range(20, 160, 10):
+    for k in range(20, 160, 20):
         radiance, distance, hits = casts(crowd, k)
         still, behind, _ = casts(empty, k)
         person = hits >= 6 * len(crowd.world.boxes)
@@ -39,7 +39,7 @@ def test_people_cover_what_is_behind_them_and_nothing_else() -> None:
             border |= np.roll(person, (dy, dx), (0, 1))
         changed = (radiance != still) & ~person & ~border
         assert changed.mean() < 0.005
-    assert seen >= 4
+    assert seen >= 2
 
 
 def test_people_walk_and_keep_off_the_camera() -> None:

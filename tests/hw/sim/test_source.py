@@ -56,7 +56,7 @@ def test_samples_come_in_order_up_to_each_frame() -> None:
 
 
 def test_images_have_the_statistics_of_photographs() -> None:
-    source = open_sim("room", scale=0.5, seconds=12.0)
+    source = open_sim("room", scale=0.5, seconds=12.0, texture_bits=9)
     eyes = source.cameras()
     for k in (40, 120, 200):
         image = source.render(k, eyes).left

@@ -15,7 +15,7 @@ from kiteline_lab.evaluation.trajectories import TrajectoryError
 from kiteline_lab.grids.evaluate import between_paths, main
 from kiteline_lab.grids.files import GridFile, GridFileError, planar, read_grid
 from kiteline_lab.grids.prm import GridEvalConfig, draw_nodes, free_cells, score
-from kiteline_lab.grids.prm_kernels import roads_free
+from kiteline_lab.grids.prm_kernels import roads_free, spaced_places
 
 FEW = GridEvalConfig(draws=5, nodes=40)
 
@@ -91,6 +91,18 @@ def test_nodes_keep_their_distance_and_lie_in_free_cells() -> None:
     assert free[nodes[:, 1].astype(int), nodes[:, 0].astype(int)].all()
     gaps = np.linalg.norm(nodes[:, None] - nodes[None], axis=2)[np.triu_indices(40, 1)]
     assert gaps.min() >= 0.5 * math.sqrt(50 * 70 / 40)
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 30))
+def test_places_are_chosen_one_after_the_other(seed: int, room: int) -> None:
+    rng = np.random.default_rng(seed)
+    places, apart = rng.integers(0, 12, (60, 2)) + 0.5, rng.uniform(0.0, 4.0)
+    expected: list[np.ndarray] = []
+    for place in places:
+        if len(expected) < room and all(np.linalg.norm(place - other) >= apart for other in expected):
+            expected.append(place)
+    chosen = np.empty((room, 2))
+    assert np.array_equal(chosen[: spaced_places(places, apart, chosen)], np.array(expected))
 
 
 @given(st.integers(0, 2**32 - 1))
