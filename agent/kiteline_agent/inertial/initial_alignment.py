@@ -9,6 +9,7 @@ motion", 2014). The gyro bias and the refinement that imposes the length of grav
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -109,22 +110,12 @@ def align(
         return None
     rotated = T_m_b[:, :3, :3] @ p_b_c
     camera = (T_m_b[:, :3, 3] + rotated).reshape(-1)
-    felt = _integrated(T_m_b, motions, bias)
-    integrated = (rotated + felt.p).reshape(-1)
-    # With q = 1 / s the noisy positions are alone on one side, so that noise does not bias the scale:
-    # p_c = p0 q + v0 q t + gravity q t^2 / 2 + jp bias q + integrated q
-    free = np.concatenate(
-        [
-            np.tile(np.eye(3), (n, 1)),
-            np.kron(felt.times[:, None], np.eye(3)),
-            felt.jp.reshape(-1, 3),
-            np.kron(0.5 * felt.times[:, None] ** 2, np.eye(3)),
-        ],
-        axis=1,
-    )
+    by_imu = _integrated(T_m_b, motions, bias)
+    integrated = (rotated + by_imu.p).reshape(-1)
+    free = _derivatives(by_imu)
     bias_weight = position_sigma_m / accel_bias_sigma
     if with_scale:
-        up, length = felt.v[-1], gravity_m_s2  # in the mean, an accelerometer measures the opposite of gravity
+        up, length = by_imu.v[-1], gravity_m_s2  # in the mean, an accelerometer measures the opposite of gravity
         unit = -up / float(np.linalg.norm(up))
     else:
         gravity = _free_gravity(free, camera - integrated, bias_weight)
@@ -132,12 +123,59 @@ def align(
         if not _GRAVITY_RANGE[0] * gravity_m_s2 < length < _GRAVITY_RANGE[1] * gravity_m_s2:
             return None
         unit = gravity / length
-    # impose the length: gravity q = length * (q unit + basis @ w), w in the tangent plane
+    found = _with_gravity_of_length(free, camera, integrated, unit, gravity_m_s2, bias_weight, with_scale=with_scale)
+    if found is None:
+        return None
+    x, q = found.x, found.q
+    rest = found.a @ x - found.b
+    gravity, change = gravity_m_s2 * found.unit, x[_BIAS] / q
+    velocities = x[_VELOCITY] / q + by_imu.times[:, None] * gravity + by_imu.v + by_imu.jv @ change
+    sigma = 0.0
+    if with_scale:
+        variance = max(float(rest @ rest) / (3 * n - 9), (_MIN_RESIDUAL * q) ** 2)
+        sigma = float(np.sqrt(variance * np.linalg.inv(found.a.T @ found.a)[_Q, _Q])) / q**2
+    residual = float(np.sqrt(np.mean(rest[: 3 * n] ** 2))) / q
+    error = abs(length / gravity_m_s2 - 1.0)
+    return ImuAlignment(velocities, gravity, bias[3:] + change, 1.0 / q, sigma, residual, error)
+
+
+def _derivatives(by_imu: _Integrated) -> F64:
+    """Derivatives (3n,12) of n positions by the first one, the first velocity, the bias and gravity.
+
+    With q = 1 / s the noisy positions are alone on one side of the equations, so that noise does not bias the scale:
+    p_c = p0 q + v0 q t + gravity q t^2 / 2 + jp bias q + integrated q.
+    """
+    times = by_imu.times[:, None]
+    columns = (
+        np.tile(np.eye(3), (len(times), 1)), np.kron(times, np.eye(3)), by_imu.jp.reshape(-1, 3),
+        np.kron(0.5 * times**2, np.eye(3)),
+    )  # fmt: skip
+    return np.concatenate(columns, axis=1)
+
+
+class _Solution(NamedTuple):
+    """Unknowns x, with a x = b in the least squares. q: 1 / scale, 1 if it is known. unit: (3,) along gravity."""
+
+    x: F64
+    a: F64
+    b: F64
+    q: float
+    unit: F64
+
+
+def _with_gravity_of_length(
+    free: F64, camera: F64, integrated: F64, unit: F64, length: float, bias_weight: float, *, with_scale: bool
+) -> _Solution | None:
+    """Solve with the length of gravity imposed; None if degenerate.
+
+    free: see `_derivatives`. camera, integrated: (3n,) positions in the map's unit, and by the IMU in m. unit: (3,)
+    first guess of gravity's direction. length: m/s^2. gravity q = length (q unit + basis w), w in the tangent plane.
+    """
     q = 1.0
     for _ in range(_ITERATIONS):
         basis = np.linalg.svd(unit[None, :])[2][1:].T
-        pull = integrated + gravity_m_s2 * free[:, _GRAVITY] @ unit
-        a = np.concatenate([free[:, : _GRAVITY.start], gravity_m_s2 * free[:, _GRAVITY] @ basis], axis=1)
+        pull = integrated + length * free[:, _GRAVITY] @ unit
+        a = np.concatenate([free[:, : _GRAVITY.start], length * free[:, _GRAVITY] @ basis], axis=1)
         b = camera - (0.0 if with_scale else pull)
         if with_scale:
             a = np.concatenate([a, pull[:, None]], axis=1)
@@ -150,16 +188,7 @@ def align(
             return None
         rotated_unit = q * unit + basis @ x[_TURNS]
         unit = rotated_unit / float(np.linalg.norm(rotated_unit))
-    rest = a @ x - b
-    gravity, change = gravity_m_s2 * unit, x[_BIAS] / q
-    velocities = x[_VELOCITY] / q + felt.times[:, None] * gravity + felt.v + felt.jv @ change
-    sigma = 0.0
-    if with_scale:
-        variance = max(float(rest @ rest) / (3 * n - 9), (_MIN_RESIDUAL * q) ** 2)
-        sigma = float(np.sqrt(variance * np.linalg.inv(a.T @ a)[_Q, _Q])) / q**2
-    residual = float(np.sqrt(np.mean(rest[: 3 * n] ** 2))) / q
-    error = abs(length / gravity_m_s2 - 1.0)
-    return ImuAlignment(velocities, gravity, bias[3:] + change, 1.0 / q, sigma, residual, error)
+    return _Solution(x, a, b, q, unit)
 
 
 def _free_gravity(free: F64, positions: F64, bias_weight: float) -> F64:
