@@ -24,6 +24,7 @@ from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraModel, CameraRig, RectifiedCamera, Rectifier
 from kiteline_core.geometry.disparity_offset import TERMS, terms
 from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId
+from tests.agent.plain_landmarks import plain_landmarks
 
 F64 = NDArray[np.float64]
 CAMERA = RectifiedCamera(752, 480, 430.0, 430.0, 376.0, 240.0, 0.11, True, np.eye(4))
@@ -101,11 +102,7 @@ class Flight:
         self.xyz = np.column_stack([normalised(uv), np.ones(len(uv))]) * self.depth[:, None]
         disparity = CAMERA.bf / self.depth + terms(normalised(uv)) @ offset + self.rng.normal(0, 0.2, len(uv))
         header = KeyframeHeader(KeyframeId(0), 0, NO_KEYFRAME, np.eye(4), len(uv))
-        templates = np.zeros((len(uv), 3, *self.map.templates.shape[2:]), np.uint8)
-        bytes_ = np.zeros(len(uv), np.uint8)
-        descriptors = np.zeros((len(uv), 32), np.uint8)
-        self.map.add(header, np.eye(4), uv, np.maximum(disparity, 0.1) / CAMERA.bf, np.full(len(uv), 0.01), bytes_,
-                     bytes_, descriptors, templates, 0)  # fmt: skip
+        self.map.add(header, np.eye(4), plain_landmarks(uv, np.maximum(disparity, 0.1) / CAMERA.bf, 0.01), 0)
 
     def frames(self, count: int) -> Iterator[tuple[F64, NDArray[np.int64], F64]]:
         """Pose, rows and observations of frames."""

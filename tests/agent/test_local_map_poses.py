@@ -25,6 +25,7 @@ from kiteline_codec.schema import (
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import KEYPOINT_BITS, NO_KEYFRAME, KeyframeId, SubmapId
+from tests.agent.plain_landmarks import plain_landmarks
 
 F64 = NDArray[np.float64]
 CAMERA = RectifiedCamera(752, 480, 400.0, 400.0, 370.0, 240.0, 0.11, True, np.eye(4))
@@ -43,9 +44,8 @@ def local_map(keyframes: int = 4, slots: int = 8, camera: RectifiedCamera = CAME
 def add(held: LocalMap, k: int, parent: int = NO_KEYFRAME) -> None:
     n = 30
     held.add(
-        KeyframeHeader(KeyframeId(k), k, KeyframeId(parent), np.eye(4), n), np.eye(4), np.full((n, 2), 200.0),
-        np.full(n, 1.0 / DEPTH_M), np.full(n, 1e-3), np.zeros(n, np.uint8), np.zeros(n, np.uint8),
-        np.zeros((n, 32), np.uint8), np.zeros((n, 3, 21, 21), np.uint8), k,
+        KeyframeHeader(KeyframeId(k), k, KeyframeId(parent), np.eye(4), n), np.eye(4),
+        plain_landmarks(np.full((n, 2), 200.0), 1.0 / DEPTH_M), k,
     )  # fmt: skip
 
 

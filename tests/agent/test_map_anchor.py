@@ -20,6 +20,7 @@ from kiteline_codec.schema import CulledLandmarks, KeyframeHeader, KeyframePose,
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, KeyframeId
+from tests.agent.plain_landmarks import plain_landmarks
 
 F64 = NDArray[np.float64]
 CAMERA = RectifiedCamera(752, 480, 450.0, 450.0, 370.0, 240.0, 0.11, True, np.eye(4))
@@ -36,9 +37,8 @@ def scene(seed: int = 0) -> tuple[LocalMap, Track]:
         uv = rng.uniform((80.0, 60.0), (680.0, 420.0), (LANDMARKS, 2))
         T_m_k = se3.exp(rng.normal(0.0, 0.05, 6))
         local_map.add(
-            KeyframeHeader(KeyframeId(k), 0, NO_KEYFRAME, T_m_k, LANDMARKS), T_m_k, uv, 1.0 / z,
-            np.full(LANDMARKS, 1e-3), np.zeros(LANDMARKS, np.uint8), np.zeros(LANDMARKS, np.uint8),
-            np.zeros((LANDMARKS, 32), np.uint8), np.zeros((LANDMARKS, 3, 21, 21), np.uint8), 0,
+            KeyframeHeader(KeyframeId(k), 0, NO_KEYFRAME, T_m_k, LANDMARKS), T_m_k,
+            plain_landmarks(uv, 1.0 / z), 0,
         )  # fmt: skip
         local_map.share(KeyframeId(k), LANDMARKS)
     rows = np.concatenate([k * local_map.slot_size + np.arange(IN_VIEW) for k in range(2)]).astype(np.int64)

@@ -14,6 +14,7 @@ from kiteline_codec.schema import KeyframeHeader, KeyframePose, RefinedLandmarks
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, KeyframeId, SubmapId
+from tests.agent.plain_landmarks import plain_landmarks
 
 CAMERA = RectifiedCamera(752, 480, 400.0, 400.0, 370.0, 240.0, 0.11, True, np.eye(4))
 CONFIG = AgentConfig()
@@ -38,9 +39,8 @@ class _Flight:
         T_p_k = _at(step_m if k else 0.0)
         T_m_k = self.map.T_m_k[self.map.slot_of(parent)] @ T_p_k if k else T_p_k
         self.map.add(
-            KeyframeHeader(KeyframeId(k), k, parent, T_p_k, n), T_m_k, np.full((n, 2), 200.0), np.full(n, 0.25),
-            np.full(n, 1e-3), np.zeros(n, np.uint8), np.zeros(n, np.uint8), np.zeros((n, 32), np.uint8),
-            np.zeros((n, 3, 21, 21), np.uint8), k,
+            KeyframeHeader(KeyframeId(k), k, parent, T_p_k, n), T_m_k,
+            plain_landmarks(np.full((n, 2), 200.0), 0.25), k,
         )  # fmt: skip
 
     def find_offset(self) -> None:

@@ -21,6 +21,7 @@ from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, KeyframeId, SubmapId
 from kiteline_core.pose import pose_kernels
+from tests.agent.plain_landmarks import plain_landmarks
 from tests.core.helpers_from_python import from_python
 
 F64 = NDArray[np.float64]
@@ -55,8 +56,7 @@ def map_of(observed: F64, T_m_k: F64 | None = None) -> LocalMap:
     n = len(observed)
     local_map.add(
         KeyframeHeader(KeyframeId(0), 0, NO_KEYFRAME, np.eye(4), n), np.eye(4) if T_m_k is None else T_m_k,
-        observed[:, :2], observed[:, 2] / CAMERA.bf, np.full(n, 1e-4), np.zeros(n, np.uint8), np.zeros(n, np.uint8),
-        np.zeros((n, 32), np.uint8), np.zeros((n, 3, 21, 21), np.uint8), 0,
+        plain_landmarks(observed[:, :2], observed[:, 2] / CAMERA.bf, 1e-4), 0,
     )  # fmt: skip
     return local_map
 

@@ -21,6 +21,7 @@ from kiteline_codec.schema import KeyframeHeader, KeyframePose, SubmapPlacement
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, keyframe_id, submap_id
+from tests.agent.plain_landmarks import plain_landmarks
 
 F64 = NDArray[np.float64]
 SECOND_NS = 1_000_000_000
@@ -116,9 +117,8 @@ def flown(rng: np.random.Generator) -> tuple[Corrections, LocalMap]:
     n, uv = 20, rng.uniform((80.0, 60.0), (680.0, 420.0), (20, 2))
     for k, T_m_k in enumerate(keyframes(rng, 5)):
         local_map.add(
-            KeyframeHeader(keyframe_id(SUBMAP, k), k, NO_KEYFRAME, T_m_k, n), T_m_k, uv, np.full(n, 0.3),
-            np.full(n, 1e-3), np.zeros(n, np.uint8), np.zeros(n, np.uint8), np.zeros((n, 32), np.uint8),
-            np.zeros((n, 3, 21, 21), np.uint8), k,
+            KeyframeHeader(keyframe_id(SUBMAP, k), k, NO_KEYFRAME, T_m_k, n), T_m_k,
+            plain_landmarks(uv, 0.3), k,
         )  # fmt: skip
     corrections = Corrections(
         local_map, MapCache(camera, config.map_cache, config.matching, config.ransac, None), config.smoothing

@@ -21,6 +21,7 @@ from kiteline_agent.imaging.feature_kernels import BORDER
 from kiteline_agent.imaging.features import Pyramid
 from kiteline_agent.keyframes.policy import KeyframeNeed, Situation, coverage, keyframe_need
 from kiteline_agent.keyframes.reference import ReferenceKeyframe
+from kiteline_agent.local_map.keyframe_landmarks import KeyframeLandmarks
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.relocalisation.map_cache import MapCache
 from kiteline_agent.step import Identity
@@ -243,7 +244,6 @@ class SharedKeyframes:
         centre, rho = np.array([[self._camera.cx, self._camera.cy]]), np.array([1.0 / self._typical_depth(frame)])
         blank = np.zeros((1, TEMPLATE_LEVELS, TEMPLATE, TEMPLATE), np.uint8)
         none = np.zeros(1, np.uint8)
-        self._map.add(
-            header, T_m_k, centre, rho, rho, none, none, np.zeros((1, 32), np.uint8), blank, frame.number
-        )  # fmt: skip
+        one = KeyframeLandmarks(centre, rho, rho, none, none, np.zeros((1, 32), np.uint8), blank)
+        self._map.add(header, T_m_k, one, frame.number)
         self._map.share(header.keyframe, 0)

@@ -188,7 +188,7 @@ def _with_gravity_of_length(
             return None
         rotated_unit = q * unit + basis @ x[_TURNS]
         unit = rotated_unit / float(np.linalg.norm(rotated_unit))
-    return _Solution(x, a, b, q, unit)
+    return _Solution(np.asarray(x), a, b, q, np.asarray(unit, np.float64))
 
 
 def _free_gravity(free: F64, positions: F64, bias_weight: float) -> F64:

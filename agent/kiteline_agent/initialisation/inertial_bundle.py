@@ -336,29 +336,29 @@ class InertialBundle:
         lens = step[STATE * n + SHARED :]
         landmark = -(system.inv @ system.bp[..., None])[..., 0] - system.iw @ np.append(x[:, :6].ravel(), lens)
         # A map that grows is the same to the camera, but a linear step of inverse depths is not: the growth in the step
-        # is applied exactly, and the rest of the step to the grown map.
+        # is applied exactly, and the rest of the step to the longer map.
         dp, dv = x[:, 3:6], x[:, 6:9]
-        grown = self._growth(state, dp) if gravity.any() else 0.0
-        along, origin = self._grown(state, grown)
+        share = self._lengthened_by(state, dp) if gravity.any() else 0.0
+        along, origin = self._with_longer_lengths(state, share)
         landmark -= along
         away = state.p - state.p[0] + (state.R - state.R[0]) @ self._t_bc  # cameras from the first one
-        p = state.p + dp + grown * (dp - grown * away)
-        v = state.v + dv + grown * (dv - grown * state.v)
+        p = state.p + dp + share * (dp - share * away)
+        v = state.v + dv + share * (dv - share * state.v)
         return WindowState(
             R, p, v, state.accel_bias + x[:, 9:],
             state.gyro_bias + shared[:3], gravity,
-            state.m + landmark[:, :2], np.maximum((state.rho + landmark[:, 2]) / (1.0 + grown), 1e-4), origin,
+            state.m + landmark[:, :2], np.maximum((state.rho + landmark[:, 2]) / (1.0 + share), 1e-4), origin,
             state.lens + lens,
         )  # fmt: skip
 
-    def _growth(self, state: WindowState, step: F64) -> float:
+    def _lengthened_by(self, state: WindowState, step: F64) -> float:
         """Share by which a step (K,3) of the positions lengthens all lengths."""
         spread = state.p - state.p.mean(axis=0)
         square = float((spread**2).sum())
         found = float((spread * step).sum()) / square if square > 0.0 else 0.0
         return float(np.clip(found, -_MOST_GROWTH, _MOST_GROWTH))
 
-    def _grown(self, state: WindowState, share: float) -> tuple[F64, F64]:
+    def _with_longer_lengths(self, state: WindowState, share: float) -> tuple[F64, F64]:
         """Change (P,3) of (m, rho) at the old origins, to first order, and new origins (P,3), if lengths grow so."""
         first = state.p[0] + state.R[0] @ self._t_bc  # the first camera, which stays
         away = share * (state.origin - first + self._rays(state) / state.rho[:, None])

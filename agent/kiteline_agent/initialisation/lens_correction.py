@@ -22,12 +22,12 @@ def moved(xy: F64, lens: F64) -> F64:
     """Where the calibrated camera shows true places (...,2). lens: (8,)."""
     x, y = xy[..., 0], xy[..., 1]
     square = np.minimum(x * x + y * y, FARTHEST)
-    grown = lens[0] + square * (lens[3] + square * lens[4])
+    radial = lens[0] + square * (lens[3] + square * lens[4])
     about_x, about_y, about_z = lens[5:]
     return np.stack(
         [
-            x * (1.0 + grown) + lens[1] + x * y * about_x - (1.0 + x * x) * about_y + y * about_z,
-            y * (1.0 + grown) + lens[2] + (1.0 + y * y) * about_x - x * y * about_y - x * about_z,
+            x * (1.0 + radial) + lens[1] + x * y * about_x - (1.0 + x * x) * about_y + y * about_z,
+            y * (1.0 + radial) + lens[2] + (1.0 + y * y) * about_x - x * y * about_y - x * about_z,
         ],
         axis=-1,
     )

@@ -15,6 +15,7 @@ from kiteline_agent.governor.cost_model import Work
 from kiteline_agent.imaging import alignment_kernels
 from kiteline_agent.imaging.row_alignment import RowAlignment
 from kiteline_agent.keyframes.new_landmarks import NewPoints, moved_to_frame, new_points
+from kiteline_agent.local_map.keyframe_landmarks import KeyframeLandmarks
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_agent.tracking.track import Track
@@ -177,10 +178,10 @@ class KeyframeMaker:
         parent = self._map.slot_of(header.parent)
         if header.parent != NO_KEYFRAME and parent >= 0:
             header = replace(header, T_p_k=se3.orthonormalise(se3.inverse(self._map.T_m_k[parent]) @ T_m_k))
-        slot = self._map.add(
-            header, T_m_k, uv, rho, sigma, octave, landmarks.angle, landmarks.descriptor, templates, ctx.number,
-            np.argsort(order),
-        )  # fmt: skip
+        new = KeyframeLandmarks(
+            uv, rho, sigma, octave, landmarks.angle, landmarks.descriptor, templates, np.argsort(order)
+        )
+        slot = self._map.add(header, T_m_k, new, ctx.number)
         self._map.rolled[slot] = ctx.shutter is None
         return seen_uv
 

@@ -87,9 +87,9 @@ class DisparityAlignment:
         for slot in slots[counts >= config.min_points].tolist():
             if self._keyframe[slot] != m.keyframe[slot]:
                 self._begin(slot)
-        grown = {slot: self._grown(slot, T_c_m) for slot in slots[counts >= config.min_points].tolist()}
-        slot = max(grown, key=lambda s: grown[s], default=None)
-        if slot is None or grown[slot] < config.growth:
+        ratios = {slot: self._parallax_ratio(slot, T_c_m) for slot in slots[counts >= config.min_points].tolist()}
+        slot = max(ratios, key=lambda s: ratios[s], default=None)
+        if slot is None or ratios[slot] < config.growth:
             return None
         if self._add_pair(slot, T_c_m, rows, observed):
             self._solve()
@@ -152,7 +152,7 @@ class DisparityAlignment:
         usable = self._map.usable[slot]
         return float(np.linalg.norm(T[:3, 3]) * median(self._map.rho[slot, usable])) if usable.any() else 0.0
 
-    def _grown(self, slot: int, T_c_m: F64) -> float:
+    def _parallax_ratio(self, slot: int, T_c_m: F64) -> float:
         """Parallax to a keyframe over that of its last pair."""
         return self._parallax_of(slot, T_c_m) / max(float(self._parallax[slot]), _LEAST_PARALLAX)
 

@@ -18,6 +18,7 @@ from kiteline_agent.config import DepthFilterConfig, LocalMapConfig
 from kiteline_agent.imaging.alignment_kernels import TEMPLATE, TEMPLATE_LEVELS
 from kiteline_agent.local_map import projection_kernels as kernels
 from kiteline_agent.local_map.held_corrections import HeldCorrections, Removed
+from kiteline_agent.local_map.keyframe_landmarks import KeyframeLandmarks
 from kiteline_codec.schema import KeyframeHeader, KeyframePose, RefinedLandmarks
 from kiteline_core.geometry import disparity_offset, se3
 from kiteline_core.geometry.cameras import RectifiedCamera
@@ -117,17 +118,9 @@ class LocalMap:
         """Landmark ids (n,) of rows (n,)."""
         return np.asarray((self.keyframe[rows // self.slot_size] << KEYPOINT_BITS) | (rows % self.slot_size))
 
-    def add(
-        self, head: KeyframeHeader, T_m_k: F64, uv: F64, rho: F64, sigma_rho: F64, octave: NDArray[np.uint8],
-        angle: NDArray[np.uint8], descriptor: NDArray[np.uint8], templates: NDArray[np.uint8], frame_number: int,
-        order: I64 | None = None,
-    ) -> int:  # fmt: skip
-        """Store a keyframe with its new landmarks, and return its slot. The slot seen least recently is evicted.
-
-        uv: (n,2) px. rho, sigma_rho: (n,) 1/m; rho 0: without depth, a seed.
-        angle: (n,) in 1/256 turns. descriptor: (n,32). templates: (n,3,21,21). order: (n,) in which landmarks
-        are candidates, if nothing else decides; None for their own.
-        """
+    def add(self, head: KeyframeHeader, T_m_k: F64, new: KeyframeLandmarks, frame_number: int) -> int:
+        """Store a keyframe with its new landmarks, and return its slot. The slot seen least recently is evicted."""
+        uv, rho = new.uv, new.rho
         slot = self._free_slot(head.parent)
         self.held.forget(KeyframeId(int(self.keyframe[slot])))
         n = min(len(uv), self.slot_size)
@@ -137,13 +130,13 @@ class LocalMap:
         self.from_base[slot] = False
         self.last_seen[slot] = frame_number
         self.counts[slot] = n
-        self.order[slot, :n] = np.arange(n) if order is None else order[order < n]
+        self.order[slot, :n] = np.arange(n) if new.order is None else new.order[new.order < n]
         self.usable[slot] = self.removed[slot] = False
         self.usable[slot, :n] = rho[:n] > 0.0
         self.uv[slot, :n] = uv[:n]
         self.bearing[slot, :n] = self._bearings(uv[:n])
         self.rho[slot, :n] = np.where(rho[:n] > 0.0, rho[:n], 1.0 / _SEED_DEPTH_M)
-        self.sigma_rho[slot, :n] = np.where(rho[:n] > 0.0, sigma_rho[:n], 0.0)  # 0: not initialised
+        self.sigma_rho[slot, :n] = np.where(rho[:n] > 0.0, new.sigma_rho[:n], 0.0)  # 0: not initialised
         self.measured[slot] = False
         self.measured[slot, :n] = rho[:n] > 0.0
         self.disparity[slot] = 0.0
@@ -151,8 +144,8 @@ class LocalMap:
         self.seed[slot] = False
         self.seed[slot, :n] = rho[:n] <= 0.0
         self._has_new_seeds = True
-        self.octave[rows], self.angle[rows], self.descriptor[rows] = octave[:n], angle[:n], descriptor[:n]
-        self.templates[rows] = templates[:n]
+        self.octave[rows], self.angle[rows], self.descriptor[rows] = new.octave[:n], new.angle[:n], new.descriptor[:n]
+        self.templates[rows] = new.templates[:n]
         self.tried[rows], self.hits[rows], self.misses[rows], self.last_hit[rows] = 0, 0, 0, frame_number
         return slot
 
