@@ -6,6 +6,7 @@ import importlib.util
 import time
 from collections import deque
 from collections.abc import Callable, Collection, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +36,7 @@ from kiteline_hw.lockstep.shared_core import SharedCore
 from kiteline_hw.logs.log_budget import LogBudget
 from kiteline_hw.logs.mcap_log import LogWriter
 from kiteline_hw.ports import SourceError
-from kiteline_hw.sim.links.link_model import LinkModelConfig, LinkModels
+from kiteline_hw.sim.links.link_model import LinkModelConfig, LinkModels, link_seed
 from kiteline_hw.system import process
 from kiteline_hw.system.memory import rss_mib
 from kiteline_hw.system.notices import Notices
@@ -109,7 +110,7 @@ class BaseRuntime:
             loss=options.loss, duplicate=options.disorder, reorder=options.disorder,
             delay_ns=round(options.delay_s * 1e9),
         )  # fmt: skip
-        self._links = LinkModels(disorder, options.seed * 64 + 32)
+        self._links = LinkModels(disorder, partial(link_seed, options.seed, up=False))
         self._imports: list[Import] = []
 
     def _open_log(self, about: Mapping[str, str]) -> LogWriter | None:

@@ -11,6 +11,7 @@ from kiteline_basestation.runtime.options import BaseOptions
 from kiteline_core.frame import Frame
 from kiteline_core.ids import MAX_BOOTS
 from kiteline_hw.ports import FrameSource, SourceError, is_live
+from kiteline_hw.sim.links.link_model import link_seed
 from kiteline_hw.sources.open import open_source
 from kiteline_hw.system import process
 
@@ -90,7 +91,7 @@ def plan(o: Options, quiet: bool = False) -> FlightPlan:
                 config=o.config, rig=o.rig, calibration=o.calibration, grid=o.grid, tracker=o.tracker,
                 start_ns=starts[k], seconds=o.seconds, up_bytes_s=o.up_bytes_s, profile=o.profile,
                 delay_s=o.delay_s, loss=o.loss, disorder=o.loss,
-                seed=o.seed * 64 + k % 32 + (k // 32 << 32), cpu_percent=o.cpu_percent,
+                seed=link_seed(o.seed, k, up=True), cpu_percent=o.cpu_percent,
                 kill_at_s=o.kill_agent_at_s if k == 0 else None,
                 await_base_at_s=o.restart_base_at_s, await_bases=bool(o.base_kills),
             )

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kiteline_hw.sim.links.link_model import LinkModel, LinkModelConfig, LinkModels
+from kiteline_hw.sim.links.link_model import LinkModel, LinkModelConfig, LinkModels, link_seed
 
 chances = st.floats(0.0, 1.0)
 configs = st.builds(
@@ -133,7 +133,7 @@ def test_invalid_settings(bad: dict[str, float]) -> None:
 
 def test_each_receiver_has_a_link_of_its_own() -> None:
     config = LinkModelConfig(loss=0.5, delay_ns=10)
-    links, alone = LinkModels(config, 40), LinkModel(config, 43)
+    links, alone = LinkModels(config, lambda to: 40 + to), LinkModel(config, 43)
     assert links.deliver(0) == {}
     packets = [bytes([k]) for k in range(100)]
     links.send(3, packets, 0)
@@ -144,3 +144,8 @@ def test_each_receiver_has_a_link_of_its_own() -> None:
     delivered = links.deliver(10)
     assert list(delivered) == [1, 3]
     assert delivered[3] == tuple(alone.deliver(10)) != delivered[1]
+
+
+def test_no_two_directions_of_256_agents_in_neighbouring_flights_share_a_seed() -> None:
+    seeds = {link_seed(flight, agent, up=up) for flight in range(4) for agent in range(256) for up in (False, True)}
+    assert len(seeds) == 4 * 256 * 2

@@ -9,7 +9,7 @@ from __future__ import annotations
 import heapq
 import random
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields
 
 
@@ -144,20 +144,25 @@ class LinkModel:
         return self._in_transit[0][0] if self._in_transit else None
 
 
+def link_seed(flight: int, agent: int, *, up: bool) -> int:
+    """Seed of one direction of an agent's link: no two agents, directions or flights (below 2^26) share one."""
+    return flight * 64 + (0 if up else 32) + agent % 32 + (agent // 32 << 32)
+
+
 class LinkModels:
     """One direction of the links to any number of receivers, each created at its first packet."""
 
-    def __init__(self, config: LinkModelConfig, seed: int) -> None:
-        """seed: of the link to receiver 0; receiver n uses seed + n."""
+    def __init__(self, config: LinkModelConfig, seed_of: Callable[[int], int]) -> None:
+        """seed_of: the seed of the link to a receiver."""
         self._config = config
-        self._seed = seed
+        self._seed_of = seed_of
         self._links: dict[int, LinkModel] = {}
 
     def send(self, to: int, packets: Iterable[bytes], now_ns: int) -> None:
         """Send packets to a receiver."""
         for packet in packets:
             if to not in self._links:
-                self._links[to] = LinkModel(self._config, self._seed + to)
+                self._links[to] = LinkModel(self._config, self._seed_of(to))
             self._links[to].send(packet, now_ns)
 
     def deliver(self, now_ns: int) -> dict[int, tuple[bytes, ...]]:
