@@ -56,7 +56,6 @@ def fly_live(options: BaseOptions, parent: process.Parent | None, stop: process.
         link = open_link(options.link, "base", framer=StreamFramer, required=False, logins=logins)
         stack.callback(link.close)
         seals = BaseSeals(options, link)
-        hub = seals.hub
         page = _open_page(options, clock.now_ns(), stack)
         workers = Workers(options.workers)
         stack.callback(workers.close)
@@ -74,42 +73,69 @@ def fly_live(options: BaseOptions, parent: process.Parent | None, stop: process.
         if parent is not None:
             parent.send_event("ready")
         terminal = TerminalReporter(base.station) if parent is None and not options.quiet else None
-        begin_ns, stepped_ns = clock.now_ns(), 0
         if terminal is not None:
             store = f"store {options.store}" if options.store else "no --store: the map is not saved"
             process.print_lines([f"base on {options.link}, session {options.session}, {store}", *options.told])
+        loop = _Loop(base, seals, workers, questions, clock, parent, terminal)
         while not stop:
-            now_ns = clock.now_ns()
-            packets = {agent: received for agent, end in hub.links().items() if (received := end.receive())}
-            done = workers.done(now_ns)
-            process.print_lines([*workers.take_notes(), *seals.lines(now_ns)])
-            commands = questions.commands()
-            if packets or done or commands or now_ns - stepped_ns >= _STEP_NS:
-                output = base.step(packets, done, now_ns, commands)
-                questions.answer(output.answers)
-                stepped_ns = now_ns
-                _raise_boots(seals.sealers, base.station)
-                _send(hub, base.outgoing(now_ns))
-                base.compare_digests(hub.alive())
-                if parent is None:
-                    process.print_lines(base.take_notices())
-                if terminal is not None:
-                    stored = None if base.keeper is None else base.keeper.idle
-                    process.print_lines(terminal.lines(hub.alive(), now_ns - begin_ns, base.rss_mib, stored))
+            now_ns = loop.turn()
             if page is not None:
                 page.update(base.station, now_ns)
-            if parent is not None and parent.next_line() == "frames_over":
-                base.end_of_frames()
             process.notify("WATCHDOG=1")
             stop.wait(_POLL_S)
-        if terminal is not None:
-            process.print_lines([f"stopped: {terminal.summary()}"])
+        loop.end()
+    return all(closed)
+
+
+class _Loop:
+    """The loop of a live base: a step where something has arrived, or none was for _STEP_NS."""
+
+    def __init__(
+        self, base: BaseRuntime, seals: BaseSeals, workers: Workers, questions: Questions, clock: MonotonicClock,
+        parent: process.Parent | None, terminal: TerminalReporter | None,
+    ) -> None:  # fmt: skip
+        """parent: the process that started this one. terminal: what people are told; None with a parent or --quiet."""
+        self._base, self._seals, self._workers, self._questions = base, seals, workers, questions
+        self._clock, self._parent, self._terminal = clock, parent, terminal
+        self._begin_ns, self._stepped_ns = clock.now_ns(), 0
+
+    def turn(self) -> int:
+        """Take in what has arrived, step if that is due, and send; the time of the turn."""
+        now_ns, hub = self._clock.now_ns(), self._seals.hub
+        packets = {agent: received for agent, end in hub.links().items() if (received := end.receive())}
+        done = self._workers.done(now_ns)
+        process.print_lines([*self._workers.take_notes(), *self._seals.lines(now_ns)])
+        commands = self._questions.commands()
+        if packets or done or commands or now_ns - self._stepped_ns >= _STEP_NS:
+            output = self._base.step(packets, done, now_ns, commands)
+            self._questions.answer(output.answers)
+            self._stepped_ns = now_ns
+            _raise_boots(self._seals.sealers, self._base.station)
+            _send(hub, self._base.outgoing(now_ns))
+            self._base.compare_digests(hub.alive())
+            self._tell(hub, now_ns)
+        if self._parent is not None and self._parent.next_line() == "frames_over":
+            self._base.end_of_frames()
+        return now_ns
+
+    def end(self) -> None:
+        """Tell how it ended: the terminal, or the parent."""
+        base, parent = self._base, self._parent
+        if self._terminal is not None:
+            process.print_lines([f"stopped: {self._terminal.summary()}"])
         base.end_of_frames()
         if parent is not None and base.at_last_frame is not None:
             parent.send_event("flown", keyframes=base.at_last_frame.keyframes)
             parent.send_event("result", report=base.report(), keyframes=base.summary().keyframes)
         process.print_lines(base.take_notices())
-    return all(closed)
+
+    def _tell(self, hub: LinkHub, now_ns: int) -> None:
+        base = self._base
+        if self._parent is None:
+            process.print_lines(base.take_notices())
+        if self._terminal is not None:
+            stored = None if base.keeper is None else base.keeper.idle
+            process.print_lines(self._terminal.lines(hub.alive(), now_ns - self._begin_ns, base.rss_mib, stored))
 
 
 def _raise_boots(sealers: Mapping[int, Sealer], station: Station) -> None:
