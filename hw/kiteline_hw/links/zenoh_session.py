@@ -29,9 +29,15 @@ _EXIT_TIMEOUT_S = 6.0  # s for sessions that are closed at the end of the proces
 CONNECT_TIMEOUT_MS = 4000  # ms of one attempt to connect: two round trips with 900 ms of delay each way
 _RETRY_S = 0.1  # s between two attempts to connect
 _ROUTER = "router/"  # before a locator: a Zenoh router listens there, and both sides connect
+_SOURCE_LINE = re.compile(r"\.? at /\S+\.rs:\d+\.?")
 _WITHOUT_PORT = re.compile(r"(?P<host>(tcp|udp|tls|quic|ws)/(\[[^]]*\]|[^:?#]*)):?([?#].*)?")
 
 Role = Literal["client", "base"]
+
+
+def reason_of(error: zenoh.ZError) -> str:
+    """What Zenoh says of an error, without the lines of its own sources."""
+    return _SOURCE_LINE.sub("", str(error))
 
 
 def check_port(endpoint: str) -> None:
@@ -83,7 +89,7 @@ def session_config(
         for name, value in options.items():
             config.insert_json5(name, json.dumps(value))
     except zenoh.ZError as error:
-        raise LinkError(f"{endpoint!r} is no Zenoh endpoint ({error}); write tcp/HOST:PORT") from error
+        raise LinkError(f"{endpoint!r} is no Zenoh endpoint ({reason_of(error)}); write tcp/HOST:PORT") from error
     return config
 
 
@@ -126,8 +132,8 @@ def _opened(
         except zenoh.ZError as error:
             if role == "base" and not endpoint.startswith(_ROUTER):
                 raise LinkError(
-                    f"cannot listen on {endpoint} ({error}): is another base station running, and is the address "
-                    "one of this machine (tcp/0.0.0.0:PORT listens on all)?"
+                    f"cannot listen on {endpoint} ({reason_of(error)}): is another base station running, and is "
+                    "the address one of this machine (tcp/0.0.0.0:PORT listens on all)?"
                 ) from error
             if time.monotonic() >= deadline_s or (give_up is not None and give_up.is_set()):
                 who = "router" if endpoint.startswith(_ROUTER) else "base station"

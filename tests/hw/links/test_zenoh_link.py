@@ -246,6 +246,13 @@ def test_a_process_with_an_open_link_ends(way: str, status: int) -> None:
             process.communicate()
 
 
+def test_an_endpoint_that_is_taken_is_told_without_lines_of_zenohs_sources() -> None:
+    endpoint = free_endpoint()
+    with ZenohHub(endpoint), pytest.raises(LinkError, match="Address already in use") as caught:
+        ZenohHub(endpoint)
+    assert ".rs" not in str(caught.value)
+
+
 def test_bad_numbers_and_names() -> None:
     with pytest.raises(LinkError, match="expected 0 to 255"):
         ZenohLink("tcp/127.0.0.1:1", 256)
