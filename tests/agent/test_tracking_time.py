@@ -12,6 +12,7 @@ from kiteline_agent.runtime import agent_runtime
 from kiteline_agent.runtime.agent_runtime import AgentRuntime
 from kiteline_agent.runtime.flight_record import FlightRecord
 from kiteline_agent.runtime.options import AgentOptions
+from kiteline_agent.step import StepInput
 from kiteline_hw.sources.open import open_source
 
 
@@ -29,7 +30,7 @@ def test_a_slow_log_is_no_part_of_the_tracking_time(
         assert now_ns is not None
         frame, imu, odometry = runtime.reader.take()
         begin_s = time.monotonic()
-        runtime.step(frame, imu, (), now_ns, odometry)
+        runtime.step(StepInput(frame, imu, odometry=odometry), now_ns)
         whole_ms.append(1e3 * (time.monotonic() - begin_s))
     for tracking_ms, step_ms in zip(runtime.report()["timing"]["tracking_ms"], whole_ms, strict=True):
         assert 0.0 < tracking_ms < step_ms - 99.0

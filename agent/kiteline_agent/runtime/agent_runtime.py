@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -35,7 +35,6 @@ from kiteline_agent.step import Identity, StepInput, StepOutput
 from kiteline_codec import warm as codec_warm
 from kiteline_codec.channel import CodedChannel, RecordChannel, settled
 from kiteline_core.config import ConfigError
-from kiteline_core.frame import Frame, ImuBatch, OdometryBatch
 from kiteline_core.ids import AgentId
 from kiteline_hw.links.kinds import link_traits
 from kiteline_hw.lockstep.messages import Down, Phase, Up
@@ -163,14 +162,15 @@ class AgentRuntime:
         """One tick of a lock-step flight: take the base's packets, and the next frame if it is due."""
         if down.phase is not Phase.FLY:
             self.end_of_frames()
-        frame = imu = odometry = None
+        given = StepInput(packets=tuple(down.packets))
         if self.next_ns is not None and self.next_ns <= down.now_ns:
             if self._core.newest_wins(self.next_ns, self.reader.period_ns):
                 self.reader.drop()
                 self.counts.dropped += 1
             else:
                 frame, imu, odometry = self.reader.take()
-        sent = self.step(frame, imu, down.packets, down.now_ns, odometry)
+                given = replace(given, frame=frame, imu=imu, odometry=odometry)
+        sent = self.step(given, down.now_ns)
         quiet, equal = settled(self.channel)
         return Up(self.next_ns, quiet, equal, tuple(sent))
 
@@ -215,18 +215,15 @@ class AgentRuntime:
         if self.flight_counts is None:
             self.flight_counts = self.counts.as_report()
 
-    def step(
-        self, frame: Frame | None, imu: ImuBatch | None, packets: Sequence[bytes], now_ns: int,
-        odometry: OdometryBatch | None = None, predict_ns: int | None = None,
-        publish: Callable[[StepOutput], None] | None = None,
-    ) -> list[bytes]:  # fmt: skip
-        """One step of the agent, logged and counted. Returns the packets to send.
+    def step(self, given: StepInput, now_ns: int, publish: Callable[[StepOutput], None] | None = None) -> list[bytes]:
+        """One step of the agent, logged and counted, with the CPU time of its last frame. Returns the packets to send.
 
         publish: gets the output before it is logged, since a flight controller waits for its pose.
         """
         self._account.begin()
         begin_ns = time.monotonic_ns()
-        step_input = StepInput(frame, imu, tuple(packets), self._last_cpu_ns, odometry, predict_ns)
+        frame, packets = given.frame, given.packets
+        step_input = replace(given, cpu_ns=self._last_cpu_ns)
         self.output = output = self.agent.step(step_input, now_ns)
         if publish is not None:
             publish(output)

@@ -25,13 +25,13 @@ from kiteline_agent.runtime.options import LOG_STEM, AgentOptions
 from kiteline_agent.runtime.pose_schedule import PoseSchedule
 from kiteline_agent.runtime.terminal import StatusMessages, summary
 from kiteline_agent.runtime.warm import WARMING
-from kiteline_agent.step import StepOutput
+from kiteline_agent.step import StepInput, StepOutput
 from kiteline_codec.channel import settled
 from kiteline_codec.sync.resumption import agent_session, order_of
 from kiteline_codec.transport.framing import StreamFramer
 from kiteline_codec.transport.seal import Direction, Opener, Sealer, suite_for
 from kiteline_codec.transport.seal_watch import SealWatch
-from kiteline_core.frame import Frame, ImuBatch, OdometryBatch
+from kiteline_core.frame import ImuBatch, OdometryBatch
 from kiteline_hw.links.kinds import link_traits
 from kiteline_hw.links.open import open_link
 from kiteline_hw.links.sealed_link import SealedLink
@@ -99,17 +99,13 @@ def fly_live(
 
 
 class _Due(NamedTuple):
-    """What a step of a live flight is given.
+    """What a step of a live flight is given, without packets.
 
-    captured_ns: of the frame on the clock of the process, or the time of the step. predict_ns: of a pose between
-    frames, as stamps of frames.
+    captured_ns: of the frame on the clock of the process, or the time of the step.
     """
 
     captured_ns: int
-    frame: Frame | None = None
-    imu: ImuBatch | None = None
-    odometry: OdometryBatch | None = None
-    predict_ns: int | None = None
+    given: StepInput
 
 
 class _LiveFlight:
@@ -151,10 +147,9 @@ class _LiveFlight:
             if due is None:
                 break
             push = None
-            if controller is not None and self._predicts_poses == (due.frame is None):
+            if controller is not None and self._predicts_poses == (due.given.frame is None):
                 push = partial(_push, controller, runtime.agent, due.captured_ns, runtime.options.boot, self._clock)
-            received = self._base.receive()
-            sent = runtime.step(due.frame, due.imu, received, now_ns, due.odometry, due.predict_ns, push)
+            sent = runtime.step(replace(due.given, packets=tuple(self._base.receive())), now_ns, push)
             self._base.send(sent, runtime.session)
             if controller is not None:
                 push_obstacles(controller, runtime.agent, runtime.output, self._obstacles, now_ns)
@@ -173,7 +168,7 @@ class _LiveFlight:
         while not self._stop and now_ns < end_ns and now_ns - quiet_ns < _QUIET_S * 1e9:
             self._stop.wait(_IDLE_TICK_S / 2)
             now_ns = self._clock.now_ns()
-            self._base.send(runtime.step(None, None, self._base.receive(), now_ns), runtime.session)
+            self._base.send(runtime.step(StepInput(packets=tuple(self._base.receive())), now_ns), runtime.session)
             if not all(settled(runtime.channel)):
                 quiet_ns = now_ns
             process.notify("WATCHDOG=1")
@@ -203,13 +198,13 @@ class _LiveFlight:
             if controller is not None:
                 odometry = _measured(controller.take_odometry(captured_ns), odometry, self._shift_ns)
                 imu = _measured(controller.take_imu(captured_ns), imu, self._shift_ns)  # late samples: next frame
-            return _Due(captured_ns, frame, imu, odometry)
+            return _Due(captured_ns, StepInput(frame, imu, odometry=odometry))
         if controller is None or not self._predictions.take_due(now_ns):
-            return _Due(now_ns)
+            return _Due(now_ns, StepInput())
         predict_ns = now_ns + self._shift_ns
         own = controller.take_imu(now_ns) if runtime.options.imu_of else None
         imu = _measured(own, runtime.reader.take_imu(predict_ns), self._shift_ns)
-        return _Due(now_ns, imu=imu, predict_ns=predict_ns)
+        return _Due(now_ns, StepInput(imu=imu, predict_ns=predict_ns))
 
     def _report(self, now_ns: int) -> None:
         """Tell the terminal, or the parent, how the flight goes."""

@@ -13,6 +13,7 @@ import numpy as np
 from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_agent.runtime.agent_runtime import AgentRuntime
 from kiteline_agent.runtime.options import AgentOptions
+from kiteline_agent.step import StepInput
 from kiteline_bench.harness.bars import Bar, Bench, at_most
 from kiteline_bench.vehicle.agent_process import favour
 from kiteline_core.frame import Frame, ImuBatch
@@ -66,12 +67,12 @@ def _fly(recording: str, raw: AgentRuntime, encoded: AgentRuntime) -> list[tuple
         turns = turns[:: 1 if len(out) % 2 else -1]  # the first one has the colder caches
         for runtime, frame, side in turns:
             mark_ns = time.process_time_ns()
-            runtime.step(frame, imu, (), now_ns)
+            runtime.step(StepInput(frame, imu), now_ns)
             spent[side] += (time.process_time_ns() - mark_ns) * 1e-6
         time.sleep(max(0.0, begin_s + (len(out) + 0.5) * _PERIOD_S - time.monotonic()))
         for runtime, _, side in turns:  # what was encoded meanwhile is written
             mark_ns = time.process_time_ns()
-            runtime.step(None, None, (), now_ns + round(0.5e9 * _PERIOD_S))
+            runtime.step(StepInput(), now_ns + round(0.5e9 * _PERIOD_S))
             spent[side] += (time.process_time_ns() - mark_ns) * 1e-6
         out.append((spent[0], spent[1]))
         if len(out) == _FRAMES:

@@ -21,6 +21,7 @@ from kiteline_agent.runtime import rig_file
 from kiteline_agent.runtime.agent_runtime import AgentRuntime, opened
 from kiteline_agent.runtime.controller import controller_link, with_controller_imu
 from kiteline_agent.runtime.options import AgentOptions, agent_config
+from kiteline_agent.step import StepInput
 from kiteline_core.errors import KitelineError
 from kiteline_core.geometry import se3
 from kiteline_hw.sources.kinds import source_forms
@@ -152,7 +153,7 @@ def _frames(runtime: AgentRuntime, options: AgentOptions, stack: ExitStack) -> I
         while runtime.next_ns is not None:
             now_ns = runtime.next_ns
             frame, imu, odometry = runtime.reader.take()
-            runtime.step(frame, imu, (), now_ns, odometry)
+            runtime.step(StepInput(frame, imu, odometry=odometry), now_ns)
             yield
         return
     clock, stop = MonotonicClock(), process.StopSignal()
@@ -169,5 +170,5 @@ def _frames(runtime: AgentRuntime, options: AgentOptions, stack: ExitStack) -> I
         captured_ns = begin_ns + runtime.next_ns
         frame, imu, odometry = runtime.reader.take()
         samples = None if controller is None else controller.take_imu(captured_ns)
-        runtime.step(frame, samples or imu, (), clock.now_ns(), odometry)
+        runtime.step(StepInput(frame, samples or imu, odometry=odometry), clock.now_ns())
         yield

@@ -111,7 +111,7 @@ def fly_hours(folder: Path, hours: float, cap_mib: int) -> LogDay:
     seen: dict[str, int] = {}
     for k in range(frames):
         frame, imu, odometry = cast(Any, runtime.reader).take()
-        runtime.step(frame, imu, (), frame.t_ns, odometry)
+        runtime.step(StepInput(frame, imu, odometry=odometry), frame.t_ns)
         if k % RATE_HZ == 0:
             day.notices += runtime.take_notices()
             _look(folder, day, seen)
