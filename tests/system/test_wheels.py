@@ -15,7 +15,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 # What a system with glibc 2.28 or newer takes: Raspberry Pi OS 11 has 2.31, Ubuntu 22.04 2.35. pip adds no older ones.
-# These are the names that auditwheel gives; pip compares each file of an index with all of them, half of its time.
+# Names that auditwheel gives: pip compares each file of an index with all of them, a fifth of its time with thirteen.
 PLATFORMS = [f"manylinux_2_{minor}_aarch64" for minor in (28, 27, 26, 24, 17)] + ["manylinux2014_aarch64"]
 UNREACHABLE = ("Name or service not known", "Temporary failure in name resolution", "Connection refused", "ProxyError",
                "Network is unreachable", "No route to host", "timed out", "Could not fetch URL")  # fmt: skip
