@@ -14,7 +14,6 @@ F64 = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 _MAX_SPEED = 1e3  # m/s and rad/s; more is a device fault
-_ROUNDING = 1e-3  # by which correlations may exceed 1, and their matrix be negative: some come in single precision
 _MAX_VARIANCE = 1e12  # (m/s)^2 and (rad/s)^2; more only loses precision
 _ANY_RATE = 100.0  # (rad/s)^2; any measured axis is far more precise
 _LIKELY_RATE = 0.25  # (rad/s)^2; rotation about an unmeasured axis of a calm vehicle
@@ -61,17 +60,14 @@ def chosen(batch: OdometryBatch, keep: Bools | slice) -> OdometryBatch:
 
 
 def usable(batch: OdometryBatch) -> Bools:
-    """Mask (n,) of samples with plausible values and covariances: positive semidefinite, but for what rounding does."""
+    """Mask (n,) of samples with plausible values, and covariances in which no two axes correlate by more than 1."""
     moving = np.concatenate([batch.velocity, batch.rate], axis=1)
     good = np.asarray((np.abs(moving) < _MAX_SPEED).all(axis=1))
     for cov in (batch.velocity_cov, batch.rate_cov):
         diagonal = np.diagonal(cov, axis1=1, axis2=2)
         good &= ((diagonal >= 0.0) & (diagonal < _MAX_VARIANCE)).all(axis=1)
         root = np.sqrt(np.where(good[:, None], diagonal, 0.0))
-        product = root[:, :, None] * root[:, None, :]
-        good &= (np.abs(cov) <= (1.0 + _ROUNDING) * product).all(axis=(1, 2))
-        correlation = np.where(good[:, None, None], cov, 0.0) / np.where(product > 0.0, product, 1.0)
-        good &= np.linalg.eigvalsh(correlation)[:, 0] >= -_ROUNDING
+        good &= (np.abs(cov) <= 1.001 * root[:, :, None] * root[:, None, :]).all(axis=(1, 2))
     return np.asarray(good)
 
 
