@@ -9,6 +9,7 @@ from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_codec.schema import KeyframeHeader, RefinedLandmarks
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, AgentId, keyframe_id, submap_id
+from tests.agent.plain_landmarks import plain_landmarks
 
 CAMERA = RectifiedCamera(752, 480, 450.0, 450.0, 376.0, 240.0, 0.1, True, np.eye(4))
 CONSTANT = np.array([0.1, 0.0, 0.0, 0.0, 0.0])
@@ -18,11 +19,8 @@ FIRST = keyframe_id(submap_id(AgentId(0), 0, 0), 0)
 def held_map(disparity: list[float]) -> LocalMap:
     held = LocalMap(CAMERA, LocalMapConfig(), DepthFilterConfig())
     n = len(disparity)
-    held.add(
-        KeyframeHeader(FIRST, 0, NO_KEYFRAME, np.eye(4), n), np.eye(4), np.full((n, 2), 200.0),
-        np.array(disparity) / CAMERA.bf, np.full(n, 1e-3), np.zeros(n, np.uint8), np.zeros(n, np.uint8),
-        np.zeros((n, 32), np.uint8), np.zeros((n, 3, 21, 21), np.uint8), 0,
-    )  # fmt: skip
+    landmarks = plain_landmarks(np.full((n, 2), 200.0), np.array(disparity) / CAMERA.bf)
+    held.add(KeyframeHeader(FIRST, 0, NO_KEYFRAME, np.eye(4), n), np.eye(4), landmarks, 0)
     held.share(FIRST, n)
     return held
 

@@ -15,6 +15,7 @@ import pytest
 from kiteline_agent.agent import Agent
 from kiteline_agent.config import AgentConfig, LocalMapConfig
 from kiteline_agent.exchange.no_base import NoBaseChannel
+from kiteline_agent.local_map.keyframe_landmarks import KeyframeLandmarks
 from kiteline_agent.step import Estimate, Identity, StepInput
 from kiteline_codec.schema import KeyframeHeader, Record
 from kiteline_core.frame import Frame
@@ -276,11 +277,11 @@ def copy_map(agent: Agent, shift_m: np.ndarray) -> None:
         T_m_k = m.T_m_k[slot].copy()
         T_m_k[:3, 3] += shift_m
         copy = KeyframeId(int(m.keyframe[slot]) + 1000)
-        m.add(
-            KeyframeHeader(copy, 0, NO_KEYFRAME, T_m_k, n), T_m_k, m.uv[slot, :n].copy(), m.rho[slot, :n].copy(),
-            m.sigma_rho[slot, :n].copy(), m.octave[rows].copy(), m.angle[rows].copy(), m.descriptor[rows].copy(),
-            m.templates[rows].copy(), 0,
+        landmarks = KeyframeLandmarks(
+            m.uv[slot, :n].copy(), m.rho[slot, :n].copy(), m.sigma_rho[slot, :n].copy(), m.octave[rows].copy(),
+            m.angle[rows].copy(), m.descriptor[rows].copy(), m.templates[rows].copy(),
         )  # fmt: skip
+        m.add(KeyframeHeader(copy, 0, NO_KEYFRAME, T_m_k, n), T_m_k, landmarks, 0)
         agent._relocaliser.add_keyframe(copy)
 
 
