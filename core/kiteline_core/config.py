@@ -85,8 +85,8 @@ def of_log(config: T, text: str) -> T:
         return apply(config, tomllib.loads(text))
     except ConfigError as error:
         raise ConfigError(
-            f"another build wrote this log ({error}): replay it with that build, or fly its images with this one "
-            "by `kiteline fly LOG`"
+            f"another build wrote this log ({error}): replay or import it with that build; the images of an agent's "
+            "log can be flown with this one by `kiteline fly LOG`"
         ) from error
 
 

@@ -8,11 +8,13 @@ from typing import Any
 
 import pytest
 
+from kiteline_basestation.runtime.flight_log import station_of
 from kiteline_basestation.runtime.imports import read_imports
 from kiteline_basestation.station import Station
 from kiteline_basestation.store.checksums import StoreError
 from kiteline_basestation.store.saved_map import SavedMap, SavedValues
 from kiteline_codec.schema import KeyframeHeader, WireError, messages, record_log
+from kiteline_hw.links.kinds import link_traits
 from kiteline_hw.logs.mcap_log import LogWriter
 from kiteline_hw.ports import SourceError
 
@@ -41,6 +43,13 @@ def test_what_cannot_be_read_is_left_out_and_named(make_flight: MakeFlight, tmp_
     assert saved.empty and whole.faults == ()
     assert sum(len(p.codes) for p in found.pieces) == sum(len(p.codes) for p in whole.pieces) - 1
     assert len(found.faults) == 1 and "cannot be read" in found.faults[0]
+
+
+def test_a_base_log_of_another_build_is_not_called_damaged(tmp_path: Path) -> None:
+    with LogWriter(tmp_path / "log.mcap", {"role": "base", "config": "[graph]\nturns = 8"}) as log:
+        log.flush()
+    with pytest.raises(StoreError, match=r"log\.mcap: another build wrote this log \(unknown key 'turns'"):
+        read_imports([str(tmp_path / "log.mcap")], SavedMap(), lambda about: station_of(about, None, link_traits))
 
 
 def test_a_cut_log_is_told(make_flight: MakeFlight, tmp_path: Path) -> None:

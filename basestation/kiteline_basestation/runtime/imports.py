@@ -16,6 +16,7 @@ from kiteline_basestation.store.restore import restore
 from kiteline_basestation.store.saved_map import SavedMap, SavedValues, unpack, value_name
 from kiteline_basestation.store.store import FILE, read
 from kiteline_codec.schema import Key, WireError, messages, owners, record_log
+from kiteline_core.config import ConfigError
 from kiteline_core.errors import INPUT_FAULTS
 from kiteline_core.ids import AgentId
 from kiteline_hw.logs.log_parts import WholeLog
@@ -41,6 +42,8 @@ def import_map(path: Path, make_station: Callable[[Mapping[str, str]], Station])
         return read(path)
     try:
         return _of_log(path, make_station)
+    except ConfigError as error:  # of another build, not damaged
+        raise StoreError(f"{path}: {error}") from error
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, *INPUT_FAULTS) as error:
         raise StoreError(
             f"{path}: damaged, or no log of kiteline ({error!r}); `kiteline log recover` mends logs"

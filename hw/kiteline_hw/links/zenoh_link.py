@@ -27,6 +27,7 @@ from kiteline_hw.links.zenoh_session import (
     direct,
     no_stop_at_exit,
     open_session,
+    reason_of,
     stop_at_exit,
 )
 from kiteline_hw.ports import ByteLink, LinkError
@@ -265,7 +266,7 @@ class ZenohHub(Closing):
             ]
         except zenoh.ZError as error:
             close_session(self.session)
-            raise LinkError(f"cannot set up the hub on {endpoint}: {error}") from error
+            raise LinkError(f"cannot set up the hub on {endpoint}: {reason_of(error)}") from error
         self._thread = threading.Thread(target=self._run, name="zenoh-send", daemon=True)
         self._thread.start()
         stop_at_exit(self, partial(_end, self._thread, self._closed, self._wake, _EXIT_JOIN_S))

@@ -18,7 +18,7 @@ from typing import Any
 import zenoh
 
 from kiteline_hw.links.zenoh_access import access_of_base
-from kiteline_hw.links.zenoh_session import close_session, direct, open_session
+from kiteline_hw.links.zenoh_session import close_session, direct, open_session, reason_of
 from kiteline_hw.ports import LinkError
 
 _GROUP = "kiteline/1/{}"
@@ -60,7 +60,7 @@ class QueryServer:
             self._queryable = used.declare_queryable(f"{prefix(service)}/*", direct(self._on_query), complete=True)
         except zenoh.ZError as error:
             self.close()
-            raise LinkError(f"cannot answer questions on {prefix(service)}: {error}") from error
+            raise LinkError(f"cannot answer questions on {prefix(service)}: {reason_of(error)}") from error
 
     def _on_query(self, query: Any) -> None:
         with contextlib.suppress(Exception):  # one bad question must not end the service
@@ -140,7 +140,7 @@ def ask(
             time.sleep(_RETRY_S)  # a base that is just starting listens already, but still reads its store
         raise LinkError(f"no base at {endpoint} answers {service}/{verb}: is it one that serves its maps there?")
     except zenoh.ZError as error:
-        raise LinkError(f"the link to {endpoint} broke: {error}") from error
+        raise LinkError(f"the link to {endpoint} broke: {reason_of(error)}") from error
     finally:
         close_session(session)
 

@@ -30,7 +30,7 @@ CONNECT_TIMEOUT_MS = 4000  # ms of one attempt to connect: two round trips with 
 _RETRY_S = 0.1  # s between two attempts to connect
 _ROUTER = "router/"  # before a locator: a Zenoh router listens there, and both sides connect
 _SOURCE_LINE = re.compile(r"\.? at /\S+\.rs:\d+\.?")
-_WITHOUT_PORT = re.compile(r"(?P<host>(tcp|udp|tls|quic|ws)/(\[[^]]*\]|[^:?#]*)):?([?#].*)?")
+_WITHOUT_PORT = re.compile(r"(?P<host>(router/)?(tcp|udp|tls|quic|ws)/(\[[^]]*\]|[^:?#]*)):?(?P<options>([?#].*)?)")
 
 Role = Literal["client", "base"]
 
@@ -42,9 +42,11 @@ def reason_of(error: zenoh.ZError) -> str:
 
 def check_port(endpoint: str) -> None:
     """Raise LinkError for an endpoint of an IP protocol without a port, which Zenoh tries in vain without a word."""
-    found = _WITHOUT_PORT.fullmatch(endpoint.removeprefix(_ROUTER))
+    found = _WITHOUT_PORT.fullmatch(endpoint)
     if found is not None:
-        raise LinkError(f"{endpoint!r} has no port: write {found['host']}:7447, or the port at which the base listens")
+        who = "router" if endpoint.startswith(_ROUTER) else "base"
+        whole = f"{found['host']}:7447{found['options']}"
+        raise LinkError(f"{endpoint!r} has no port: write {whole}, or the port at which the {who} listens")
 
 
 def session_config(
@@ -62,7 +64,9 @@ def session_config(
     try:
         config = zenoh.Config.from_env() if os.environ.get("ZENOH_CONFIG") else zenoh.Config()
     except zenoh.ZError as error:
-        raise LinkError(f"ZENOH_CONFIG={os.environ['ZENOH_CONFIG']} is no configuration of Zenoh: {error}") from error
+        raise LinkError(
+            f"ZENOH_CONFIG={os.environ['ZENOH_CONFIG']} is no configuration of Zenoh: {reason_of(error)}"
+        ) from error
     if endpoint.startswith(_ROUTER):
         endpoint, role = endpoint.removeprefix(_ROUTER), "client"
     options: dict[str, Any] = {

@@ -16,7 +16,7 @@ from typing import Any
 
 import zenoh
 
-from kiteline_hw.links.zenoh_session import close_session, direct, open_session
+from kiteline_hw.links.zenoh_session import close_session, direct, open_session, reason_of
 from kiteline_hw.ports import LinkError
 from kiteline_hw.system.closing import Closing
 
@@ -53,7 +53,7 @@ class LockstepClient(Closing):
             self._watch = liveliness.declare_subscriber(f"{prefix}/base", direct(self._on_base), history=True)
         except zenoh.ZError as error:
             close_session(self._session)
-            raise LinkError(f"the link to {endpoint} broke while it was set up ({error})") from error
+            raise LinkError(f"the link to {endpoint} broke while it was set up ({reason_of(error)})") from error
 
     def _on_base(self, sample: Any) -> None:
         if sample.kind == zenoh.SampleKind.PUT:
@@ -85,7 +85,9 @@ class LockstepClient(Closing):
                 try:
                     self._publisher.put(_HEADER.pack(self._number, _ANSWER) + message)
                 except zenoh.ZError as error:
-                    raise LinkError(f"the link to the base station at {self._endpoint} broke: {error}") from error
+                    raise LinkError(
+                        f"the link to the base station at {self._endpoint} broke: {reason_of(error)}"
+                    ) from error
                 repeat_s = time.monotonic() + _REPEAT_S[self._answered_once]
             try:
                 wait_s = min(deadline_s, repeat_s) - time.monotonic()
@@ -147,7 +149,7 @@ class LockstepServer(Closing):
             self._token = liveliness.declare_token(f"{prefix}/base")
         except zenoh.ZError as error:
             close_session(self._session)
-            raise LinkError(f"cannot set up the lock-step barrier on {endpoint}: {error}") from error
+            raise LinkError(f"cannot set up the lock-step barrier on {endpoint}: {reason_of(error)}") from error
 
     def _on_agent(self, sample: Any) -> None:
         try:
@@ -235,7 +237,7 @@ class LockstepServer(Closing):
         try:
             self._send(agent, opened.session, _HEADER.pack(opened.number, _ANSWER) + message)
         except zenoh.ZError as error:
-            raise LinkError(f"the answer to agent {agent} could not be sent: {error}") from error
+            raise LinkError(f"the answer to agent {agent} could not be sent: {reason_of(error)}") from error
 
     def lost(self) -> set[int]:
         """Agents that have appeared and ended."""

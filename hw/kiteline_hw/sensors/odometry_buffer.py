@@ -44,7 +44,7 @@ class OdometerStream:
         sound = odometry.usable(batch)
         newest = np.maximum.accumulate(np.concatenate([[self._last_ns], np.where(due & sound, batch.t_ns, -(2**63))]))
         late = batch.t_ns <= newest[:-1]
-        self._note("odometer sample not finite", batch.t_ns[due & ~sound])
+        self._note("odometer sample not plausible", batch.t_ns[due & ~sound])
         self._note("odometer stamp not increasing", batch.t_ns[due & sound & late])
         keep = due & sound & ~late
         if not keep.any():

@@ -73,6 +73,7 @@ def test_none() -> None:
         ("carrier-pigeon:7", "unknown link 'carrier-pigeon:7'"),
         ("mavlink:pigeon:1", "expected udp:HOST:PORT"),
         ("zenoh:tcp/127.0.0.1", "has no port: write tcp/127.0.0.1:7447"),
+        ("zenoh:router/tcp/[::1]?rel=1", r"has no port: write router/tcp/\[::1\]:7447\?rel=1"),
         ("serial:/dev/ttyNONE", "expected DEVICE:BAUD"),
         ("serial:/dev/ttyNONE:57600", "cannot open serial port /dev/ttyNONE"),
     ],

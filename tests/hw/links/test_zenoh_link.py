@@ -12,7 +12,7 @@ import zenoh
 from kiteline_hw.links import zenoh_session
 from kiteline_hw.links.queued_link import INBOX_PACKETS, OUTBOX_PACKETS, QueuedLink
 from kiteline_hw.links.zenoh_link import ZenohHub, ZenohLink
-from kiteline_hw.links.zenoh_session import open_session
+from kiteline_hw.links.zenoh_session import check_port, open_session
 from kiteline_hw.ports import LinkError
 from tests.hw.processes import free_endpoint, start, wait_for
 
@@ -251,6 +251,14 @@ def test_an_endpoint_that_is_taken_is_told_without_lines_of_zenohs_sources() -> 
     with ZenohHub(endpoint), pytest.raises(LinkError, match="Address already in use") as caught:
         ZenohHub(endpoint)
     assert ".rs" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "endpoint", ["tcp/[fe80::1%eth0]:7447", "udp/224.0.0.1:7447#iface=eth0", "router/tls/host:7447?rel=1",
+                 "unixsock-stream//tmp/kiteline", "serial//dev/ttyS0#baudrate=9600", "vsock/-1:1234"],
+)  # fmt: skip
+def test_endpoints_with_a_port_and_those_that_have_none_are_taken(endpoint: str) -> None:
+    check_port(endpoint)
 
 
 def test_bad_numbers_and_names() -> None:

@@ -47,7 +47,7 @@ def test_late_repeated_and_broken_samples_are_counted() -> None:
     taken = stream.take_until(100)
     assert taken is not None
     assert taken.t_ns.tolist() == [10, 20, 30]
-    assert report.skipped == {"odometer sample not finite": 1, "odometer stamp not increasing": 2}
+    assert report.skipped == {"odometer sample not plausible": 1, "odometer stamp not increasing": 2}
 
 
 def test_odometry_is_inserted_before_its_frame() -> None:
