@@ -17,7 +17,8 @@ from kiteline_hw.mavlink.coordinate_frames import R_L_O, mounting
 from kiteline_hw.mavlink.messages import Heartbeat
 from kiteline_hw.mavlink.watch.attitude import CANDIDATES, attitude_rotation
 from kiteline_hw.mavlink.watch.controller_watch import ControllerWatch
-from kiteline_hw.mavlink.watch.findings import Finding, Level
+from kiteline_hw.mavlink.watch.findings import Finding, FindingLog, Level
+from kiteline_hw.mavlink.watch.latency import LatencyWatch
 from kiteline_hw.ports import PoseSample
 from kiteline_hw.sim.autopilot import Faults, ModelledAutopilot
 
@@ -103,6 +104,15 @@ def test_a_good_flight_says_each_thing_once(kind: str) -> None:
     # each goes out as STATUSTEXT too, whole
     assert sorted(m.text for m in bench.controller.texts) == sorted(f.short for _, f in bench.found)
     assert all(len(f.short) <= 50 and f.short.startswith("kiteline: ") for _, f in bench.found)
+
+
+def test_a_delay_that_changes_little_is_said_once() -> None:
+    log = FindingLog()
+    watch = LatencyWatch(log)
+    for delay_ms in (30, 36, 30, 41):
+        for _ in range(watch.config.poses):
+            watch.sent(delay_ms * 1_000_000, 3)
+    assert [f.short for f in log.take()] == ["kiteline: set VISO_DELAY_MS 30", "kiteline: set VISO_DELAY_MS 41"]
 
 
 @pytest.mark.parametrize("true", sorted(CANDIDATES))
