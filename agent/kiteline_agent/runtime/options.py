@@ -154,7 +154,7 @@ def check(p: argparse.ArgumentParser, a: argparse.Namespace) -> None:
     if not 0 <= a.agent < MAX_AGENTS:
         p.error(f"--agent {a.agent}: expected 0 to {MAX_AGENTS - 1}")
     for name in ("--cpu", "--up-bytes", "--log-mib"):
-        if (value := getattr(a, name[2:].replace("-", "_"))) < 0:
+        if not (value := getattr(a, name[2:].replace("-", "_"))) >= 0:  # neither is "nan"
             p.error(f"{name} {value}: expected 0 (no limit) or more")
     if unused := _unused_by_filter(a):
         p.error(f"--tracker ekf uses no {' and no '.join(unused)}: leave them out, or fly --tracker map")

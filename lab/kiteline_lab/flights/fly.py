@@ -90,8 +90,8 @@ def options(argv: list[str]) -> Options:
         p.error(f"--link-loss {a.link_loss}: expected a probability from 0 to below 1")
     if a.rig and len(a.sources) > 1:
         p.error("--rig is the file of one rig: it goes with one SOURCE")
-    if a.cpu < 0.0 or a.seconds < 0.0:
-        p.error("--cpu and --seconds must not be negative")
+    if not (a.cpu >= 0.0 and a.seconds >= 0.0):
+        p.error("--cpu and --seconds: expected 0 (no limit) or more")
     if a.out.exists() and not a.out.is_dir():
         p.error(f"--out {a.out} is a file: name a folder")
     return Options(

@@ -164,7 +164,7 @@ def main(argv: list[str]) -> int:
     )
     p.add_argument("--out", metavar="DIR", type=Path, help="leave trajectories here")
     a = p.parse_args(argv)
-    if a.cpu < 0.0 or (a.cpu and a.verify):
+    if not a.cpu >= 0.0 or (a.cpu and a.verify):
         p.error("--cpu is a percentage above 0, and goes without --verify: its flight is a new one")
     if a.cpu:
         from kiteline_lab.replay.replay_cpu import refly
