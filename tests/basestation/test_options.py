@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from kiteline_basestation.__main__ import main
 from kiteline_basestation.runtime import options, questions
 from kiteline_basestation.runtime.options import MOST_WORKERS, BaseOptions
 from kiteline_hw.links.ends import LinkOptions
@@ -18,6 +19,13 @@ def test_a_number_of_workers_that_no_machine_bears_is_refused(workers: str, caps
     with pytest.raises(SystemExit):
         options.parser().parse_args(["--workers", workers])
     assert f"expected 0 to {MOST_WORKERS}" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("given", [["--down-bytes", "-1"], ["--log-mib", "-4"]])
+def test_negative_limits_are_refused(given: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main(given)
+    assert f"{' '.join(given)}: expected 0" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
