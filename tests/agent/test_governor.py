@@ -28,6 +28,7 @@ class Flight:
         self.efforts: list[Effort] = []
         self.events: list[str] = []
         self.keyframe_ns = 0
+        self.waits: list[int] = []  # ns by which keyframes were late
 
     def fly(self, frames: int) -> Flight:
         for _ in range(frames):
@@ -39,6 +40,7 @@ class Flight:
                 cost = FRAME_NS * decision.effort.frame_cost * self.dearer
                 due_ns = self.keyframe_ns + self.every_s * decision.effort.keyframes * 1e9
                 if now_ns >= due_ns and self.governor.may(Extra.KEYFRAME):
+                    self.waits.append(now_ns - round(due_ns))
                     self.keyframe_ns = now_ns
                     cost += KEYFRAME_NS * decision.effort.keyframe_cost * self.dearer
             self.cost_ns.append(round(cost))
@@ -88,6 +90,16 @@ def test_with_an_imu_frames_go_before_pixels_and_without_it_pixels_before_frames
     row = CARRIED[carried.levels[-1]]
     assert row == replace(FULL, every=row.every, keyframes=row.keyframes)
     assert ALONE[alone.levels[-1]].first == 1
+
+
+def test_images_alone_keep_room_for_keyframes_that_come_early() -> None:
+    """Without an IMU the track is lost while a keyframe waits."""
+    intervals_s = np.random.default_rng(1).choice([0.1, 0.1, 0.2, 0.6, 0.8], 1000)
+    flight = Flight(0.8 * LOAD, carried=False)
+    for _ in range(800):
+        flight.every_s = float(intervals_s[len(flight.waits)])
+        flight.fly(1)
+    assert np.mean(flight.waits[10:]) < 0.06e9
 
 
 @pytest.mark.parametrize("carried", [True, False])

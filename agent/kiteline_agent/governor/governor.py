@@ -28,7 +28,7 @@ class Effort:
     keyframes: float  # motion until the next keyframe
     slots: float  # keyframes whose landmarks are searched
     every: int  # 1: every frame is tracked, 2: every other one
-    frame_cost: float  # of a tracked frame relative to the first row: initial value of the estimate
+    frame_cost: float  # of a tracked frame relative to the first row, measured
     keyframe_cost: float  # the same of the extra cost of a keyframe
 
 
@@ -40,19 +40,19 @@ CARRIED = (
     Effort(1.00, 1.00, 1.0, 1, 0, 1.4, 1.0, 4, 1.00, 1.00),
     Effort(1.00, 1.00, 1.0, 1, 0, 1.4, 1.0, 6, 1.00, 1.00),
     Effort(1.00, 1.00, 1.0, 1, 0, 1.4, 1.0, 8, 1.00, 1.00),
-    Effort(0.50, 0.50, 0.5, 1, 0, 1.4, 0.5, 8, 0.75, 0.90),
-    Effort(0.65, 0.65, 0.5, 1, 1, 1.4, 0.5, 8, 0.60, 0.75),
-    Effort(0.45, 0.45, 0.3, 0, 1, 1.4, 0.5, 9, 0.52, 0.70),
+    Effort(0.65, 0.65, 0.5, 0, 0, 1.4, 0.5, 8, 0.81, 0.90),
+    Effort(0.45, 0.45, 0.3, 0, 0, 1.4, 0.5, 8, 0.72, 0.81),
+    Effort(0.45, 0.45, 0.3, 0, 1, 1.4, 0.5, 9, 0.72, 0.55),
 )  # with an IMU, which bridges skipped frames: skipping costs little accuracy
 ALONE = (
     FULL,
     Effort(1.00, 1.00, 1.0, 1, 0, 1.0, 1.0, 2, 1.00, 1.00),
-    Effort(1.00, 1.00, 0.5, 1, 1, 1.2, 1.0, 2, 0.72, 0.82),
-    Effort(0.80, 0.80, 0.5, 0, 1, 1.2, 1.0, 2, 0.62, 0.78),
-    Effort(0.65, 0.65, 0.5, 0, 1, 1.2, 1.0, 2, 0.58, 0.75),
-    Effort(0.65, 0.65, 0.5, 0, 1, 1.2, 1.0, 3, 0.58, 0.75),
-    Effort(0.65, 0.65, 0.5, 0, 1, 1.2, 1.0, 4, 0.58, 0.75),
-    Effort(0.45, 0.45, 0.3, 0, 1, 1.4, 0.5, 4, 0.52, 0.70),
+    Effort(1.00, 1.00, 0.5, 1, 1, 1.2, 1.0, 2, 0.89, 0.66),
+    Effort(0.80, 0.80, 0.5, 0, 1, 1.2, 1.0, 2, 0.74, 0.68),
+    Effort(0.65, 0.65, 0.5, 0, 1, 1.2, 1.0, 2, 0.68, 0.65),
+    Effort(0.65, 0.65, 0.5, 0, 1, 1.2, 1.0, 3, 0.68, 0.65),
+    Effort(0.65, 0.65, 0.5, 0, 1, 1.2, 1.0, 4, 0.68, 0.65),
+    Effort(0.45, 0.45, 0.3, 0, 1, 1.4, 0.5, 4, 0.56, 0.56),
 )  # images alone: rotation between frames must stay small, so resolution is reduced before frames are skipped
 
 
@@ -257,8 +257,7 @@ class Governor:
 
     def _advance(self, t_ns: int) -> None:
         """Advance the window to t_ns."""
-        window_ns = round(self._config.window_s * 1e9)
-        while self._spent and self._spent[0][0] <= t_ns - window_ns:
+        while self._spent and self._spent[0][0] <= t_ns - round(self._config.window_s * 1e9):
             self._window_ns -= self._spent.popleft()[1]
         if self._last_t_ns is None:
             self._first_t_ns = self._level_since_ns = self._calm_since_ns = self._tracked_t_ns = t_ns
@@ -339,7 +338,8 @@ class Governor:
         all_frames = self._frames(self.level) * self._every(self.level)
         if all_frames <= 0.0:
             return most
-        affordable = self._config.fill - self._load(self.level) + self._frames(self.level)
+        planned = self._config.carried_fill if self._ladder is CARRIED else self._config.fill
+        affordable = planned - self._load(self.level) + self._frames(self.level)
         return min(most, max(affordable, _LEAST) / all_frames)
 
     def _every(self, level: int) -> float:
