@@ -236,28 +236,28 @@ class Governor:
         if not self._early(self._last_t_ns):
             self._spent.append((self._last_t_ns, cpu_ns))
             self._window_ns += cpu_ns
-        gain = _LEARNING
         if not self._last_tracked:
-            self._idle_ns += (cpu_ns - self._idle_ns) * (gain if self._idle_ns else 1.0)
+            self._idle_ns += (cpu_ns - self._idle_ns) * (_LEARNING if self._idle_ns else 1.0)
             return
-        self._scatter += (self._relative_error(cpu_ns) - self._scatter) * gain
+        self._scatter += (self._relative_error(cpu_ns) - self._scatter) * _LEARNING
         if self._last_extra is not None:
             known_ns = self._extra_ns[self._last_extra]
             more_ns = max(cpu_ns - self._frame_ns, 0.0)
-            self._extra_ns[self._last_extra] += (more_ns - known_ns) * (2.0 * gain if known_ns else 1.0)
+            self._extra_ns[self._last_extra] += (more_ns - known_ns) * (2.0 * _LEARNING if known_ns else 1.0)
             if self._last_extra not in (Extra.SEARCH, Extra.SCAN):
                 self._count_keyframe(self._last_t_ns)
         elif self._measured:
             cpu_ns = min(cpu_ns, round(_OUTLIER * self._frame_ns))  # outliers: a frame that lost and regained tracking
             # Increases are followed faster than decreases.
-            up = 2.0 * gain if cpu_ns > self._frame_ns else gain
+            up = 2.0 * _LEARNING if cpu_ns > self._frame_ns else _LEARNING
             self._frame_ns += (cpu_ns - self._frame_ns) * min(up, 1.0)
         else:
             self._frame_ns, self._measured = float(cpu_ns), True
 
     def _advance(self, t_ns: int) -> None:
         """Advance the window to t_ns."""
-        while self._spent and self._spent[0][0] <= t_ns - round(self._config.window_s * 1e9):
+        window_ns = round(self._config.window_s * 1e9)
+        while self._spent and self._spent[0][0] <= t_ns - window_ns:
             self._window_ns -= self._spent.popleft()[1]
         if self._last_t_ns is None:
             self._first_t_ns = self._level_since_ns = self._calm_since_ns = self._tracked_t_ns = t_ns
