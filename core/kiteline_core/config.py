@@ -26,6 +26,14 @@ class ConfigError(KitelineError, ValueError):
     """An unknown key or a value of the wrong type; the text names the key, its section and what is known there."""
 
 
+class UnknownKeyError(ConfigError):
+    """A key that a section does not have. near: the whole name of the key there that is most like it, or empty."""
+
+    def __init__(self, text: str, near: str) -> None:
+        super().__init__(text)
+        self.near = near
+
+
 def apply(config: T, table: Mapping[str, object], path: str = "") -> T:
     """A copy of `config` (a frozen dataclass, sections nested) with the values of `table` in place of its own.
 
@@ -39,9 +47,10 @@ def apply(config: T, table: Mapping[str, object], path: str = "") -> T:
     changes: dict[str, object] = {}
     for key, value in table.items():
         if key not in known:
-            near = difflib.get_close_matches(key, known, 1)
-            hint = f"did you mean {f'{path}.{near[0]}'.strip('.')}? " if near else ""
-            raise ConfigError(f"unknown key {key!r} in {_section(path)}; {hint}known are: {', '.join(sorted(known))}")
+            near = "".join(f"{path}.{like}".strip(".") for like in difflib.get_close_matches(key, known, 1))
+            hint = f"did you mean {near}? " if near else ""
+            text = f"unknown key {key!r} in {_section(path)}; {hint}known are: {', '.join(sorted(known))}"
+            raise UnknownKeyError(text, near)
         old = getattr(config, key)
         inner = f"{path}.{key}" if path else key
         if is_dataclass(old):

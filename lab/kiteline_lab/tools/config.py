@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from kiteline_core.config import ConfigError, apply, in_range, toml_value
+from kiteline_core.config import ConfigError, UnknownKeyError, apply, in_range, toml_value
 from kiteline_lab.tools.options import ROOTS, Option, as_markdown, as_toml, sections
 
 
@@ -67,7 +67,8 @@ def check(text: str) -> list[Problem]:
         try:
             in_range(apply(ROOTS[root], _nested(rest, value) if rest else value, root), ROOTS[root], root)
         except ConfigError as error:
-            hint = "" if name in known or "did you mean" in str(error) else _near(name)
+            told = name in known or (isinstance(error, UnknownKeyError) and error.near)
+            hint = "" if told else _near(name)
             problems.append(Problem(_line_of(text, name), f"{error}{hint}"))
     return problems
 
