@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_basestation.config import BaseConfig
-from kiteline_basestation.exchange.publisher import Published, Publisher, apply_record
+from kiteline_basestation.exchange.publisher import Published, Publisher
 from kiteline_basestation.grid.grid_updates import GridUpdates
 from kiteline_basestation.grid.grid_view import GridViews
 from kiteline_basestation.grid.image_scans import ImageScans
@@ -150,8 +150,8 @@ class Mapper:
         return MapperOutput(published, tuple(jobs), tuple(answers), withdrawn, self._publisher.unfinished)
 
     def adopt(self, record: Record) -> None:
-        """Replace a published value by its quantised code, as the agent will hold it."""
-        apply_record(self.map, record)
+        """Replace a published value by its quantised code, as the agent will hold it, unless it changed meanwhile."""
+        self._publisher.adopt(record)
 
     def take_confirmed(self) -> dict[AgentId, int]:
         """How many keyframes of each agent were found to agree with older ones since the last call."""

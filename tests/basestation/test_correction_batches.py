@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,7 @@ from kiteline_codec.schema import (
 from kiteline_codec.sync.config import SyncConfig
 from kiteline_core.ids import AgentId, KeyframeId
 from kiteline_hw.sim.links.link_model import LinkModel, LinkModelConfig
+from tests.basestation.feeding import WITHOUT_GRID
 
 AGENT = AgentId(0)
 SECOND_NS = 1_000_000_000
@@ -241,3 +243,47 @@ def test_every_batch_is_applied_as_it_was_made(
     assert held == newest
     assert sum(key.kind == KeyframePose.KIND for key in held) == 11
     assert any(key.kind == RefinedLandmarks.KIND for key in held)
+
+
+def test_values_of_two_bundles_are_not_applied_in_one_batch(make_flight: Callable[..., Any]) -> None:
+    """A large batch is sent over several steps of a thin link, and a bundle moves the map again meanwhile."""
+    flight = make_flight(keyframes=12, turns=0.4)
+    base_end, agent_end = (
+        CodedChannel(SyncConfig(packet_bytes=220, budget_bytes=1500), 1),
+        CodedChannel(SyncConfig(), 1),
+    )
+    config = replace(WITHOUT_GRID, publish=replace(PublishConfig(), step_values=4))
+    station, holder = Station(config, lambda agent: base_end), Holder()
+    moved = flight.keyframes[1:]  # the first one has no pose but its submap's
+    agent_end.put(CameraIntrinsics(flight.agent, flight.camera))
+    x_m: dict[KeyframeId, float] = {}  # at the agent
+    before_m, first = dict[KeyframeId, float](), 0
+    shifts: list[set[float]] = []  # of the agent's keyframes against `before_m`, as they change
+    done: list[Any] = []
+    for n in range(600):
+        now_ns = n * STEP_NS
+        for record in flight.records[n] if n < len(flight.records) else ():
+            agent_end.put(record)
+        output = station.step({flight.agent: agent_end.poll(now_ns)}, done, now_ns)
+        done = [run_job(job) for job in output.jobs]
+        heard = agent_end.receive(dict(output.packets).get(flight.agent, ()), now_ns)
+        ready = [r for r in holder.take(heard, ()) if isinstance(r, KeyframePose)]
+        x_m.update((r.keyframe, float(r.T_m_k[0, 3])) for r in ready)
+        settled = station.mapper.idle and base_end.endpoint.digest_equal and not len(holder)
+        if not before_m and not (settled and n > len(flight.records)):
+            continue
+        if before_m and ready:
+            shifts.append({round(x_m[k] - before_m[k]) for k in moved})
+        if shifts and settled:
+            break
+        if not before_m:
+            before_m, first = dict(x_m), n
+        if n in (first, first + 2):  # two bundles, the second one while the batch of the first is being sent
+            for keyframe in moved:
+                T_m_k = station.mapper.map.pose(keyframe).copy()
+                T_m_k[0, 3] += 1.0
+                station.mapper.map.set_pose(keyframe, T_m_k)
+                station.mapper._publisher.mark_changed(KeyframePose.KIND, keyframe)
+    assert shifts == [{1}, {2}]
+    for keyframe in moved:
+        assert station.mapper.map.pose(keyframe)[0, 3] == x_m[keyframe]

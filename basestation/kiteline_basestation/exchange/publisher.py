@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections import deque
+from collections.abc import Collection, Iterable, Mapping
 from itertools import chain, islice
 
 import numpy as np
@@ -23,6 +24,7 @@ from kiteline_codec.schema import (
     SubmapPlacement,
     messages,
 )
+from kiteline_codec.schema.owners import submap_of
 from kiteline_core.ids import AgentId, KeyframeId, SubmapId, agent_of_keyframe, agent_of_submap, submap_of_keyframe
 
 F64 = NDArray[np.float64]
@@ -39,12 +41,12 @@ Published = tuple[tuple[AgentId, tuple[Record, ...]], ...]
 class _Moves:
     """What moves the map of one agent and has not been sent.
 
-    batch: chosen for the batch that is being made, in order of sending. poses: keyframes. others: what has waited
-    longest first. None of them is in two.
+    batch: values of the batch that is being sent, as they were when it was chosen, the next one first. poses: keyframes
+    that changed. others: other changes, what has waited longest first.
     """
 
     def __init__(self) -> None:
-        self.batch: dict[_Mark, None] = {}
+        self.batch: deque[Record] = deque()
         self.poses: dict[KeyframeId, None] = {}
         self.others: dict[_Mark, None] = {}
 
@@ -52,17 +54,19 @@ class _Moves:
         return bool(self.batch or self.poses or self.others)
 
     def add(self, kind: int, keyframe: KeyframeId) -> None:
-        """Add a change; of one that is chosen already, the newest value is sent."""
-        if (kind, keyframe) in self.batch:
-            return
+        """Add a change. One of a value of the batch goes with the next batch."""
         if kind == KeyframePose.KIND:
             self.poses.setdefault(keyframe)
         else:
             self.others.setdefault((kind, keyframe))
 
+    def has(self, kind: int, keyframe: KeyframeId) -> bool:
+        """True if a value has changed and was not chosen for a batch since."""
+        return keyframe in self.poses if kind == KeyframePose.KIND else (kind, keyframe) in self.others
+
     def forget(self, submaps: Collection[SubmapId]) -> None:
         """Drop the changes of some submaps."""
-        self.batch = {mark: None for mark in self.batch if submap_of_keyframe(mark[1]) not in submaps}
+        self.batch = deque(record for record in self.batch if submap_of(messages.key(record)) not in submaps)
         self.poses = {keyframe: None for keyframe in self.poses if submap_of_keyframe(keyframe) not in submaps}
         self.others = {mark: None for mark in self.others if submap_of_keyframe(mark[1]) not in submaps}
 
@@ -119,6 +123,14 @@ class Publisher:
         for moves in self._moves.values():
             moves.forget(submaps)
 
+    def adopt(self, record: Record) -> None:
+        """Replace a value by its quantised code, as the agent will hold it, unless it has changed since."""
+        if isinstance(record, KeyframePose | RefinedLandmarks):
+            moves = self._moves.get(agent_of_keyframe(record.keyframe))
+            if moves is not None and moves.has(record.KIND, record.keyframe):
+                return
+        apply_record(self._map, record)
+
     @property
     def waiting(self) -> bool:
         """True if changes wait for room."""
@@ -139,17 +151,15 @@ class Publisher:
         out: dict[AgentId, dict[Key, Record]] = {}
         records, self._records = self._records, []
         for agent, record in records:
-            if isinstance(record, MEMBERS) and room.get(agent) == 0:
+            if isinstance(record, MEMBERS) and (room.get(agent) == 0 or agent in self.unfinished):
                 self._records.append((agent, record))
             else:
                 out.setdefault(agent, {})[messages.key(record)] = record
-        for kind, keyframe in sorted(self._in_turn(room)):
-            made = self._record(kind, keyframe)
-            if made is not None:
-                out.setdefault(agent_of_keyframe(keyframe), {})[messages.key(made)] = made
+        for key, made in sorted(((messages.key(r), r) for r in self._in_turn(room)), key=lambda found: found[0]):
+            out.setdefault(agent_of_keyframe(KeyframeId(key.id)), {})[key] = made
         return tuple((agent, tuple(found.values())) for agent, found in sorted(out.items()))
 
-    def _in_turn(self, room: Mapping[AgentId, int]) -> list[_Mark]:
+    def _in_turn(self, room: Mapping[AgentId, int]) -> list[Record]:
         """Take the changes of one step. A batch is chosen where there is room, and taken over several steps if it is
         large; in a room above 0 it has at least one change.
         """
@@ -157,14 +167,17 @@ class Publisher:
         taken, self._whole = list(islice(self._dirty, most)), False  # what moves nothing: it waits for no other values
         for mark in taken:
             del self._dirty[mark]
+        records = self._records_of(taken)
         for agent, moves in self._moves.items():
             if not moves.batch and room.get(agent) != 0:
-                moves.batch = dict.fromkeys(self._choose(moves, room.get(agent)))
-            now = list(islice(moves.batch, self._config.step_values))
-            taken += now
-            for mark in now:
-                del moves.batch[mark]
-        return taken
+                # As they are now: what a job changes while they are sent would not fit those that left before.
+                moves.batch.extend(self._records_of(self._choose(moves, room.get(agent))))
+            records += [moves.batch.popleft() for _ in range(min(len(moves.batch), self._config.step_values))]
+        return records
+
+    def _records_of(self, marks: Iterable[_Mark]) -> list[Record]:
+        made = (self._record(kind, keyframe) for kind, keyframe in marks)
+        return [record for record in made if record is not None]
 
     def _choose(self, moves: _Moves, left: int | None) -> list[_Mark]:
         """Take as many of an agent's changes as a batch and `left` bytes hold: all poses, the newest first, then
@@ -194,13 +207,13 @@ class Publisher:
 
     def _record(self, kind: int, keyframe: KeyframeId) -> Record | None:
         sparse_map, table = self._map, self._map.keypoints
-        slots = sparse_map.slots_of(keyframe)
         row = sparse_map.rows[keyframe]
-        is_landmark = table.kind[slots] == LANDMARK
         if kind == KeyframePose.KIND:
             if sparse_map.keyframes.pose_source[row] != REFINED_POSE:
                 return None
             return KeyframePose(keyframe, sparse_map.keyframes.T_m_k[row].copy())
+        slots = sparse_map.slots_of(keyframe)
+        is_landmark = table.kind[slots] == LANDMARK
         if kind == RefinedLandmarks.KIND:
             here = slots[
                 is_landmark & (table.flags[slots] & (REFINED | CULLED) == REFINED) & (table.root[slots] == slots)
