@@ -72,7 +72,7 @@ class Agent:
         camera = self._rectifier.camera
         self._has_depth = rig.right is not None or rig.has_depth
         self.work = Work()  # operations of the last step
-        self.map = LocalMap(camera, config.local_map, config.depth_filter)
+        self.map = LocalMap(camera, config.local_map)
         self.map_cache = MapCache(camera, config.map_cache, config.matching, config.ransac, vocabulary)
         self._governor = Governor(config.governor, inertial=imu is not None)
         self._effort = FULL

@@ -45,34 +45,13 @@ class OdometerConfig:
     max_gap_s: float = 0.25  # a longer gap makes an interval unknown: wheels are read at 10 Hz at least
     floor_m_s: float = 0.02  # velocity error that no device states: its axes, its place, its stamps
     floor_rad_s: float = 0.005  # the same of a rotation rate
-    correlation_s: float = 0.5  # correlation time of its errors: a patch of slippery floor, a gust
-    compare_s: float = 0.2  # window of a comparison, in which images measure a velocity to a centimetre a second
-    least_moved_m: float = 0.02  # motion in a window below which axes and scale are not observable
     aligned: float = 0.9  # least cosine between both displacements for their lengths to be compared
-    scale_start: float = 0.1  # relative deviation of its scale at the start
-    scale_most: float = 0.25  # relative; a larger difference is a fault, not a scale
-    scale_floor: float = 0.01  # least relative deviation of the scale
     scale_walk: float = 0.003  # relative, per sqrt(s): load and temperature change
-    scale_sigma_m_s: float = 0.05  # expected noise of a window in the scale estimate
-    start_m_s: float = 0.08  # expected noise at the start, weighted as one window
-    start_rad_s: float = 0.03  # the same of the rotation rate
-    memory_s: float = 3.0  # time constant of the noise estimate
-    unusual: float = 5.0  # times the expected squared error, above which `rise` applies
     rise: float = 0.5  # weight of such an error: a slip is detected within 0.2 s
     tolerance_m_s: float = 0.12  # noise above which it is not used; that of a good one is 0.05
-    tolerance_share: float = 0.10  # of the speed, likewise
-    proofs: int = 3  # consecutive moving windows that must agree before it is used
-    surprise: float = 4.0  # deviations from the prediction above which a sample is rejected: 8 m/s^2
     settled: float = 0.4  # share of a rejected jump below which the velocity must fall before it is used again
     accel_m_s2: float = 2.0  # acceleration of the constant-velocity model: leaning by twelve degrees
     turn_rad_s2: float = 4.0  # the same about the body's axes: a small multicopter that tilts
-    seen_m_s: float = 0.05  # error of the velocity between two frames placed by images
-    seen_rad_s: float = 0.02  # the same of the rotation rate
-    unit_window_s: float = 0.4  # window of a comparison while the scale of a monocular map is unknown
-    unit_windows: int = 40  # newest such windows that are kept
-    unit_least: int = 5  # least number of agreeing windows for a scale
-    unit_moved_m: float = 0.05  # least motion by the odometer in a window that counts
-    unit_share: float = 0.7  # least share of the windows that must agree
     unit_wait_s: float = 20.0  # s for which poses wait for that scale; then they are given in a unit of their own
 
 
@@ -89,8 +68,6 @@ class StereoConfig:
     """Depth from disparities along the image row."""
 
     min_depth_m: float = 0.25  # m: nearest surface; bounds the search along the row
-    uniqueness: float = 1.15  # second-best cost over best; below it the row repeats itself
-    min_ncc: float = 0.85  # correlation of the two patches; lower at occlusions and depth edges
     search_px: float = 3.0  # px of the level: range around the predicted disparity
     iterations: int = 6  # Gauss-Newton steps; it converges in 3
     points: int = 240  # disparities measured in a frame, spread over the landmarks found; 0: none
@@ -106,7 +83,6 @@ class AlignConfig:
     cell_px: int = 32  # px: candidates are spread over cells of this size
     iterations: int = 8  # Gauss-Newton steps a level
     fine_from: int = 1  # template level at which the fine pass begins; 0 is cheaper and converges from less far
-    coarse_step_px: float = 7.0  # px of the coarse level: half a template
     fine_step_px: float = 3.0  # px of the fine level: error that the coarse pass leaves
     min_ncc: float = 0.80  # correlation of template and patch
     sigma_px: float = 0.30  # px at octave 0: standard deviation of an aligned coordinate
@@ -136,7 +112,6 @@ class KeyframeConfig:
     min_cover: float = 0.45  # share of coarse image cells that hold a tracked landmark
     baseline_ratio: float = 0.12  # translation over median depth: new views of the same scene
     rotation_rad: float = 0.30  # rad: a rotation that has replaced a quarter of the view
-    wait_right_s: float = 0.26  # that a keyframe waits for a lost right image: without it points have no depth
     thin: float = 3.0  # times the fewest inliers of a pose; with fewer a keyframe does not wait for CPU time
 
 
@@ -158,8 +133,6 @@ class LocalMapConfig:
 class DepthFilterConfig:
     """How observations sharpen a landmark's depth until the base sends a better one."""
 
-    refined_sigma_px: float = 0.08  # px: virtual disparity error of a depth that the base refined
-    floor_px: float = 0.06  # px: smallest virtual disparity error of the filter
     inflation: float = 6.0  # factor on variances: successive observations share the template's error
 
 
@@ -184,22 +157,17 @@ class DepthFromMotionConfig:
     """How landmarks without depth (seeds) get one from motion."""
 
     per_frame: int = 150  # seeds searched in a frame; each costs about 10 us
-    per_frame_stereo: int = 24  # the same with stereo, which leaves only far and doubtful ones
     nearer: float = 2.0  # times the inverse depth of the nearest twentieth of the landmarks: end of the search
     reach: float = 2.5  # standard deviations of inverse depth that are searched
     step_px: float = 0.7  # px of the level between two tries: half the width of the correlation peak
-    max_steps: int = 40  # tries on a segment; longer ones are searched on a smaller image
-    min_search_ncc: float = 0.7  # correlation at a try, up to half a step from the peak
     distinct: float = 0.93  # share of the best correlation that nothing else on the segment may reach
     off_line_px: float = 1.5  # px at octave 0 between the aligned pixel and the epipolar line
     gate: float = 3.0  # standard deviations between measured and held inverse depth
     sigma_px: float = 0.5  # px: standard deviation of an aligned pixel, with the pose's own error
     inflation: float = 2.0  # factor on variances: successive frames share the template's error
     known: float = 0.12  # deviation over inverse depth below which a seed becomes a landmark
-    far_share: float = 0.4  # of the typical inverse depth: `known` counts from there for farther landmarks
     min_hits: int = 3  # frames that agree
     max_misses: int = 6  # frames without a match: it moved, or was an occlusion edge
-    max_tries: int = 60  # frames in view without a depth
 
 
 @dataclass(frozen=True, slots=True)
@@ -208,24 +176,17 @@ class DisparityConfig:
 
     on: bool = True  # False: only the base estimates it
     every: int = 4  # frames between two pairs: each costs a quarter of a millisecond
-    min_points: int = 30  # landmarks of a pair; eleven numbers are estimated from them
     points: int = 120  # most of them that are used
     sigma_px: float = 0.3  # px at octave 0; of aligned coordinates and disparities
     inflation: float = 2.0  # of variance: templates and lens errors are common to neighbouring points
-    usual_square: float = 0.45  # mean squared error above which a pair counts less before an offset is applied
     iterations: int = 3  # Gauss-Newton steps; two converge from a scale that is off by a tenth
     growth: float = 1.2  # of the parallax between two pairs of the same keyframe
-    known_px: float = 0.1  # px; by which each number changes between two flights: mounts and temperature
-    prior_px: float = 0.9  # px; standard deviation of a constant offset of a worn rig: both centres moved
-    prior_slope_px: float = 0.5  # px where x or y is 1; of the other terms
     good_px: float = 0.1  # px; standard deviation of all terms of a good calibration
     worn_share: float = 0.2  # probability of a worn rig before the flight
     sure: float = 0.95  # the same, above which the offset is applied
     refuted: float = 5.0  # log likelihood without earlier flights over that with them, from which those are dropped
     least_px: float = 0.2  # px, rms over the image; of an offset that is applied: good calibrations have a tenth
-    least_change_px: float = 0.04  # px, rms over the image; of a later change that is applied
     min_sideways: float = 0.2  # share of the motion across the optical axis below which errors of a lens pass for such
-    rows_sure: float = 0.99  # probability of a worn rig by rows alone, above which it is applied in any motion
 
 
 @dataclass(frozen=True, slots=True)
@@ -234,23 +195,14 @@ class RelocalisationConfig:
 
     cell_px: int = 16  # px: one corner a cell; four times as many as in a keyframe, so that its own are among them
     max_corners: int = 600  # 0.5 ms of descriptors
-    min_corners: int = 60  # with fewer there is no texture in view, and a search would prove nothing
     entered: int = 16  # keyframes that a frame's search enters into the place index, the newest first; 0.65 ms each
     candidates: int = 3  # places tried in a frame; each costs about 1 ms
     beyond: float = 0.2  # of the image width: landmarks so far beyond a keyframe's border are matched, too
-    min_pnp_inliers: int = 12  # of P3P; chance matches reach 8
     min_inliers: int = 30  # of the tracker from that pose
     min_share: float = 0.4  # of the landmarks the tracker searched for; a place that only looks similar has fewer
     dead_reckoning_m: float = 0.08  # m: standard deviation up to which dead reckoning extends the map; below good_m
-    dead_reckoning_rad: float = 0.02  # rad: the same for the rotation, a degree
     failures: int = 2  # failed searches in frames with texture before a new submap is opened
-    join_s: float = 1.02  # s for which older submaps are searched beside a new one
-    agree_ratio: float = 0.05  # of the depth: difference between two results beside a new submap
-    agree_rad: float = 0.035  # rad: the same for the rotation, 2 degrees
-    ambiguous_candidates: int = 2  # further places of the same submap that are tried; each costs about 1 ms
-    ambiguous_share: float = 0.6  # of the inliers: with so many another place is as likely
-    ambiguous_ratio: float = 0.2  # of the depth: difference up to which two results are the same place
-    ambiguous_rad: float = 0.15  # rad: the same for the rotation
+    agree_rad: float = 0.035  # rad: rotation between two results beside a new submap, 2 degrees
 
 
 @dataclass(frozen=True, slots=True)
@@ -263,25 +215,13 @@ class CovarianceConfig:
     least_rms: float = 0.3  # whitened residual of a frame: its noise is never assumed to be smaller
 
     imu_offset_frames: float = 10.0  # frames over which the difference between fused and image poses is averaged
-    imu_offset_share: float = 1.0  # of the mean difference: standard deviation of its systematic part
-    refined_share: float = 0.25  # of a keyframe's variance that remains when the base has optimised it
     unmeasured_accel_m_s2: float = 2.0  # m/s^2 of an unobserved vehicle: a multicopter tilted by twelve degrees
     unmeasured_turn_rad_s2: float = 2.0  # rad/s^2: the same for the rotation
-    lost_velocity_m_s: float = 0.03  # m/s: error of the velocity between two frames
-    lost_rate_rad_s: float = 0.02  # rad/s: the same for the rotation
     unknown_velocity_m_s: float = 5.0  # m/s: error of the velocity of a vehicle whose motion was not observed yet
     unknown_rate_rad_s: float = 1.0  # rad/s: the same for the rotation
     good_m: float = 0.2  # m: error up to which a pose counts as good
     good_rad: float = 0.1745  # rad: the same for the rotation, 10 degrees
-    few_inliers: int = 10  # inliers with which quality begins to rise: so many agree by chance
-    many_inliers: int = 30  # inliers with which quality is not reduced
     flagged_below: int = 50  # percent: quality below which a pose must not be relied on, as likely wrong as good
-    surprise: float = 7.0  # standard deviations between a relocalised pose and the IMU's prediction, at most
-    surprise_unmeasured: float = 10.0  # the same if nothing measured the motion: 2 g all the time
-    far_deviations: float = 4.0  # the same beyond which a relocalised pose has low quality at first: nearly 1 g
-    low_quality_s: float = 0.98  # s of that low quality, in which a wrong place fails to track
-    surprise_m: float = 0.1  # m: standard deviation added to that comparison, since maps are corrected meanwhile
-    surprise_rad: float = 0.05  # rad: the same for the rotation
 
 
 @dataclass(frozen=True, slots=True)
@@ -291,12 +231,7 @@ class MapCacheConfig:
     keyframes: int = 32  # slots; the base sends fewer, but those of an earlier base may still be there
     landmarks: int = 128  # of a cached keyframe
     sigma_px: float = 0.15  # px: virtual disparity error of a cached landmark, which rests on many views
-    max_scale: float = 2.5  # change of distance since the cached keyframe, as a factor
-    octave_gap: float = 1.2  # octaves between predicted and matched size
-    corner_px: float = 1.0  # px at octave 0: standard deviation of a corner that was detected twice
     radius_px: float = 6.0  # px at octave 0: search radius around a projection, the error that P3P leaves
-    min_matches: int = 12  # that agree with one pose; chance matches reach 8
-    min_relocalisation_matches: int = 30  # with which a lost frame is relocalised
     min_share: float = 0.15  # of the landmarks that should be in view; not every one is a corner again
     candidates: int = 3  # cached keyframes tried in a lost frame
     beyond: float = 0.2  # of the image width: landmarks so far beyond a keyframe's border are matched, too

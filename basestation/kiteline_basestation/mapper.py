@@ -88,7 +88,7 @@ class Mapper:
         job_ids = itertools.count(1)
         self._intake = Intake(self.config.intake, self.map)
         self._publisher = Publisher(self.map, self.config.publish)
-        self._placements = SubmapPlacements(self.config.intake, self.map, self._intake, self._publisher)
+        self._placements = SubmapPlacements(self.map, self._intake, self._publisher)
         self._local_bundles = LocalBundles(self.config, self.map, self._publisher, job_ids)
         self.grid_updates = GridUpdates(self.config, self.map, self.placements)
         self.image_scans = ImageScans(self.config.scan, self.map, job_ids)
@@ -273,14 +273,14 @@ class Mapper:
         """Match, triangulate and cull landmarks around a new keyframe, then search for its place in all maps."""
         config, publisher = self.config, self._publisher
         self._placements.place_new(keyframe)
-        if is_confirmed(self.map, keyframe, config.intake):
+        if is_confirmed(self.map, keyframe):
             self._confirmed[agent_of_keyframe(keyframe)] += 1
         self.counts.found += landmark_matching.match_landmarks(self.map, keyframe, config.landmark_matching, publisher)
         self.counts.triangulated += triangulation.triangulate_landmarks(
             self.map, keyframe, config.triangulation, publisher
         )
-        self.counts.culled += culling.cull_weak_landmarks(self.map, keyframe, config.cull, publisher)
-        culled = culling.cull_redundant_keyframes(self.map, keyframe, config.cull, publisher)
+        self.counts.culled += culling.cull_weak_landmarks(self.map, keyframe, publisher)
+        culled = culling.cull_redundant_keyframes(self.map, keyframe, publisher)
         self.counts.keyframes_culled += len(culled)
         self._local_bundles.add(keyframe)
         self.grid_updates.add_keyframe(keyframe)

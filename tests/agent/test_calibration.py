@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from kiteline_agent.config import DepthFilterConfig, LocalMapConfig
+from kiteline_agent.config import LocalMapConfig
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_codec.schema import KeyframeHeader, RefinedLandmarks
 from kiteline_core.geometry.cameras import RectifiedCamera
@@ -17,7 +17,7 @@ FIRST = keyframe_id(submap_id(AgentId(0), 0, 0), 0)
 
 
 def held_map(disparity: list[float]) -> LocalMap:
-    held = LocalMap(CAMERA, LocalMapConfig(), DepthFilterConfig())
+    held = LocalMap(CAMERA, LocalMapConfig())
     n = len(disparity)
     landmarks = plain_landmarks(np.full((n, 2), 200.0), np.array(disparity) / CAMERA.bf)
     held.add(KeyframeHeader(FIRST, 0, NO_KEYFRAME, np.eye(4), n), np.eye(4), landmarks, 0)

@@ -24,7 +24,7 @@ FAR = se3.exp(np.array([1.3, -0.6, 0.1, 0.0, 0.0, 0.4]))
 @pytest.fixture
 def corrections() -> Corrections:
     camera, config = RectifiedCamera(752, 480, 450.0, 450.0, 370.0, 240.0, 0.11, True, np.eye(4)), AgentConfig()
-    local_map = LocalMap(camera, config.local_map, config.depth_filter)
+    local_map = LocalMap(camera, config.local_map)
     local_map.activate(FIRST)
     cache = MapCache(camera, config.map_cache, config.matching, config.ransac, None)
     return Corrections(local_map, cache, config.smoothing)

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from kiteline_agent.config import AgentConfig, DepthFilterConfig, DisparityConfig, LocalMapConfig
+from kiteline_agent.config import AgentConfig, DisparityConfig, LocalMapConfig
 from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_agent.local_map import disparity_kernels as kernels
 from kiteline_agent.local_map.disparity_alignment import DisparityAlignment
@@ -95,7 +95,7 @@ class Flight:
 
     def __init__(self, offset: F64, seed: int, step: F64) -> None:
         self.rng, self.offset, self.step = np.random.default_rng(seed), offset, step
-        self.map = LocalMap(CAMERA, LocalMapConfig(keyframes=8), DepthFilterConfig())
+        self.map = LocalMap(CAMERA, LocalMapConfig(keyframes=8))
         self.alignment = DisparityAlignment(self.map, DisparityConfig())
         uv = self.rng.uniform([40, 40], [710, 440], (160, 2))
         self.depth = self.rng.uniform(2.0, 12.0, len(uv))

@@ -23,7 +23,7 @@ SUBMAP = submap_id(3, 1, 0)
 def test_a_place_with_a_scale_stretches_the_way_but_not_the_arm(pace: float) -> None:
     config = AgentConfig()
     window = MapCache(CAMERA, config.map_cache, config.matching, config.ransac, None)
-    local_map = LocalMap(CAMERA, config.local_map, config.depth_filter)
+    local_map = LocalMap(CAMERA, config.local_map)
     base = Corrections(local_map, window, SmoothingConfig(max_m_s=pace, max_rad_s=pace, snap_m=0.3))
     T_m_c = se3.exp(np.array([2.0, 1.0, 0.3, 0.1, 0.4, -0.2]))
     T_m_b, T_o_m = T_m_c @ se3.inverse(T_B_C), se3.exp(np.array([5.0, 0.0, 0.0, 0.0, 0.0, 0.7]))

@@ -35,7 +35,7 @@ LEAST_M = CONFIG.local_map.moved_px * DEPTH_M / CAMERA.fx  # of a shift that cou
 
 
 def local_map(keyframes: int = 4, slots: int = 8, camera: RectifiedCamera = CAMERA) -> LocalMap:
-    out = LocalMap(camera, replace(CONFIG.local_map, keyframes=slots), CONFIG.depth_filter)
+    out = LocalMap(camera, replace(CONFIG.local_map, keyframes=slots))
     for k in range(keyframes):
         add(out, k)
     return out

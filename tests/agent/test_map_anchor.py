@@ -31,7 +31,7 @@ LANDMARKS, IN_VIEW = 80, 60  # of each of three keyframes; the last one's are no
 def scene(seed: int = 0) -> tuple[LocalMap, Track]:
     """Three keyframes with landmarks, and a frame that tracks those of the first two without error."""
     rng = np.random.default_rng(seed)
-    local_map = LocalMap(CAMERA, CONFIG.local_map, CONFIG.depth_filter)
+    local_map = LocalMap(CAMERA, CONFIG.local_map)
     for k in range(3):
         z = rng.uniform(2.0, 8.0, LANDMARKS)
         uv = rng.uniform((80.0, 60.0), (680.0, 420.0), (LANDMARKS, 2))

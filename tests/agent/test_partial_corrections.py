@@ -27,7 +27,7 @@ class _Flight:
     """Keyframes 0, 1, 2, ... in a row along x, each at twice the fitting distance where the base says nothing else."""
 
     def __init__(self, keyframes: int) -> None:
-        self.map = LocalMap(CAMERA, CONFIG.local_map, CONFIG.depth_filter)
+        self.map = LocalMap(CAMERA, CONFIG.local_map)
         cache = MapCache(CAMERA, CONFIG.map_cache, CONFIG.matching, CONFIG.ransac, None)
         self.corrections = Corrections(self.map, cache, CONFIG.smoothing)
         self.covariance = PoseCovariance(self.map, np.eye(4), CONFIG.covariance, has_body=False, has_depth=True)

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from kiteline_agent.config import AgentConfig, CovarianceConfig
 from kiteline_agent.covariance import calibration_error_kernels as certainty_kernels
 from kiteline_agent.covariance.calibration_evidence import CalibrationEvidence
-from kiteline_agent.covariance.pose_covariance import PoseCovariance, adjoint, probability_good
+from kiteline_agent.covariance.pose_covariance import PoseCovariance, adjoint
+from kiteline_agent.covariance.pose_quality import probability_good
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.tracking.pose_state import PoseState
 from kiteline_agent.tracking.track import Track
@@ -52,7 +53,7 @@ def scene(n: int = 120) -> F64:
 
 def map_of(observed: F64, T_m_k: F64 | None = None) -> LocalMap:
     config = AgentConfig()
-    local_map = LocalMap(CAMERA, config.local_map, config.depth_filter)
+    local_map = LocalMap(CAMERA, config.local_map)
     n = len(observed)
     local_map.add(
         KeyframeHeader(KeyframeId(0), 0, NO_KEYFRAME, np.eye(4), n), np.eye(4) if T_m_k is None else T_m_k,

@@ -112,7 +112,7 @@ SUBMAP = submap_id(AgentId(0), 1, 0)
 def flown(rng: np.random.Generator) -> tuple[Corrections, LocalMap]:
     """An agent with five keyframes in a placed submap, and what it has said once."""
     camera, config = RectifiedCamera(752, 480, 450.0, 450.0, 370.0, 240.0, 0.11, True, np.eye(4)), AgentConfig()
-    local_map = LocalMap(camera, config.local_map, config.depth_filter)
+    local_map = LocalMap(camera, config.local_map)
     local_map.activate(SUBMAP)
     n, uv = 20, rng.uniform((80.0, 60.0), (680.0, 420.0), (20, 2))
     for k, T_m_k in enumerate(keyframes(rng, 5)):

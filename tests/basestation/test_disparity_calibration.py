@@ -146,7 +146,7 @@ def test_a_rig_that_was_repaired_is_not_held_to_earlier_flights(make_flight: Mak
         mapper.map.set_camera(flight.agent, flight.camera)
         mapper.map.set_stereo_alignment(StereoAlignment(flight.agent, NONE, False, known))  # of a rig file
         mapper.map.set_stereo_alignment(StereoAlignment(flight.agent, NONE, False, found, 0.1))  # of this flight
-        mean = prior_mean(mapper.map, flight.agent, BaseConfig().disparity)
+        mean = prior_mean(mapper.map, flight.agent)
         assert np.allclose(mean, known if holds else found)
         if not holds:
             assert np.allclose(mapper.map.disparity_offset_px[flight.agent], found)
@@ -162,7 +162,7 @@ def test_a_restarted_base_tells_an_offset_that_it_knows_better(make_flight: Make
     first.map.disparity_offset_px[flight.agent], first.map.disparity_sigma_px[flight.agent] = better, 0.04
     second.restore(flight.agent, received, (), 0)
     second.restore_state(first.state())
-    assert np.array_equal(prior_mean(second.map, flight.agent, BaseConfig().disparity), found)
+    assert np.array_equal(prior_mean(second.map, flight.agent), found)
     output = second.step(MapperInput(()), 0)
     sent = [r for _, records in output.publish for r in records if isinstance(r, DisparityCalibration)]
     assert [(r.disparity_px.tolist(), r.sigma_px) for r in sent] == [(better.tolist(), 0.04)]
@@ -216,7 +216,7 @@ def test_a_worn_rig_is_held_about_what_earlier_flights_found(words: Any, make_fl
         config = replace(BaseConfig().disparity, min_sideways=2.0)  # no motion is believed
         mapper = Mapper(replace(WITHOUT_GRID, disparity=config), words)
         fly(mapper, flight, WORN, (StereoAlignment(flight.agent, 0.1 * BENT_ROWS, False, told),))
-        assert not has_bent(mapper.map, flight.agent, config)
+        assert not has_bent(mapper.map, flight.agent)
         error = WORN - mapper.map.disparity_offset_px.get(AgentId(0), NONE)
         left.append(float(np.sqrt(np.mean(np.square(terms(CORNERS) @ error)))))
     assert left[1] < 0.06
@@ -224,15 +224,15 @@ def test_a_worn_rig_is_held_about_what_earlier_flights_found(words: Any, make_fl
 
 
 def test_what_a_good_calibration_may_have_is_not_carried_from_flight_to_flight(words: Any) -> None:
-    mapper, config = Mapper(WITHOUT_GRID, words), BaseConfig().disparity
-    assert not np.any(prior_mean(mapper.map, AgentId(0), config))
+    mapper = Mapper(WITHOUT_GRID, words)
+    assert not np.any(prior_mean(mapper.map, AgentId(0)))
     camera = RectifiedCamera(752, 480, FOCAL, FOCAL, CX, CY, 0.11, True, np.eye(4))
     mapper.map.set_camera(AgentId(0), camera)
     mapper.map.set_stereo_alignment(StereoAlignment(AgentId(0), NONE, False, CONSTANT))
     assert np.array_equal(mapper.map.disparity_offset_px[AgentId(0)], CONSTANT)  # where it begins
-    assert not np.any(prior_mean(mapper.map, AgentId(0), config))
+    assert not np.any(prior_mean(mapper.map, AgentId(0)))
     mapper.map.known_offset_px[AgentId(0)] = WORN
-    assert np.array_equal(prior_mean(mapper.map, AgentId(0), config), WORN)
+    assert np.array_equal(prior_mean(mapper.map, AgentId(0)), WORN)
 
 
 def test_bent_rows_let_a_large_offset_be_found_whatever_the_motion(make_flight: MakeFlight, words: Any) -> None:

@@ -192,7 +192,7 @@ def test_a_gap_in_the_chain_costs_little() -> None:
 
 def test_few_or_mad_steps_tell_nothing() -> None:
     segments, T_w_c = a_map(0.95)
-    assert tells_scale(segments, CONFIG) and not tells_scale(segments[:2], CONFIG)
+    assert tells_scale(segments) and not tells_scale(segments[:2])
     assert scale_of((), T_w_c) is None
     T_w_c[3, 0, 3] = np.nan
     assert scale_of(segments, T_w_c) is None

@@ -77,7 +77,7 @@ def test_culling_takes_no_memory_in_proportion_to_the_map(
     monkeypatch.setattr(mapper.map, "slots", 100_000_000)  # as of a map of 300,000 keyframes
     tracemalloc.start()
     try:
-        cull_weak_landmarks(mapper.map, flight.keyframes[25], mapper.config.cull, Publisher(mapper.map))
+        cull_weak_landmarks(mapper.map, flight.keyframes[25], Publisher(mapper.map))
         assert tracemalloc.get_traced_memory()[1] < 10_000_000
     finally:
         tracemalloc.stop()

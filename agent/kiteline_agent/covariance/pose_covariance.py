@@ -29,6 +29,7 @@ from kiteline_agent.covariance.calibration_error_kernels import (
 from kiteline_agent.covariance.calibration_evidence import CalibrationEvidence
 from kiteline_agent.covariance.evaluation_schedule import EvaluationSchedule
 from kiteline_agent.covariance.odometry_drift import covariance_by_map
+from kiteline_agent.covariance.pose_quality import probability_good
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.tracking.pose_state import PoseState
 from kiteline_agent.tracking.track import Track
@@ -42,6 +43,18 @@ _CACHE_DEPTH_M = 4.0  # typical depth of such corners
 _MOUNT = 2.0  # growth of the error of the extrinsic rotation with that of the lenses: .15 degrees an axis if worn
 _WORN_LENS_PX = 0.8  # px at the image's edge: focal length and centre of a worn lens
 _WORN_MOUNT_RAD = 3e-3  # rad: rotation of the camera in the body about an axis, if worn
+_IMU_OFFSET_SHARE = 1.0  # of the mean difference: standard deviation of its systematic part
+_REFINED_SHARE = 0.25  # of a keyframe's variance that remains when the base has optimised it
+_LOST_VELOCITY_M_S = 0.03  # m/s: error of the velocity between two frames
+_LOST_RATE_RAD_S = 0.02  # rad/s: the same for the rotation
+_FEW_INLIERS = 10  # inliers with which quality begins to rise: so many agree by chance
+_MANY_INLIERS = 30  # inliers with which quality is not reduced
+_SURPRISE = 7.0  # standard deviations between a relocalised pose and the IMU's prediction, at most
+_SURPRISE_UNMEASURED = 10.0  # the same if nothing measured the motion: 2 g all the time
+_FAR_DEVIATIONS = 4.0  # the same beyond which a relocalised pose has low quality at first: nearly 1 g
+_LOW_QUALITY_S = 0.98  # s of that low quality, in which a wrong place fails to track
+_SURPRISE_M = 0.1  # m: standard deviation added to that comparison, since maps are corrected meanwhile
+_SURPRISE_RAD = 0.05  # rad: the same for the rotation
 
 
 class PoseCovariance:
@@ -60,7 +73,7 @@ class PoseCovariance:
         self._refined = np.zeros(slots, np.bool_)
         self._good_variance = np.full(CALIBRATION, config.calibration_px**2)
         self._good_variance[:DISPARITY_SHAPES] *= 2.0 if has_depth else 0.0  # a disparity has the errors of two cameras
-        self._calibration = np.diag([*self._good_variance, config.imu_offset_share**2])
+        self._calibration = np.diag([*self._good_variance, _IMU_OFFSET_SHARE**2])
         self._evidence = CalibrationEvidence(self._good_variance)
         self._disparity_error: F64 | None = None  # as set last
         self._worn = 0.0  # probability of a worn rig
@@ -198,7 +211,7 @@ class PoseCovariance:
         c = self._config
         before = (self._unmeasured_s or 0.0) if before_s is None else before_s
         after = before + dt_s
-        speed = (c.lost_velocity_m_s, c.lost_rate_rad_s) if moves else (c.unknown_velocity_m_s, c.unknown_rate_rad_s)
+        speed = (_LOST_VELOCITY_M_S, _LOST_RATE_RAD_S) if moves else (c.unknown_velocity_m_s, c.unknown_rate_rad_s)
         (m0, m1), (t0, t1) = (
             tuple(v * s + 0.5 * a * s * s for s in (before, after))
             for v, a in zip(speed, (c.unmeasured_accel_m_s2, c.unmeasured_turn_rad_s2), strict=True)
@@ -252,13 +265,13 @@ class PoseCovariance:
         if not new.any():
             return
         self._refined |= new
-        lost = 1.0 - self._config.refined_share
-        self._noise_k[new] *= self._config.refined_share
+        lost = 1.0 - _REFINED_SHARE
+        self._noise_k[new] *= _REFINED_SHARE
         # the odometry frame does not gain accuracy by it
         self._same_frame = False
         a = adjoint(pose.T_o_m)
         self._carried = self._carried + lost * a @ self._noise @ a.T
-        self._noise = self._noise * self._config.refined_share
+        self._noise = self._noise * _REFINED_SHARE
 
     def correct_disparities(self, offset: F64) -> F64:
         """Move keyframes by a change (5,) px of the disparity offset; how the camera moves in m, on the left (6,)."""
@@ -343,26 +356,25 @@ class PoseCovariance:
         if T_o_m is None or not (self._has_imu_motion or (relocalised and self._metric)):
             return True
         self._far_relocalisation = False
-        c = self._config
         here, there = pose.T_o_m @ predicted_T_m_c, T_o_m @ se3.inverse(T_c_m)
         away_m = float(np.abs(there[:3, 3] - here[:3, 3]).sum())
         turned = 0.5 * (3.0 - float(np.vdot(here[:3, :3], there[:3, :3])))  # 1 - cos
-        if away_m < c.surprise_m and turned < 0.5 * c.surprise_rad**2:
+        if away_m < _SURPRISE_M and turned < 0.5 * _SURPRISE_RAD**2:
             return True
         if not self._has_imu_motion and submap == active and self._unmeasured_s is None:
             return True  # images were lost in this very frame
         here, there = here @ T_c_b, there @ T_c_b
         e = np.concatenate([there[:3, 3] - here[:3, 3], se3.so3_log(here[:3, :3].T @ there[:3, :3])])
-        cov = self.of_poses(pose, pose.T_m_c @ T_c_b)[1] + np.diag(np.repeat([c.surprise_m, c.surprise_rad], 3) ** 2)
+        cov = self.of_poses(pose, pose.T_m_c @ T_c_b)[1] + np.diag(np.repeat([_SURPRISE_M, _SURPRISE_RAD], 3) ** 2)
         apart = math.sqrt(float(e @ np.linalg.solve(cov, e)))
         if self._has_imu_motion:
-            return apart < c.surprise
-        self._far_relocalisation = apart >= c.far_deviations
-        return apart < c.surprise_unmeasured
+            return apart < _SURPRISE
+        self._far_relocalisation = apart >= _FAR_DEVIATIONS
+        return apart < _SURPRISE_UNMEASURED
 
     def confirm_relocalisation(self) -> None:
         """Accept the last consistent relocalisation; if it is far from the prediction, its quality is low at first."""
-        self._doubtful_s = self._config.low_quality_s if self._far_relocalisation else 0.0
+        self._doubtful_s = _LOW_QUALITY_S if self._far_relocalisation else 0.0
 
     def quality(self, cov: F64, inliers: int | None) -> int:
         """Probability in percent, at least 1, that a pose of covariance cov (6,6) is good, as configured.
@@ -370,26 +382,10 @@ class PoseCovariance:
         inliers: None if the pose comes from dead reckoning.
         """
         c = self._config
-        counted = c.many_inliers if inliers is None else inliers
-        trust = min(max((counted - c.few_inliers) / (c.many_inliers - c.few_inliers), 0.0), 1.0)
+        counted = _MANY_INLIERS if inliers is None else inliers
+        trust = min(max((counted - _FEW_INLIERS) / (_MANY_INLIERS - _FEW_INLIERS), 0.0), 1.0)
         most = 100 if self._doubtful_s == 0.0 else c.flagged_below - 1
         return min(max(1, round(100.0 * trust * probability_good(cov, c.good_m, c.good_rad))), most)
-
-
-def probability_good(cov: F64, good_m: float, good_rad: float) -> float:
-    """Probability that an error of covariance cov (6,6) is within both limits, taken as independent.
-
-    The length of a Gaussian vector, by the cube root of its square (E. Wilson, M. Hilferty, 1931; for unequal axes
-    D. Jensen, H. Solomon, 1972).
-    """
-    both = 1.0
-    for block, limit in ((cov[:3, :3], good_m), (cov[3:, 3:], good_rad)):
-        v = block.ravel().tolist()
-        if (mean := sum(v[::4])) > 1e-18:  # the trace
-            k = mean * mean / sum(x * x for x in v)
-            z = ((limit * limit / mean) ** (1.0 / 3.0) - 1.0 + 2.0 / (9.0 * k)) / math.sqrt(2.0 / (9.0 * k))
-            both *= 0.5 * math.erfc(-z / math.sqrt(2.0))
-    return both
 
 
 def adjoint(T: F64) -> F64:

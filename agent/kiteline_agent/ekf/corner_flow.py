@@ -25,6 +25,8 @@ Bools = NDArray[np.bool_]
 U8 = NDArray[np.uint8]
 
 _BORDER_PX = 8.0  # a window of the flow and its gradients lie inside
+_WINDOW_PX = 21  # px of the flow's window
+_SLIDE_PX = 3.0  # px of its octave between the flow and a corner's template at most
 
 
 class CornerFlow:
@@ -47,7 +49,7 @@ class CornerFlow:
     def follow(self, left: Pyramid) -> None:
         """Follow the corners into a frame by optical flow."""
         if self._last is not None and len(self.ids):
-            size = {"winSize": (self._config.window_px, self._config.window_px), "maxLevel": 3}
+            size = {"winSize": (_WINDOW_PX, _WINDOW_PX), "maxLevel": 3}
             found, ok, _ = cv2.calcOpticalFlowPyrLK(self._last[0], left[0], self.uv.astype(np.float32), None, **size)  # type: ignore[call-overload]
             limit = np.array([left[0].shape[1], left[0].shape[0]]) - _BORDER_PX
             inside = (found >= _BORDER_PX).all(axis=1) & (found < limit).all(axis=1)
@@ -65,7 +67,7 @@ class CornerFlow:
         config = self._align
         alignment_kernels.align(
             left, NO_GRID, self._templates, np.arange(n), self.octave, self._warps(T_o_c, depth_m), uv, 0, 0,
-            config.iterations, self._config.slide_px, config.min_ncc, found, ncc,
+            config.iterations, _SLIDE_PX, config.min_ncc, found, ncc,
         )  # fmt: skip
         self.uv = uv
         self._keep(found)

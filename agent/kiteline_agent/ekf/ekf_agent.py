@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_agent.config import AgentConfig
-from kiteline_agent.covariance.pose_covariance import probability_good
+from kiteline_agent.covariance.pose_quality import probability_good
 from kiteline_agent.ekf.corner_flow import CornerFlow
 from kiteline_agent.ekf.ekf_slam import EkfSlam
 from kiteline_agent.ekf.odometer_motion import OdometerMotion

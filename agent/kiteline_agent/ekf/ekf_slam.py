@@ -27,6 +27,17 @@ F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
+_VIEW_M = 0.15  # m between two camera poses in the state: nearer ones add no parallax indoors
+_LEAST_RAYS = 4  # sightings from which a landmark is positioned
+_RAY_PX = 10.0  # px from the point that two views give beyond which a third one's ray is a wrong match
+_PARALLAX_RAD = 0.05  # rad: three degrees between a landmark's first and last ray, at least
+_DEPTH_SHARE = (
+    0.05  # deviation of a new landmark's distance over that distance, at most: at 0.1 lengths come out 3 % long
+)
+_ENDED_RAYS = (
+    5  # rays of an ended track that correct the views: seven equations each, the cost of as many landmarks in view
+)
+
 
 @dataclass(frozen=True, slots=True)
 class FrameUpdate:
@@ -130,7 +141,7 @@ class EkfSlam:
 
     def _is_view_due(self) -> bool:
         used = self.state.view_used
-        return not used.any() or self._way - float(self._view_way[used].max()) >= self._config.view_m
+        return not used.any() or self._way - float(self._view_way[used].max()) >= _VIEW_M
 
     def _enter(self, ids: I64, xy: F64, coarse: F64, ended: list[Track]) -> I64:
         """Correct the state by new landmarks and ended tracks, and let the former in; returns their ids.
@@ -159,7 +170,7 @@ class EkfSlam:
         """Places in `ids` of tracks whose rays meet under enough parallax, widest first, with what agrees of each."""
         config, state = self._config, self.state
         known, rows = self._tracks.find(ids)
-        enough = self._tracks.seen[rows].sum(axis=1) >= config.least_rays - 1
+        enough = self._tracks.seen[rows].sum(axis=1) >= _LEAST_RAYS - 1
         known, rows = known[enough], rows[enough]
         if not len(known):
             return []
@@ -168,14 +179,14 @@ class EkfSlam:
         seen = np.concatenate([self._tracks.seen[rows], np.ones((len(rows), 1), np.bool_)], axis=1)
         rays = np.einsum("vij,nvj->nvi", poses[:, :3, :2], points) + poses[:, :3, 2]
         rays /= np.linalg.norm(rays, axis=2, keepdims=True)
-        wide = np.flatnonzero(largest_parallax(rays, seen) > config.parallax_rad)
+        wide = np.flatnonzero(largest_parallax(rays, seen) > _PARALLAX_RAD)
         if not len(wide):
             return []
         known, points, rays = known[wide], points[wide], rays[wide]
-        seen = supporting_views(poses[:, :3, 3], rays, seen[wide], config.ray_px / float(self._focal[0]))
+        seen = supporting_views(poses[:, :3, 3], rays, seen[wide], _RAY_PX / float(self._focal[0]))
         parallax = largest_parallax(rays, seen)
         order = np.argsort(-parallax, kind="stable")
-        enough = (parallax > config.parallax_rad) & (seen.sum(axis=1) >= config.least_rays)
+        enough = (parallax > _PARALLAX_RAD) & (seen.sum(axis=1) >= _LEAST_RAYS)
         out = []
         for k in order[enough[order]][: config.entries].tolist():
             views = np.flatnonzero(seen[k, :-1])
@@ -189,19 +200,19 @@ class EkfSlam:
         rays = linearised(state, track, state.T_o_c, state.view_T_o_c)
         if rays is None or not rays_meet(state, rays, config.residual_gate):
             return False
-        return distance_share(state, rays) <= config.depth_share
+        return distance_share(state, rays) <= _DEPTH_SHARE
 
     def _ended(self, ids: I64) -> list[Track]:
         """Tracks that are followed no more, were seen often enough, and whose rays meet. ids: (n,) followed ones."""
         tracks, config = self._tracks, self._config
         ended = np.flatnonzero(~np.isin(tracks.ids, ids))
         out: list[Track] = []
-        for row in ended[tracks.seen[ended].sum(axis=1) >= config.least_rays].tolist():
+        for row in ended[tracks.seen[ended].sum(axis=1) >= _LEAST_RAYS].tolist():
             if len(out) == config.ended:
                 break
             views = np.flatnonzero(tracks.seen[row])
             views = views[np.argsort(self._view_way[views], kind="stable")]
-            views = views[np.unique(np.linspace(0, len(views) - 1, config.ended_rays).round().astype(np.int64))]
+            views = views[np.unique(np.linspace(0, len(views) - 1, _ENDED_RAYS).round().astype(np.int64))]
             track = Track(views, tracks.xy[row, views], self._sigma * float(tracks.coarse[row]))
             rays = linearised(self.state, track, self.state.T_o_c, self.state.view_T_o_c)
             if rays is not None and rays_meet(self.state, rays, config.residual_gate):
@@ -238,5 +249,5 @@ class EkfSlam:
         way = self._view_way[order]
         if self._tracks.seen[:, order[0]].sum() < 4:
             return int(order[0])
-        gap = (way[2:] - way[:-2]) / (self._way - way[1:-1] + self._config.view_m)
+        gap = (way[2:] - way[:-2]) / (self._way - way[1:-1] + _VIEW_M)
         return int(order[1 + int(np.argmin(gap))])

@@ -14,6 +14,13 @@ from kiteline_core.geometry import se3
 F64 = NDArray[np.float64]
 
 _MEASURED = 100.0  # (m/s)^2 or (rad/s)^2: any measured direction is far more precise
+_TURN_SHARE = 0.02  # rad per sqrt(rad) turned: error of the heading
+_IDLE_M_S = 0.005  # m per sqrt(s): the error of a vehicle that stands
+_IDLE_RAD_S = 0.001  # rad per sqrt(s): the same of the heading
+_UNMEASURED_M_S = 0.02  # m/s: velocity along axes that the odometer does not measure: wheels do not slide sideways
+_UNMEASURED_RAD_S = 0.2  # rad/s: the same about axes that it does not measure
+_GAP_M_S = 1.0  # m/s by which the velocity may have changed where samples are missing
+_GAP_RAD_S = 0.5  # rad/s: the same of the rotation rate
 
 
 class OdometerMotion:
@@ -54,15 +61,15 @@ class OdometerMotion:
         """Of the body's motion (6,6): translation along the axes of b0, rotation about those of b1."""
         c = self._config
         out = np.zeros((6, 6))
-        by_way = c.path_noise**2 * way + c.idle_m_s**2 * dt_s
-        by_turn = c.turn_noise**2 * way + c.turn_share**2 * turned + c.idle_rad_s**2 * dt_s
+        by_way = c.path_noise**2 * way + _IDLE_M_S**2 * dt_s
+        by_turn = c.turn_noise**2 * way + _TURN_SHARE**2 * turned + _IDLE_RAD_S**2 * dt_s
         out[:3, :3], out[3:, 3:] = by_way * np.eye(3), by_turn * np.eye(3)
         if mean is None:
-            out[:3, :3] += (c.gap_m_s * dt_s) ** 2 * np.eye(3)
-            out[3:, 3:] += (c.gap_rad_s * dt_s) ** 2 * np.eye(3)
+            out[:3, :3] += (_GAP_M_S * dt_s) ** 2 * np.eye(3)
+            out[3:, 3:] += (_GAP_RAD_S * dt_s) ** 2 * np.eye(3)
             return out
-        out[:3, :3] += dt_s**2 * _bounded(mean.velocity_cov, c.unmeasured_m_s)
-        out[3:, 3:] += dt_s**2 * _bounded(mean.rate_cov, c.unmeasured_rad_s)
+        out[:3, :3] += dt_s**2 * _bounded(mean.velocity_cov, _UNMEASURED_M_S)
+        out[3:, 3:] += dt_s**2 * _bounded(mean.rate_cov, _UNMEASURED_RAD_S)
         return out
 
 

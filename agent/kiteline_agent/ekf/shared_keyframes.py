@@ -84,7 +84,7 @@ class SharedKeyframes:
         few = min(config.keyframe.min_inliers, config.ekf.corners // 3)
         self._policy = replace(config.keyframe, min_inliers=few)
         # Poses of keyframes alone; one point at their typical depth tells by how much a correction moves the image.
-        self._map = LocalMap(camera, replace(config.local_map, landmarks=1), config.depth_filter)
+        self._map = LocalMap(camera, replace(config.local_map, landmarks=1))
         self._map.activate(self.submap)
         self._reference = ReferenceKeyframe(self._map)
         cache = MapCache(camera, config.map_cache, config.matching, config.ransac, None)

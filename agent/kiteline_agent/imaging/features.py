@@ -18,6 +18,10 @@ Pyramid = tuple[U8, ...]
 # change: descriptors of all versions are compared.
 PATTERN_SEED = 20_260_101
 PATTERN_REACH_PX = 10.0  # per axis, so that a rotated test stays within 15 px
+_FAINT_THRESHOLD = 6  # grey levels, for faint corners
+_FAINT_SCORE = 2.0  # (grey levels / px)^2; least score of faint corners, and
+_FAINT_NOISE = 1.5  # their least score in squared noise: corners of pure noise reach 0.9
+_MARGIN_PX = 20  # px at octave 0: border without image after rectification
 
 
 def _pattern() -> NDArray[np.float64]:
@@ -43,10 +47,6 @@ class DetectorConfig:
     fast_threshold: int = 12  # grey levels; low, since only the best corner of a cell is kept
     min_score: float = 12.0  # (grey levels / px)^2; weaker corners are sensor noise
     faint_below: int = 100  # corners, existing ones included: with fewer, empty cells are searched for faint corners
-    faint_threshold: int = 6  # grey levels, for faint corners
-    faint_score: float = 2.0  # least score of faint corners, and
-    faint_noise: float = 1.5  # least score in squared noise: corners of pure noise reach 0.9
-    margin_px: int = 20  # level-0 px: border without image after rectification
     max_corners: int = 200  # new landmarks of a keyframe: what fits in 12 kB
 
 
@@ -88,7 +88,7 @@ def detect(pyramid: Pyramid, taken: NDArray[np.float64], config: DetectorConfig)
     def search(threshold: int, min_score: float) -> None:
         for level in range(config.first, min(config.levels, len(pyramid))):
             image = pyramid[level]
-            margin = max(kernels.BORDER, config.margin_px >> level)
+            margin = max(kernels.BORDER, _MARGIN_PX >> level)
             corners = np.empty((max(image.size // 4, 1), 2), np.int32)
             n = fast_corners(image, threshold, margin, 1 << level, float(config.cell_px), occupied, corners)
             xy, score = corners[:n], np.empty(n)
@@ -101,7 +101,7 @@ def detect(pyramid: Pyramid, taken: NDArray[np.float64], config: DetectorConfig)
     if np.count_nonzero(occupied | (best_score > 0.0)) < config.faint_below:
         occupied |= best_score > 0.0
         noise = noise_of(pyramid[min(config.first, len(pyramid) - 1)])
-        search(config.faint_threshold, max(config.faint_score, config.faint_noise * noise * noise))
+        search(_FAINT_THRESHOLD, max(_FAINT_SCORE, _FAINT_NOISE * noise * noise))
     r, c = np.nonzero(best_score > 0.0)
     order = np.argsort(-best_score[r, c], kind="stable")[: config.max_corners]
     r, c = r[order], c[order]

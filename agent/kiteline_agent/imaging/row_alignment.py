@@ -23,6 +23,18 @@ TERMS = 5
 _ROUNDS = 4  # of robust weighting
 _TURNS = np.array([0, 1, 3])  # terms of pitch, roll and yaw of the right camera
 _MOST_DEVIATIONS = 3.0  # of a worn rig's x y
+_MIN_POINTS = 40  # points of a keyframe with a measured offset; five numbers are estimated from them
+_PRIOR_PX = 1.5  # px; standard deviation of each number before anything was measured: a worn rig's
+_MAX_PX = 3.5  # px of the level; offset beyond which the patch is another one
+_MIN_NCC = 0.9  # correlation of the two patches; lower at occlusions
+_MIN_CHANGE_PX = 0.5  # px; rms over points of a change that is applied: good calibrations are off by 0.3 px
+_MIN_SIGNIFICANCE = 4.0  # standard deviations of a change that is applied
+_KNOWN_PX = 0.1  # px; standard deviation of each number where an earlier flight measured it
+_SHARE_PX = 0.1  # px; rms over points of a change that the base is told: a tenth of what a worn rig has
+_SIGMA_SHARE = 0.3  # of the standard deviations by sigma_px: what estimates of known rigs err by at most
+_GOOD_PX = 0.1  # px; standard deviation of level, slope along x and x y with a good calibration
+_WORN_SLOPE_PX = 0.3  # px where x is 1; of the slope along x: the mount is twisted by 0.04 degrees
+_WORN_TURN_PX = 0.6  # px where x y is 1; of x y: it is turned about y by 0.07 degrees
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,21 +42,9 @@ class RowConfig:
     """Estimation of how far the right image lies off the rows of the left one, from the points of keyframes."""
 
     on: bool = True  # False: the right image is read where the calibration says
-    min_points: int = 40  # points of a keyframe with a measured offset; five numbers are estimated from them
     sigma_px: float = 0.5  # px at octave 0; of a measured offset, with what points of a keyframe have in common
-    prior_px: float = 1.5  # px; standard deviation of each number before anything was measured: a worn rig's
-    max_px: float = 3.5  # px of the level; offset beyond which the patch is another one
     iterations: int = 10  # Gauss-Newton steps; it converges in 4 from 1 px
-    min_ncc: float = 0.9  # correlation of the two patches; lower at occlusions
-    min_px: float = 0.5  # px; rms over points of a change that is applied: good calibrations are off by 0.3 px
-    min_significance: float = 4.0  # standard deviations of a change that is applied
-    known_px: float = 0.1  # px; standard deviation of each number where an earlier flight measured it
-    share_px: float = 0.1  # px; rms over points of a change that the base is told: a tenth of what a worn rig has
-    sigma_share: float = 0.3  # of the standard deviations by sigma_px: what estimates of known rigs err by at most
-    good_px: float = 0.1  # px; standard deviation of level, slope along x and x y with a good calibration
     worn_px: float = 0.9  # px; standard deviation of the level with a worn rig: both centres moved
-    worn_slope_px: float = 0.3  # px where x is 1; of the slope along x: the mount is twisted by 0.04 degrees
-    worn_turn_px: float = 0.6  # px where x y is 1; of x y: it is turned about y by 0.07 degrees
     shown: float = 0.7  # share of worn rigs whose rows are off; focal lengths do not move them
 
 
@@ -62,7 +62,7 @@ class RowAlignment:
     def __init__(self, rectifier: Rectifier, config: RowConfig) -> None:
         self._rectifier = rectifier
         self._config = config
-        self._information = np.diag(np.full(TERMS, config.prior_px**-2.0))
+        self._information = np.diag(np.full(TERMS, _PRIOR_PX**-2.0))
         self._vector = np.zeros(TERMS)
         self._at = np.zeros((1, TERMS))  # terms at the last keyframe's points
         self._taken_px: F64 = np.zeros(TERMS)  # see take_change
@@ -88,10 +88,10 @@ class RowAlignment:
         offset, found = np.zeros(len(uv)), np.zeros(len(uv), np.bool_)
         row_kernels.measure_rows(
             left, right, np.zeros((0, 0, 2), np.float32) if grid is None else grid, uv, octave, disparity,
-            config.iterations, config.max_px, config.min_ncc, offset, found,
+            config.iterations, _MAX_PX, _MIN_NCC, offset, found,
         )  # fmt: skip
         count = int(np.count_nonzero(found))
-        if count < config.min_points:
+        if count < _MIN_POINTS:
             return 0
         at = terms(self._normalised(uv[found] - np.stack([disparity[found], np.zeros(count)], 1)))
         total = offset[found] + at @ self.applied_px
@@ -111,11 +111,10 @@ class RowAlignment:
         """Read the right image at its rows if the last points are significantly off. Returns their rms px, or 0."""
         estimate = self.estimate_px
         change = estimate - self.applied_px
-        config = self._config
         at = self._at
         rms = float(np.sqrt(np.mean((at @ change) ** 2)))
         sigma = float(np.sqrt(np.mean(np.einsum("ni,in->n", at, np.linalg.solve(self._information, at.T)))))
-        if rms < config.min_px or rms < config.min_significance * sigma:
+        if rms < _MIN_CHANGE_PX or rms < _MIN_SIGNIFICANCE * sigma:
             return 0.0
         self._read_at(estimate)
         self._events.append(f"rows of the right image are {estimate[0]:+.2f} px off in the middle")
@@ -136,7 +135,7 @@ class RowAlignment:
 
         Disparities that were calibrated with the rows as they came would not fit others.
         """
-        self._information = np.diag(np.full(TERMS, self._config.known_px**-2.0))
+        self._information = np.diag(np.full(TERMS, _KNOWN_PX**-2.0))
         self._vector = self._information @ rows_px
         self._taken_px = rows_px
         self.known = True
@@ -153,7 +152,7 @@ class RowAlignment:
         self._measured, estimate = False, self.estimate_px
         before, self._taken_read = self._taken_read, self.read
         change = float(np.sqrt(np.mean((self._at @ (estimate - self._taken_px)) ** 2)))
-        if before == self.read and change < self._config.share_px:
+        if before == self.read and change < _SHARE_PX:
             return None
         self._taken_px = estimate
         return estimate
@@ -169,13 +168,13 @@ class RowAlignment:
         No depth moves them. An x y beyond any wear is what a rectification has left, and tells nothing.
         """
         c = self._config
-        at, worn_px = _TURNS, np.array([c.worn_px, c.worn_slope_px, c.worn_turn_px])
-        if abs(self.estimate_px[at[2]]) > _MOST_DEVIATIONS * c.worn_turn_px:
+        at, worn_px = _TURNS, np.array([c.worn_px, _WORN_SLOPE_PX, _WORN_TURN_PX])
+        if abs(self.estimate_px[at[2]]) > _MOST_DEVIATIONS * _WORN_TURN_PX:
             at, worn_px = at[:2], worn_px[:2]
         found = self.estimate_px[at]
-        cov = c.sigma_share**2 * np.linalg.inv(self._information)[np.ix_(at, at)]
+        cov = _SIGMA_SHARE**2 * np.linalg.inv(self._information)[np.ix_(at, at)]
         self.roll_px = math.sqrt(float(found[1] ** 2 + cov[1, 1]))
-        good, worn = (_log_normal(found, cov + np.diag(np.square(s))) for s in (np.full(len(at), c.good_px), worn_px))
+        good, worn = (_log_normal(found, cov + np.diag(np.square(s))) for s in (np.full(len(at), _GOOD_PX), worn_px))
         self.worn_evidence = float(np.logaddexp(math.log1p(-c.shown), math.log(c.shown) + worn - good))
 
     def _read_at(self, rows_px: F64) -> None:

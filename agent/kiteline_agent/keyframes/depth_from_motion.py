@@ -25,6 +25,11 @@ I64 = NDArray[np.int64]
 Bool = NDArray[np.bool_]
 
 _MARGIN_PX = 8.0
+_PER_FRAME_STEREO = 24  # seeds searched in a frame with stereo, which leaves only far and doubtful ones
+_MAX_STEPS = 40  # tries on an epipolar segment; longer ones are searched on a smaller image
+_MIN_SEARCH_NCC = 0.7  # correlation at a try, up to half a step from the peak
+_FAR_SHARE = 0.4  # of the typical inverse depth: the option `known` counts from there for farther landmarks
+_MAX_TRIES = 60  # frames in view without a depth
 
 
 class DepthFromMotion:
@@ -82,11 +87,7 @@ class DepthFromMotion:
 
     def _choose(self, seeds: Candidates, first: int) -> I64:
         """The seeds to search in this frame: most hits first, then the newest. first: finest pyramid level."""
-        limit = (
-            self._config.depth_from_motion.per_frame_stereo
-            if self._map.camera.stereo
-            else self._config.depth_from_motion.per_frame
-        )
+        limit = _PER_FRAME_STEREO if self._map.camera.stereo else self._config.depth_from_motion.per_frame
         fine = (self._map.octave.take(seeds.rows) >= first).nonzero()[0]
         if len(fine) <= limit:
             return fine
@@ -101,7 +102,7 @@ class DepthFromMotion:
         uv, found = np.zeros((len(rows), 2)), np.zeros(len(rows), np.int8)
         search_segments(
             images.sampled, images.grid, self._map.templates, rows, octave, warp, start, end, config.step_px,
-            config.max_steps, config.min_search_ncc, config.distinct, uv, found,
+            _MAX_STEPS, _MIN_SEARCH_NCC, config.distinct, uv, found,
         )  # fmt: skip
         seen = (found == 1).nonzero()[0]
         place, aligned, ncc = uv[seen], np.zeros(len(seen), np.bool_), np.zeros(len(seen))
@@ -119,7 +120,7 @@ class DepthFromMotion:
         self._map.tried[rows] += 1
         self._map.hits[rows[hit]] += 1
         self._map.misses[rows[failed]] += 1
-        hopeless = (self._map.misses[rows] >= config.max_misses) | (self._map.tried[rows] >= config.max_tries)
+        hopeless = (self._map.misses[rows] >= config.max_misses) | (self._map.tried[rows] >= _MAX_TRIES)
         gone = rows[hopeless & ~hit]
         self._map.seed.reshape(-1)[gone] = False
         self._map.tried[gone] = 0  # reads as never searched: the base may still give it a depth
@@ -132,7 +133,7 @@ class DepthFromMotion:
         prior = sigma[rows] ** 2
         rho[rows] = np.maximum((rho[rows] * variance + measured * prior) / (variance + prior), 1e-6)
         sigma[rows] = np.sqrt(variance * prior / (variance + prior))
-        known = (sigma[rows] < config.known * np.maximum(rho[rows], config.far_share * typical)) & (
+        known = (sigma[rows] < config.known * np.maximum(rho[rows], _FAR_SHARE * typical)) & (
             self._map.hits[rows] >= config.min_hits
         )
         self._map.promote(rows[known])

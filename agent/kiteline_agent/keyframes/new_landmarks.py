@@ -16,6 +16,7 @@ from kiteline_core.geometry.cameras import RectifiedCamera
 F64 = NDArray[np.float64]
 
 _SEARCH_PX = 2.5  # px of the level: range of sub-pixel stereo around the coarse search, whose step is 2 px
+_UNIQUENESS = 1.15  # second-best cost over best; below it the row repeats itself
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +46,7 @@ def new_points(images: FrameImages, taken: F64, camera: RectifiedCamera, config:
         stereo = config.stereo
         widest = min(camera.bf / stereo.min_depth_m, 0.45 * camera.width)
         stereo_kernels.search_rows(
-            images.aligned, images.right.coarse(), corners.uv, corners.octave, widest, stereo.uniqueness, disparity
+            images.aligned, images.right.coarse(), corners.uv, corners.octave, widest, _UNIQUENESS, disparity
         )
         found = np.zeros(len(disparity), np.bool_)
         images.right.refine(

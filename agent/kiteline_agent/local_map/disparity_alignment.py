@@ -25,6 +25,13 @@ I64 = NDArray[np.int64]
 
 _LEAST_RHO = 1e-4  # 1/m
 _LEAST_PARALLAX = 0.02  # distance over depth of a first pair, but for `growth`
+_MIN_POINTS = 30  # landmarks of a pair; eleven numbers are estimated from them
+_USUAL_SQUARE = 0.45  # mean squared error above which a pair counts less before an offset is applied
+_KNOWN_PX = 0.1  # px; by which each number of an offset changes between two flights: mounts and temperature
+_PRIOR_PX = 0.9  # px; standard deviation of a constant offset of a worn rig: both centres moved
+_PRIOR_SLOPE_PX = 0.5  # px where x or y is 1; the same of the other terms
+_LEAST_CHANGE_PX = 0.04  # px, rms over the image; of a later change that is applied
+_ROWS_SURE = 0.99  # probability of a worn rig by rows alone, above which it is applied in any motion
 
 
 class DisparityAlignment:
@@ -48,7 +55,7 @@ class DisparityAlignment:
         self._evicted_sure_h, self._evicted_sure_b = np.zeros((TERMS, TERMS)), np.zeros(TERMS)
         self._refuted = False  # earlier flights were of another rig; the map still has their offset
         self._good = np.eye(TERMS) / config.good_px**2
-        self._prior = np.diag(np.array([config.prior_px, *[config.prior_slope_px] * (TERMS - 1)]) ** -2.0)
+        self._prior = np.diag(np.array([_PRIOR_PX, *[_PRIOR_SLOPE_PX] * (TERMS - 1)]) ** -2.0)
         x, y = np.meshgrid(np.linspace(0.0, camera.width, 7), np.linspace(0.0, camera.height, 5))
         self._grid = terms(np.stack([(x.ravel() - camera.cx) / camera.fx, (y.ravel() - camera.cy) / camera.fy], 1))
         self._frames = 0
@@ -68,7 +75,7 @@ class DisparityAlignment:
         sigma_px: its standard deviation, rms over the image.
         """
         of_each = sigma_px / float(np.sqrt(np.mean(np.sum(self._grid**2, axis=1))))  # number, if all have the same
-        self._earlier_h = np.eye(TERMS) / (self._config.known_px**2 + of_each**2)
+        self._earlier_h = np.eye(TERMS) / (_KNOWN_PX**2 + of_each**2)
         self._earlier_b = self._earlier_h @ offset
         self._solve()
         self.applied = bool(offset.any())
@@ -84,10 +91,10 @@ class DisparityAlignment:
         if self._frames % config.every:
             return None
         slots, counts = np.unique(rows // m.slot_size, return_counts=True)
-        for slot in slots[counts >= config.min_points].tolist():
+        for slot in slots[counts >= _MIN_POINTS].tolist():
             if self._keyframe[slot] != m.keyframe[slot]:
                 self._begin(slot)
-        ratios = {slot: self._parallax_ratio(slot, T_c_m) for slot in slots[counts >= config.min_points].tolist()}
+        ratios = {slot: self._parallax_ratio(slot, T_c_m) for slot in slots[counts >= _MIN_POINTS].tolist()}
         slot = max(ratios, key=lambda s: ratios[s], default=None)
         if slot is None or ratios[slot] < config.growth:
             return None
@@ -163,7 +170,7 @@ class DisparityAlignment:
         index = rows[at] % m.slot_size
         measured = m.disparity[slot, index] > 0.0
         at, index = at[measured], index[measured]
-        if len(at) < config.min_points:
+        if len(at) < _MIN_POINTS:
             return False
         if len(at) > config.points:
             chosen = np.linspace(0, len(at) - 1, config.points).astype(np.int64)
@@ -198,7 +205,7 @@ class DisparityAlignment:
         if not np.isfinite(score) or (self._score[slot] != 0.0 and score <= self._score[slot]):
             return False
         self._score[slot], self._pair_h[slot], self._pair_b[slot] = score, information, side
-        self._share[slot] = max(square, 1.0) / max(square / config.usual_square, 1.0)
+        self._share[slot] = max(square, 1.0) / max(square / _USUAL_SQUARE, 1.0)
         self._moved[slot] = (T[:3, :3].T @ T[:3, 3]) ** 2
         return True
 
@@ -244,7 +251,7 @@ class DisparityAlignment:
 
     def _rows_are_worn(self) -> bool:
         """True if the right camera's rows alone tell a worn rig: then what passes for an offset is one."""
-        return _probability(self._prior_log_odds + self._row_evidence) >= self._config.rows_sure
+        return _probability(self._prior_log_odds + self._row_evidence) >= _ROWS_SURE
 
     def _expected_cov(self) -> F64:
         """(5,5) px^2: mean square of what the map's offset is off by, beside the error of a good calibration."""
@@ -265,7 +272,7 @@ class DisparityAlignment:
                 return None
             offset = none()
         change = offset - self._map.disparity_offset
-        least = config.least_change_px if self.applied or self._refuted else config.least_px
+        least = _LEAST_CHANGE_PX if self.applied or self._refuted else config.least_px
         if float(np.sqrt(np.mean((self._grid @ change) ** 2))) < least:
             return None
         self.applied, self._refuted, self._base_sigma_px = bool(offset.any()), False, None

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_agent.config import DepthFilterConfig, LocalMapConfig
+from kiteline_agent.config import LocalMapConfig
 from kiteline_agent.imaging.alignment_kernels import TEMPLATE, TEMPLATE_LEVELS
 from kiteline_agent.local_map import projection_kernels as kernels
 from kiteline_agent.local_map.held_corrections import HeldCorrections, Removed
@@ -31,6 +31,8 @@ I64 = NDArray[np.int64]
 _SEED_DEPTH_M = 1e4  # stands for infinity in landmarks without depth
 _MIN_TRIES = 12  # frames that must have searched a landmark before it is given up
 _TRIES_A_HIT = 5  # frames that search a landmark for one that finds it; with more it is given up
+_REFINED_SIGMA_PX = 0.08  # px: virtual disparity error of a depth that the base refined
+_FLOOR_PX = 0.06  # px: smallest virtual disparity error of the filter
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,14 +52,13 @@ class Candidates:
 class LocalMap:
     """Keyframes and landmarks near the vehicle."""
 
-    def __init__(self, camera: RectifiedCamera, config: LocalMapConfig, filtering: DepthFilterConfig) -> None:
+    def __init__(self, camera: RectifiedCamera, config: LocalMapConfig) -> None:
         k, b = config.keyframes, config.landmarks
         self.camera = camera
         self.intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy, camera.bf])
         self._size = np.array([camera.width, camera.height], np.float64)
         self._config = config
         self.searched = config.searched
-        self._filtering = filtering
         self.keyframe = np.full(k, NO_KEYFRAME, np.int64)
         self.parent = np.full(k, NO_KEYFRAME, np.int64)
         self.T_m_k = np.tile(np.eye(4), (k, 1, 1))
@@ -201,7 +202,7 @@ class LocalMap:
         self, T_c_m: F64, rows: I64, inlier: NDArray[np.bool_], observed: F64, sigma_px: F64, inflate: float
     ) -> None:
         """Update the inverse depths of rows (n,) by observations (n,3) from T_c_m (4,4)."""
-        floor = self._filtering.floor_px / self.camera.bf
+        floor = _FLOOR_PX / self.camera.bf
         kernels.update_depths(
             T_c_m, self.intrinsics, rows, inlier, observed, sigma_px, inflate, floor,
             self.T_m_k, self.bearing, self.rho, self.sigma_rho,
@@ -359,7 +360,7 @@ class LocalMap:
     def _set_landmarks(self, slot: int, index: I64, rho: F64, bearing: F64) -> None:
         self.rho[slot, index], self.bearing[slot, index] = rho, bearing
         self.measured[slot, index] = False
-        self.sigma_rho[slot, index] = self._filtering.refined_sigma_px / self.camera.bf
+        self.sigma_rho[slot, index] = _REFINED_SIGMA_PX / self.camera.bf
 
     def offset_px(self, uv: F64) -> F64:
         """Error (n,) of stereo disparities at pixels (n,2)."""

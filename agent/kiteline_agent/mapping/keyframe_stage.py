@@ -19,6 +19,9 @@ from kiteline_core.ids import NO_KEYFRAME, KeyframeId
 
 F64 = NDArray[float64]
 
+_WAIT_RIGHT_S = 0.26  # s that a keyframe waits for a lost right image: without it points have no depth
+_DEAD_RECKONING_RAD = 0.02  # rad: standard deviation up to which dead reckoning extends the map, a degree
+
 
 class KeyframeStage:
     """Keyframe policy, with what the link carries and CPU time allows, and the making of keyframes."""
@@ -45,7 +48,7 @@ class KeyframeStage:
         urgent = track.inliers < ctx.config.keyframe.thin * ctx.config.pose.min_inliers
         if not self._governor.may(Extra.KEYFRAME, urgent=urgent):
             return ["governor: keyframe postponed"]
-        if not urgent and 0.0 < (ctx.t_ns - self._right_t_ns) * 1e-9 < ctx.config.keyframe.wait_right_s:
+        if not urgent and 0.0 < (ctx.t_ns - self._right_t_ns) * 1e-9 < _WAIT_RIGHT_S:
             return []  # its new landmarks would have no depth
         if not need.pressing and self._camera.reference.age_ns(ctx.t_ns) < self._channel.keyframe_gap_ns():
             self._add_unshared(ctx, track)
@@ -73,7 +76,7 @@ class KeyframeStage:
         Returns whether the map goes on there, also if the keyframe has to wait for CPU time, and events.
         """
         limits = ctx.config.relocalisation
-        if not self._camera.covariance.dead_reckoning_within(limits.dead_reckoning_m, limits.dead_reckoning_rad):
+        if not self._camera.covariance.dead_reckoning_within(limits.dead_reckoning_m, _DEAD_RECKONING_RAD):
             return False, []
         if not self._governor.may(Extra.KEYFRAME, urgent=True):
             return True, ["governor: keyframe postponed"]

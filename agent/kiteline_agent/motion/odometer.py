@@ -16,14 +16,30 @@ from kiteline_agent.config import OdometerConfig
 from kiteline_agent.inertial.fixed_lag import BodyVelocity
 from kiteline_agent.motion.extrapolation import Extrapolation, MotionSource, along_twist
 from kiteline_agent.motion.odometer_samples import MeanVelocity, OdometerSamples, measured_part
+from kiteline_agent.motion.unit_scale import WINDOW_S, UnitScale
 from kiteline_core.frame import OdometryBatch
 from kiteline_core.geometry import se3
 
 F64 = NDArray[np.float64]
 
 _UNMATCHED = 10  # windows without a sample, after which the stamps are reported to be wrong
-_OUTLYING = 3.0  # deviations of a window from the median scale: slip, a moment of bad images
 _WELL = 0.09  # (m/s)^2 or (rad/s)^2; directions measured worse than this count less and less
+_CORRELATION_S = 0.5  # s; correlation time of an odometer's errors: a patch of slippery floor, a gust
+_COMPARE_S = 0.2  # s; window of a comparison, in which images measure a velocity to a centimetre a second
+_LEAST_MOVED_M = 0.02  # m; motion in a window below which axes and scale are not observable
+_SCALE_START = 0.1  # relative deviation of an odometer's scale at the start
+_SCALE_MOST = 0.25  # relative; a larger difference is a fault, not a scale
+_SCALE_FLOOR = 0.01  # least relative deviation of the scale
+_SCALE_SIGMA_M_S = 0.05  # m/s; expected noise of a window in the scale estimate
+_START_M_S = 0.08  # m/s; expected noise at the start, weighted as one window
+_START_RAD_S = 0.03  # rad/s; the same of the rotation rate
+_MEMORY_S = 3.0  # s; time constant of the noise estimate
+_UNUSUAL = 5.0  # times the expected squared error, above which the option `rise` applies
+_TOLERANCE_SHARE = 0.10  # of the speed: noise above which an odometer is not used, beside tolerance_m_s
+_PROOFS = 3  # consecutive moving windows that must agree before an odometer is used
+_SURPRISE = 4.0  # deviations from the prediction above which a sample is rejected: 8 m/s^2
+_SEEN_M_S = 0.05  # m/s; error of the velocity between two frames placed by images
+_SEEN_RAD_S = 0.02  # rad/s; the same of the rotation rate
 
 
 class Odometer:
@@ -35,8 +51,8 @@ class Odometer:
         self._config = config
         self.metric = metric
         self._samples = OdometerSamples(config.keep_s, config.max_gap_s)
-        self.scale, self._scale_var = 1.0, config.scale_start**2  # true velocity = scale * measured
-        self._noise, self._rate_noise = config.start_m_s**2, config.start_rad_s**2  # variances
+        self.scale, self._scale_var = 1.0, _SCALE_START**2  # true velocity = scale * measured
+        self._noise, self._rate_noise = _START_M_S**2, _START_RAD_S**2  # variances
         self._proofs = 0
         self._speed = 0.0  # m/s, of the last window
         self._anchor: tuple[int, F64] | None = None  # stamp and T_m_c at the start of the window
@@ -51,9 +67,7 @@ class Odometer:
         self.image_loss_s = 0.0
         self._path, self._path_cov, self._path_cross = np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3))  # in m
         self._rotation_cov, self._rotation_cross = np.zeros((3, 3)), np.zeros((3, 3))  # about the body's axes
-        # Of a map of unknown scale: displacement by the odometer times that by the images, m times units; the latter's
-        # square; whether directions agreed.
-        self._scale_windows: list[tuple[float, float, bool]] = []
+        self._unit_scale = UnitScale(config.aligned)
         self._unscaled_ns: int | None = None  # stamp of the first frame in a map of unknown scale
         self._trusted = self._reported_trust = False
         self._unmatched = 0  # windows without a sample before the first comparison
@@ -183,7 +197,7 @@ class Odometer:
         """The velocity (3,) in b by a sample. prior: (3,3) its covariance before."""
         c, z = self._config, self.scale * mean.velocity
         slow = (self._noise + c.floor_m_s**2) * np.eye(3) + self._scale_var * np.outer(z, z)
-        return _blend(self._velocity, prior, z, mean.velocity_cov, slow, c.surprise)
+        return _blend(self._velocity, prior, z, mean.velocity_cov, slow, _SURPRISE)
 
     def _updated_rate(self, mean: MeanVelocity, prior: F64) -> _KalmanUpdate:
         """The same of the rate (3,), never rejected: a gust turns the vehicle at once."""
@@ -217,7 +231,7 @@ class Odometer:
         if not self._carried:
             return None
         r = T_m_c[:3, :3] @ self._T_c_b[:3, :3]
-        ended = min(dt / self._config.correlation_s, 1.0)  # share of the errors that decorrelated
+        ended = min(dt / _CORRELATION_S, 1.0)  # share of the errors that decorrelated
         relax = ended * (r @ self._gain @ r.T)
         self._path = self._path + (T_m_c[:3, 3] - before[1][:3, 3])
         self._path_cross = self._path_cross + dt * (r @ self._velocity_slow @ r.T) - relax @ self._path_cross
@@ -245,7 +259,7 @@ class Odometer:
         dt = (t_ns - before_ns) * 1e-9
         # errors are correlated over frames: inflate, so that those frames count as one
         slow = (self._noise + c.floor_m_s**2) * np.eye(3) + self._scale_var * np.outer(value, value)
-        counted = cov + max(1.0, 2.0 * c.correlation_s / dt) * slow
+        counted = cov + max(1.0, 2.0 * _CORRELATION_S / dt) * slow
         return BodyVelocity(value, cov + slow, counted, age_s)
 
     # map changes
@@ -267,24 +281,13 @@ class Odometer:
         """Change the map's unit to metres, or to an unknown one."""
         self.metric = metric
         self._anchor = self._last = None
-        self._scale_windows, self._unscaled_ns = [], None
+        self._unit_scale.clear()
+        self._unscaled_ns = None
         self._reset_image_loss()
 
     def metres_per_unit(self) -> tuple[float, float] | None:
         """Metres per unit of the map and its standard deviation; None while unknown."""
-        c = self._config
-        agreed = np.array([window[:2] for window in self._scale_windows if window[2]])
-        if len(agreed) < max(c.unit_least, c.unit_share * len(self._scale_windows)):
-            return None
-        along, square = agreed.T
-        each = along / square
-        middle = float(np.median(each))
-        spread = 1.4826 * float(np.median(np.abs(each - middle)))
-        near = np.abs(each - middle) <= _OUTLYING * spread
-        metres = float(along[near].sum() / square[near].sum())
-        left = along[near] - metres * square[near]
-        count = np.count_nonzero(near)
-        return metres, float(np.sqrt(left @ left * count / (count - 1)) / square[near].sum())
+        return self._unit_scale.metres_per_unit()
 
     # steps
 
@@ -295,20 +298,18 @@ class Odometer:
 
     def _set_velocity(self, before: F64, after: F64, dt_s: float) -> None:
         """Set the velocity to that between two frames placed by images."""
-        c = self._config
         twist = se3.log(self._T_b_c @ se3.inverse(before) @ after @ self._T_c_b) / dt_s
         self._velocity, self._rate = twist[:3], twist[3:]
-        self._velocity_cov, self._rate_cov = c.seen_m_s**2 * np.eye(3), c.seen_rad_s**2 * np.eye(3)
+        self._velocity_cov, self._rate_cov = _SEEN_M_S**2 * np.eye(3), _SEEN_RAD_S**2 * np.eye(3)
 
     def _compare(self, T_m_c: F64, t_ns: int) -> None:
         """Compare the odometer with the images once the window is long enough."""
-        c = self._config
         if self._anchor is None or t_ns <= self._anchor[0]:
             self._anchor = (t_ns, T_m_c)
             return
         before_ns, before = self._anchor
         dt = (t_ns - before_ns) * 1e-9
-        if dt < (c.compare_s if self.metric else c.unit_window_s) - 1e-3:
+        if dt < (_COMPARE_S if self.metric else WINDOW_S) - 1e-3:
             return
         self._anchor = (t_ns, T_m_c)
         mean = self._samples.between(before_ns, t_ns)
@@ -324,7 +325,7 @@ class Odometer:
         moved = r_c_b @ se3.exp(np.concatenate([dt * mean.velocity, turn]))[:3, 3]
         known = measured_part(r_c_b @ mean.velocity_cov @ r_c_b.T, _WELL)
         if not self.metric:
-            self._add_scale_window(known @ (moved + lever_motion), known @ T_c0_c1[:3, 3])
+            self._unit_scale.add(known @ (moved + lever_motion), known @ T_c0_c1[:3, 3])
             return
         self._compare_displacements(known @ moved, known @ (T_c0_c1[:3, 3] - lever_motion), float(np.trace(known)), dt)
         known = measured_part(mean.rate_cov, _WELL)
@@ -339,40 +340,31 @@ class Odometer:
         self._speed = distance / dt
         square = float(by_odometer @ by_odometer)
         self._scale_var += c.scale_walk**2 * dt
-        if square > c.least_moved_m**2:
+        if square > _LEAST_MOVED_M**2:
             along = float(by_odometer @ by_images)
             # Over the part along the images' motion: the odometer's own noise in its square would shorten it.
             measured_scale = distance**2 / along if along > 0.0 else 0.0
-            var = (c.scale_sigma_m_s * dt / distance) ** 2 if distance > 0.0 else np.inf
+            var = (_SCALE_SIGMA_M_S * dt / distance) ** 2 if distance > 0.0 else np.inf
             off = measured_scale - self.scale
             aligned = along > c.aligned * distance * float(np.sqrt(square))
             if aligned and off * off < 9.0 * (self._scale_var + var):
                 gain = self._scale_var / (self._scale_var + var)
-                self.scale = float(np.clip(self.scale + gain * off, 1.0 - c.scale_most, 1.0 + c.scale_most))
-                self._scale_var = max((1.0 - gain) * self._scale_var, c.scale_floor**2)
+                self.scale = float(np.clip(self.scale + gain * off, 1.0 - _SCALE_MOST, 1.0 + _SCALE_MOST))
+                self._scale_var = max((1.0 - gain) * self._scale_var, _SCALE_FLOOR**2)
         error = (by_images - self.scale * by_odometer) / dt
-        tolerance = c.tolerance_m_s + c.tolerance_share * self._speed
+        tolerance = c.tolerance_m_s + _TOLERANCE_SHARE * self._speed
         square_error = float(error @ error) / max(axes, 0.5)
-        if max(distance, float(np.sqrt(square))) > c.least_moved_m:
-            self._proofs = min(self._proofs + 1, c.proofs) if square_error < tolerance**2 else 0
+        if max(distance, float(np.sqrt(square))) > _LEAST_MOVED_M:
+            self._proofs = min(self._proofs + 1, _PROOFS) if square_error < tolerance**2 else 0
         self._noise = self._filtered(self._noise, square_error, dt)
-        self._trusted = self._proofs >= c.proofs and self._noise < tolerance**2
+        self._trusted = self._proofs >= _PROOFS and self._noise < tolerance**2
 
     def _filtered(self, before: float, square: float, dt: float) -> float:
         """Noise variance after a squared error, with a faster rise for unusual ones."""
         c = self._config
-        usual = max(1.0 - float(np.exp(-dt / c.memory_s)), 1.0 / (self._compared + 1.0))
-        share = max(usual, c.rise) if square > c.unusual * before else usual
+        usual = max(1.0 - float(np.exp(-dt / _MEMORY_S)), 1.0 / (self._compared + 1.0))
+        share = max(usual, c.rise) if square > _UNUSUAL * before else usual
         return before + share * (square - before)
-
-    def _add_scale_window(self, by_odometer: F64, by_images: F64) -> None:
-        """Add a window: displacement (3,) in m by the odometer and in map units by the images."""
-        a, b = float(np.sqrt(by_odometer @ by_odometer)), float(np.sqrt(by_images @ by_images))
-        if a < self._config.unit_moved_m or b <= 0.0:
-            return
-        along = float(by_odometer @ by_images)
-        self._scale_windows.append((along, b * b, along > self._config.aligned * a * b))
-        del self._scale_windows[: -self._config.unit_windows]
 
 
 @dataclass(slots=True)

@@ -30,6 +30,11 @@ U8 = NDArray[np.uint8]
 
 _MARGIN_PX = 4.0  # px beyond the border: landmarks just out of view have no corner
 _NO_SUBMAP = -1  # in the array of submaps: the keyframe's pose has not arrived
+_MAX_SCALE = 2.5  # change of distance since the cached keyframe, as a factor
+_OCTAVE_GAP = 1.2  # octaves between predicted and matched size
+_CORNER_PX = 1.0  # px at octave 0: standard deviation of a corner that was detected twice
+_MIN_MATCHES = 12  # matches that agree with one pose; chance matches reach 8
+_MIN_RELOCALISATION_MATCHES = 30  # the same with which a lost frame is relocalised
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,12 +165,12 @@ class MapCache:
     def match_landmarks(self, T_c_m: F64, submap: SubmapId, seen: FrameFeatures) -> CacheMatches | None:
         """Match cached landmarks of a submap with a frame at about T_c_m (4,4); None if too few agree on a pose."""
         projected = self._project(T_c_m, submap, _MARGIN_PX)
-        if len(projected.rows) < self._config.min_matches or len(seen.uv) < self._config.min_matches:
+        if len(projected.rows) < _MIN_MATCHES or len(seen.uv) < _MIN_MATCHES:
             return None
         offered, wanted = comparable(seen.descriptor, self._descriptor[projected.rows])
         found = match_near(
             projected.uv, np.full(len(projected.rows), self._config.radius_px), projected.octave, wanted,
-            seen.uv, seen.octave, offered, (self._camera.width, self._camera.height), self._config.octave_gap,
+            seen.uv, seen.octave, offered, (self._camera.width, self._camera.height), _OCTAVE_GAP,
             self._matching,
         )  # fmt: skip
         return self._consistent(T_c_m, projected, found, seen)
@@ -174,14 +179,14 @@ class MapCache:
         self, T_c_m: F64, projected: _Projections, found: Matches, seen: FrameFeatures
     ) -> CacheMatches | None:
         """The matches that agree with one pose."""
-        if len(found.a) < self._config.min_matches:
+        if len(found.a) < _MIN_MATCHES:
             return None
         xyz, ray = projected.xyz[found.a], projected.ray[found.a]
         observed = np.column_stack([seen.uv[found.b], np.full(len(found.b), -1.0)])
-        sigma_px = self._config.corner_px * np.ldexp(1.0, seen.octave[found.b].astype(np.int32))
+        sigma_px = _CORNER_PX * np.ldexp(1.0, seen.octave[found.b].astype(np.int32))
         T, inlier = T_c_m.copy(), np.ones(len(found.a), np.bool_)
         inliers, _ = optimise_pose(T, xyz, ray, observed, sigma_px, self._intrinsics, 3, 4, self._ransac.chi2, inlier)
-        if inliers < self._config.min_matches or not np.isfinite(T).all():
+        if inliers < _MIN_MATCHES or not np.isfinite(T).all():
             return None
         T = se3.orthonormalise(T)
         depth = se3.transform(T, xyz[inlier])[:, 2]
@@ -191,7 +196,7 @@ class MapCache:
         slots = np.flatnonzero(self._submap == submap)
         row, uv, warp, xyz, ray, depth = self._out
         n = projection_kernels.project(
-            T_c_m, self._intrinsics, self._size, margin_px, self._config.max_scale, slots, self._T_m_k, self._order,
+            T_c_m, self._intrinsics, self._size, margin_px, _MAX_SCALE, slots, self._T_m_k, self._order,
             self._counts, self._usable, self._bearing, self._rho, self._sigma_rho, row, uv, warp, xyz, ray, depth,
         )  # fmt: skip
         rows = row[:n].copy()
@@ -212,7 +217,7 @@ class MapCache:
             T_c_m = self._pose_from(slot, submap, seen, frame_number)
             matches = None if T_c_m is None else self.match_landmarks(T_c_m, submap, seen)
             if matches is not None and len(matches.corner) >= max(
-                self._config.min_relocalisation_matches, self._config.min_share * matches.in_view
+                _MIN_RELOCALISATION_MATCHES, self._config.min_share * matches.in_view
             ):
                 return submap, matches
         return None
@@ -222,14 +227,14 @@ class MapCache:
         projected = self._project(se3.inverse(self._T_m_k[slot]), submap, -self._beyond_px)
         wanted, offered = comparable(self._descriptor[projected.rows], seen.descriptor)
         found = match(wanted, self._angle[projected.rows], offered, seen.angle, self._matching)
-        if len(found.a) < self._config.min_matches:
+        if len(found.a) < _MIN_MATCHES:
             return None
         observed = np.column_stack([seen.uv[found.b], np.full(len(found.b), -1.0)])
         fit = solve_pnp(
             projected.xyz[found.a], projected.ray[found.a], observed, seen.octave[found.b], self._intrinsics,
             frame_number, self._ransac,
         )  # fmt: skip
-        return None if fit is None or fit.inliers < self._config.min_matches else fit.T_c_m
+        return None if fit is None or fit.inliers < _MIN_MATCHES else fit.T_c_m
 
     def _fill_index(self) -> None:
         """Index the cached keyframes that arrived since the last search; most flights never search."""

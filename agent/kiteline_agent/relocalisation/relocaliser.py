@@ -29,6 +29,15 @@ from kiteline_core.pose.pnp import PoseFit, solve_pnp
 
 F64 = NDArray[np.float64]
 
+_MIN_CORNERS = 60  # with fewer there is no texture in view, and a search would prove nothing
+_MIN_PNP_INLIERS = 12  # inliers of P3P; chance matches reach 8
+_JOIN_S = 1.02  # s for which older submaps are searched beside a new one
+_AGREE_RATIO = 0.05  # of the depth: difference between two results beside a new submap
+_AMBIGUOUS_CANDIDATES = 2  # further places of the same submap that are tried; each costs about 1 ms
+_AMBIGUOUS_SHARE = 0.6  # of the inliers: with so many another place is as likely
+_AMBIGUOUS_RATIO = 0.2  # of the depth: difference up to which two results are the same place
+_AMBIGUOUS_RAD = 0.15  # rad: the same for the rotation
+
 
 @dataclass(frozen=True, slots=True)
 class Relocalisation:
@@ -107,7 +116,7 @@ class Relocaliser:
 
     def start_joining(self, t_ns: int) -> None:
         """A new submap was opened at t_ns: search for older ones for a while."""
-        self._join_until_ns = t_ns + round(self._config.relocalisation.join_s * 1e9)
+        self._join_until_ns = t_ns + round(_JOIN_S * 1e9)
         self._unconfirmed = None
 
     def relocalise(self, ctx: FrameContext, reference: KeyframeId) -> Relocalisation | None:
@@ -132,7 +141,7 @@ class Relocaliser:
         limits = self._config.relocalisation
         change = found.T_c_m @ T_old_new @ se3.inverse(before[1]) @ se3.inverse(found.T_c_m)  # at the camera
         angle = float(np.linalg.norm(se3.so3_log(change[:3, :3])))
-        if np.linalg.norm(change[:3, 3]) > limits.agree_ratio * found.depth_m or angle > limits.agree_rad:
+        if np.linalg.norm(change[:3, 3]) > _AGREE_RATIO * found.depth_m or angle > limits.agree_rad:
             return None
         self._join_until_ns = None
         return found
@@ -141,7 +150,7 @@ class Relocaliser:
         """Try the reference keyframe, the most similar places, and the map cache, in this order."""
         self.enter_keyframes()  # also where nothing can be seen: frames without texture are cheap
         # 1. Corners and descriptors.
-        seen = frame_features(ctx.images, self._detector, self._config.relocalisation.min_corners)
+        seen = frame_features(ctx.images, self._detector, _MIN_CORNERS)
         self.has_texture = seen is not None
         if seen is None:
             return None
@@ -169,7 +178,6 @@ class Relocaliser:
 
     def _pose_from(self, keyframe: KeyframeId, seen: FrameFeatures, seed: int) -> PoseFit | None:
         """P3P on matches with the landmarks in view of a keyframe, or a little beyond its border."""
-        limits = self._config.relocalisation
         T_m_k = self._map.T_m_k[self._map.slot_of(keyframe)]
         around = self._map.candidates(
             se3.inverse(T_m_k), -self._beyond_px, self._config.align.max_scale, submap=submap_of_keyframe(keyframe)
@@ -178,14 +186,14 @@ class Relocaliser:
             self._map.descriptor[around.rows], self._map.angle[around.rows], seen.descriptor, seen.angle,
             self._config.matching,
         )  # fmt: skip
-        if len(matches.a) < limits.min_pnp_inliers:
+        if len(matches.a) < _MIN_PNP_INLIERS:
             return None
         observed = np.column_stack([seen.uv[matches.b], np.full(len(matches.b), -1.0)])
         fit = solve_pnp(
             around.xyz[matches.a], around.ray[matches.a], observed, seen.octave[matches.b], self._map.intrinsics,
             seed, self._config.ransac,
         )  # fmt: skip
-        return None if fit is None or fit.inliers < limits.min_pnp_inliers else fit
+        return None if fit is None or fit.inliers < _MIN_PNP_INLIERS else fit
 
     def _confirmed(self, ctx: FrameContext, T_c_m: F64, submap: SubmapId) -> Track | None:
         """Track from a pose (4,4) in a submap; None if the templates do not agree with it."""
@@ -202,16 +210,15 @@ class Relocaliser:
         """True if another place of the same submap matches about as well."""
         if self._index is None:
             return False
-        limits = self._config.relocalisation
         near = self._map.keyframe[np.unique(found.track.rows[found.track.inlier] // self._map.slot_size)].tolist()
         out = [k for k in self._index.keys if k in near or submap_of_keyframe(KeyframeId(k)) != found.submap]
-        for key in self._index.query(seen.descriptor, out, limits.ambiguous_candidates).keys.tolist():
+        for key in self._index.query(seen.descriptor, out, _AMBIGUOUS_CANDIDATES).keys.tolist():
             fit = self._pose_from(KeyframeId(key), seen, seed)
-            if fit is None or fit.inliers < limits.ambiguous_share * inliers:
+            if fit is None or fit.inliers < _AMBIGUOUS_SHARE * inliers:
                 continue
             apart = fit.T_c_m @ se3.inverse(found.T_c_m)
             angle = float(np.linalg.norm(se3.so3_log(se3.orthonormalise(apart)[:3, :3])))
-            if np.linalg.norm(apart[:3, 3]) > limits.ambiguous_ratio * found.depth_m or angle > limits.ambiguous_rad:
+            if np.linalg.norm(apart[:3, 3]) > _AMBIGUOUS_RATIO * found.depth_m or angle > _AMBIGUOUS_RAD:
                 return True
         return False
 

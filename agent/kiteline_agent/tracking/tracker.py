@@ -23,6 +23,7 @@ I64 = NDArray[np.int64]
 _SURE_PX = 0.4  # px of the octave: deviation of the predicted disparity below which no coarser level is searched
 _COARSEST = 2  # template level at which the coarse pass begins
 _MARGIN_PX = 8.0  # nearer to the border a template hangs over the edge
+_COARSE_STEP_PX = 7.0  # px of the coarse level: half a template
 
 
 class Tracker:
@@ -115,7 +116,7 @@ class Tracker:
         octave = self._map.octave.take(rows)
         found = np.zeros(len(rows), np.bool_)
         last = 1 if coarse_only else 0
-        step = align.coarse_step_px if coarse_only else align.fine_step_px
+        step = _COARSE_STEP_PX if coarse_only else align.fine_step_px
         # Templates from a finer level than this frame has are aligned one level up.
         least = 0 if coarse_only else images.first
         raised = np.maximum(octave, least) - octave if least else np.zeros_like(octave)

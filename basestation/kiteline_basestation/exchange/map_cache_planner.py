@@ -27,6 +27,13 @@ F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]
 I64 = NDArray[np.int64]
 
+_MAX_CANDIDATES = 60  # keyframes whose landmarks are projected
+_MIN_LANDMARKS = 8  # landmarks of a keyframe that will be in view: fewer are not worth their bytes
+_HYSTERESIS = 1.5  # factor on the landmarks in view of a keyframe that is cached already
+_POSE_M = 0.002  # m; smaller corrections of a cached keyframe are not sent: half a pixel at 2 m
+_POSE_RAD = 0.0005  # rad; a quarter of a pixel at 500 px of focal length
+_MAX_SCALE_CHANGE = 0.01  # relative change of the agent's unit of length at which keyframes are sent again
+
 
 @dataclass(slots=True)
 class _Cached:
@@ -95,7 +102,7 @@ class MapCachePlanner:
         cosine = axes @ T_w_c[:3, 2]
         likely = np.flatnonzero((distance < reach) & (cosine > self._config.min_cosine))
         cost = distance[likely] / reach + 1.0 - cosine[likely]
-        rows = rows[likely[np.lexsort((table.id[rows[likely]], cost))[: self._config.max_candidates]]]
+        rows = rows[likely[np.lexsort((table.id[rows[likely]], cost))[:_MAX_CANDIDATES]]]
         if not len(rows):
             return []
         landmarks = np.concatenate([self._landmarks(KeyframeId(int(table.id[row]))) for row in rows])
@@ -104,8 +111,8 @@ class MapCachePlanner:
         visible = self._in_view(agent, T_w_c, xyz) | self._in_view(agent, predicted, xyz)
         counts = np.bincount(keypoints.row[landmarks[visible]], minlength=len(table.id))[rows].astype(np.float64)
         held = np.array([int(k) in cache.cached for k in table.id[rows]], np.bool_)
-        enough = counts >= np.where(held, 0.5, 1.0) * self._config.min_landmarks
-        counts[held] *= self._config.hysteresis
+        enough = counts >= np.where(held, 0.5, 1.0) * _MIN_LANDMARKS
+        counts[held] *= _HYSTERESIS
         order = np.lexsort((table.id[rows], -counts))
         chosen = order[enough[order]][: self._config.max_keyframes]
         return [KeyframeId(int(k)) for k in table.id[rows[chosen]]]
@@ -155,7 +162,7 @@ class MapCachePlanner:
             for k, entry in cache.cached.items()
             if k not in self._map
             or map_id(submap_of_keyframe(k)) != map_id(entry.record.submap)
-            or abs(self._scale(k, submap) / entry.scale - 1.0) > self._config.max_scale_change
+            or abs(self._scale(k, submap) / entry.scale - 1.0) > _MAX_SCALE_CHANGE
             or (k not in needed and not _arrived(entry, channel))
         ]
         new = sum(k not in cache.cached for k in needed)
@@ -175,7 +182,7 @@ class MapCachePlanner:
             if entry.record.submap == submap:
                 change = se3.inverse(entry.record.T_m_k) @ now.T_m_k
                 moved, turned = np.linalg.norm(change[:3, 3]), np.linalg.norm(change[:3, :3] - np.eye(3)) / np.sqrt(2.0)
-                if moved <= self._config.pose_m and turned <= self._config.pose_rad:
+                if moved <= _POSE_M and turned <= _POSE_RAD:
                     continue
             channel.put(now)
             entry.record = now

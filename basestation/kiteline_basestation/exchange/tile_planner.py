@@ -27,6 +27,9 @@ from kiteline_core.ids import AgentId, SubmapId, agent_of_submap, submap_of_keyf
 F64 = NDArray[np.float64]
 I8 = NDArray[np.int8]
 
+_KEPT_RATIO = 1.5  # of the option reach_m; tiles farther away are removed
+_SOLID_WEIGHT = 4  # cells added for each one that became an obstacle, or is none any more
+
 
 @dataclass(slots=True)
 class _Sent:
@@ -116,7 +119,7 @@ class TilePlanner:
             place
             for place in state.sent
             if (storey and place.storey not in storey)
-            or self._distance(place, here, ahead) > self._config.kept_ratio * self._config.reach_m
+            or self._distance(place, here, ahead) > _KEPT_RATIO * self._config.reach_m
         ]
         idle = [place for place in state.sent if place not in near and place not in far]
         spare = self._config.max_tiles - len(state.sent) + len(far)
@@ -142,7 +145,7 @@ class TilePlanner:
             cells, _ = grid.cells(place)
             before = np.full_like(cells, -1) if held is None else held.cells
             other = cells != before
-            changes = int(np.count_nonzero(other)) + self._config.solid_weight * int(
+            changes = int(np.count_nonzero(other)) + _SOLID_WEIGHT * int(
                 np.count_nonzero(other & ((cells > 0) != (before > 0)))
             )
             if changes >= self._config.min_changes:

@@ -26,6 +26,15 @@ _NODE = 9  # unknowns of a node: position, velocity, accelerometer bias
 _SHARED = 2  # of the map: direction of gravity; and units of w in a metre at the knots of its drift
 _ROWS = 12  # of a step: velocity and position by the IMU, displacement by images, change of the bias
 _WIDTH = 2 * _NODE
+_LEAST_S = 8.0  # s; time of all steps below which the agent's scale stands: it rests on as much
+_NOISE_INFLATION = 3.0  # of the accelerometer's noise: vibration
+_FLOOR_M_S = 2e-4  # m/s; of a step by the IMU: the code's quanta
+_IMAGE_M = 5e-4  # m; error of a step by images, of near scenes
+_BIAS_SIGMA = 0.3  # m/s^2; of the accelerometer's bias where a chain begins
+_BIAS_WALK = (
+    0.03  # m/s^2 per sqrt(s); slow errors of the accelerometer: axes, vibration, temperature, as true poses show them
+)
+_AGENT_SIGMA = 0.03  # relative deviation of the agent's scale
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,9 +72,9 @@ def in_metres(
     return bent(result, problem, shared, found.metres, held)
 
 
-def tells_scale(segments: tuple[Segment, ...], config: InertialScaleConfig) -> bool:
+def tells_scale(segments: tuple[Segment, ...]) -> bool:
     """True if the segments are long enough."""
-    return sum(float(s.steps.dt_s.sum()) for s in segments) >= config.least_s
+    return sum(float(s.steps.dt_s.sum()) for s in segments) >= _LEAST_S
 
 
 def map_scale(
@@ -151,17 +160,17 @@ def _linearised(
     e[:, 9:] = x1[:, 6:] - x0[:, 6:]
     J[:, 9:, 6:9], J[:, 9:, 15:18] = -np.eye(3), np.eye(3)
     # whitening: L L^T = inverse covariance of [velocity, position] by white noise
-    density = config.noise_inflation * path.noise
+    density = _NOISE_INFLATION * path.noise
     v, vp, p = density**2 * dt, 0.5 * density**2 * dt**2, density**2 * dt**3 / 3.0
-    v, p = v + config.floor_m_s**2, p + config.floor_m**2
+    v, p = v + _FLOOR_M_S**2, p + config.floor_m**2
     by_p = 1.0 / np.sqrt(p - vp**2 / v)
     position = by_p[:, None] * (e[:, 3:6] - (vp / v)[:, None] * e[:, :3])
     e[:, :3], e[:, 3:6] = e[:, :3] / np.sqrt(v)[:, None], position
     position_J = by_p[:, None, None] * (J[:, 3:6] - (vp / v)[:, None, None] * J[:, :3])
     J[:, :3], J[:, 3:6] = J[:, :3] / np.sqrt(v)[:, None, None], position_J
-    image = 1.0 / np.hypot(config.image_rad * path.depth_m, config.image_m)
+    image = 1.0 / np.hypot(config.image_rad * path.depth_m, _IMAGE_M)
     chi2 = np.square(image[:, None] * e[:, 6:9]).sum(axis=1)
-    walk = 1.0 / (config.bias_walk * np.sqrt(dt))
+    walk = 1.0 / (_BIAS_WALK * np.sqrt(dt))
     for rows, factor in ((slice(6, 9), image * np.sqrt(weight)), (slice(9, 12), walk)):
         e[:, rows] *= factor[:, None]
         J[:, rows] *= factor[:, None, None]
@@ -184,11 +193,11 @@ def _solve(
     beside[a] = H[:, :_NODE, _NODE:_WIDTH]
     # where a chain begins: a place, and a first bias
     first = np.flatnonzero(path.fresh)
-    diagonal[first, :3, :3] += np.eye(3) / config.image_m**2
-    diagonal[first, 6:, 6:] += np.eye(3) / config.bias_sigma**2
-    rhs[first, 6:] -= state.node[first, 6:] / config.bias_sigma**2
+    diagonal[first, :3, :3] += np.eye(3) / _IMAGE_M**2
+    diagonal[first, 6:, 6:] += np.eye(3) / _BIAS_SIGMA**2
+    rhs[first, 6:] -= state.node[first, 6:] / _BIAS_SIGMA**2
     corner, corner_rhs = H[:, _WIDTH:, _WIDTH:].sum(axis=0), g[:, _WIDTH:].sum(axis=0)
-    prior = np.outer(drift.mean, drift.mean) / (config.agent_sigma * agent_units) ** 2 + drift.information
+    prior = np.outer(drift.mean, drift.mean) / (_AGENT_SIGMA * agent_units) ** 2 + drift.information
     corner[2:, 2:] += prior
     corner_rhs[2:] += prior @ (agent_units - state.units)
     band = np.zeros((k, _NODE, _WIDTH))

@@ -29,6 +29,8 @@ _LEAST_VIEWS = 0.1  # between two keyframes: no two have exactly the same scale
 _WEAK = 1e-3  # landmarks by which a keyframe is tied to the next one beside those that they share
 _REJECTED = 1e-6  # weight of a rejected observation: a landmark without others has to move, too
 _NEAR_M = 0.01  # m; distance between keyframes below which all of them count alike
+_KNOT_VIEWS = 1.0  # views between the values of a scale that drifts
+_MOST_KNOTS = 16  # such values of a map
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +72,7 @@ def drift_along(
 ) -> ScaleDrift:  # fmt: skip
     """The drift of scale along a path through keyframes T_w_c (k,4,4) that share landmarks (k,k)."""
     views = _views(path)
-    gaps = min(int(np.ceil(views[-1] / config.knot_views)), config.most_knots - 1)
+    gaps = min(int(np.ceil(views[-1] / _KNOT_VIEWS)), _MOST_KNOTS - 1)
     knots = np.linspace(0.0, float(views[-1]), gaps + 1)
     at_nodes = _interpolation(views, knots)
     keyframes, nodes, depth_m = _nodes_of_keyframes(segments, path)

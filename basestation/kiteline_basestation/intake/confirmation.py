@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from kiteline_basestation.config import IntakeConfig
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_core.ids import KeyframeId
 
 _LEAST_Z = 0.1  # in the submap's unit; a landmark nearer to the camera projects anywhere
+_CONFIRMED_PX = 5.0  # px; from the projection of an older landmark to where a keyframe observes it, at most
+_MIN_CONFIRMED = 10  # such landmarks, with which a keyframe is of use and its agent may claim memory for another
 
 
-def is_confirmed(sparse_map: SparseMap, keyframe: KeyframeId, config: IntakeConfig) -> bool:
+def is_confirmed(sparse_map: SparseMap, keyframe: KeyframeId) -> bool:
     """True if enough landmarks of other keyframes are where this one observes them."""
     table, row = sparse_map.keypoints, sparse_map.rows[keyframe]
     mine = sparse_map.observations_of(keyframe)
@@ -23,5 +24,5 @@ def is_confirmed(sparse_map: SparseMap, keyframe: KeyframeId, config: IntakeConf
     fx, fy, cx, cy = sparse_map.keyframes.camera[row, :4]
     z = np.where(known, local[:, 2], 1.0)
     error = np.stack([fx * local[:, 0] / z + cx, fy * local[:, 1] / z + cy], 1) - table.uv[mine]
-    near = known & (np.hypot(error[:, 0], error[:, 1]) <= config.confirmed_px)
-    return int(np.count_nonzero(near)) >= config.min_confirmed
+    near = known & (np.hypot(error[:, 0], error[:, 1]) <= _CONFIRMED_PX)
+    return int(np.count_nonzero(near)) >= _MIN_CONFIRMED

@@ -43,6 +43,9 @@ from kiteline_core.ids import (
 
 # T_m_c of a level camera that looks along x of m: x right is -y, y down is -z, z forward is x.
 _LEVEL_T_M_C = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+_PATIENCE_S = 2.0  # s; after this long a keyframe is used without its missing sections
+_MISSING_ROOT_S = 10.0  # s; after this long a submap without its first keyframe begins at its oldest one
+_MAX_PER_STEP = 4  # keyframes; used in one step, so that a backlog does not delay the rest
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,9 +126,9 @@ class Intake:
         """Keyframes to use now, in order of id: complete ones, those past the patience, and late completions."""
         self._place_orphans(now_ns)
         out: list[KeyframeId] = []
-        patience_ns = round(self._config.patience_s * 1e9)
+        patience_ns = round(_PATIENCE_S * 1e9)
         for keyframe, since_ns in sorted(self._waiting.items()):
-            if len(out) == self._config.max_per_step:
+            if len(out) == _MAX_PER_STEP:
                 break
             if not self._is_usable(keyframe):
                 continue
@@ -136,9 +139,7 @@ class Intake:
                     self._partial.add(keyframe)
         for keyframe in out:
             del self._waiting[keyframe]
-        late = [k for k in sorted(self._partial) if k not in out and self._map.is_complete(k)][
-            : self._config.max_per_step
-        ]
+        late = [k for k in sorted(self._partial) if k not in out and self._map.is_complete(k)][:_MAX_PER_STEP]
         self._partial.difference_update(late)
         return sorted(out + late)
 
@@ -255,7 +256,7 @@ class Intake:
 
     def _place_orphans(self, now_ns: int) -> None:
         """Root a submap at its oldest keyframe if its first never comes (the base lost its store)."""
-        orphan_ns = round(self._config.missing_root_s * 1e9)
+        orphan_ns = round(_MISSING_ROOT_S * 1e9)
         late = [k for k, since_ns in self._waiting.items() if now_ns - since_ns >= orphan_ns]
         for submap in sorted({submap_of_keyframe(k) for k in late}):
             keyframes = self._map.submaps[submap]

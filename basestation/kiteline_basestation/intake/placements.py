@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_basestation.config import IntakeConfig
 from kiteline_basestation.exchange.publisher import Publisher
 from kiteline_basestation.intake.intake import Intake
 from kiteline_basestation.map.sparse_map import SparseMap
@@ -22,6 +21,10 @@ from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import KeyframeId, SubmapId, agent_of_submap, submap_of_keyframe
 
 F64 = NDArray[np.float64]
+
+_ODOMETRY_GAP_S = 1.5  # s; a submap that begins within this time of the last one is placed by odometry
+_TIE_M = 0.2  # m; deviation of the motion over a loss up to which it places a submap: half a metre at worst
+_TIE_RAD = 0.03  # rad; the same of the rotation
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,8 +39,7 @@ class PlacementState:
 class SubmapPlacements:
     """S_w_m of all placed submaps; every change is published to the agent of the submap."""
 
-    def __init__(self, config: IntakeConfig, sparse_map: SparseMap, intake: Intake, publisher: Publisher) -> None:
-        self._config = config
+    def __init__(self, sparse_map: SparseMap, intake: Intake, publisher: Publisher) -> None:
         self._map = sparse_map
         self._intake = intake
         self._publisher = publisher
@@ -91,7 +93,7 @@ class SubmapPlacements:
             if live is None or S_w_before is None or T_before_k is None or T_m_first is None:
                 return
             tracked_ns = self._intake.tracked_ns.get(before, live.t_ns)
-            if self._map.keyframes.t_ns[self._map.rows[first]] - tracked_ns > self._config.odometry_gap_s * 1e9:
+            if self._map.keyframes.t_ns[self._map.rows[first]] - tracked_ns > _ODOMETRY_GAP_S * 1e9:
                 return  # too long without images: a loop closure has to place it
             T_w_c = sim3.place(S_w_before, T_before_k @ live.T_k_c)
             scale = sim3.scale_of(S_w_before) if self._map.is_up_to_scale(submap) else 1.0
@@ -125,8 +127,8 @@ class SubmapPlacements:
 
     def _place_by_tie(self, submap: SubmapId) -> bool:
         """Place a submap by its agent's motion over a loss; False if that is too uncertain, or not known yet."""
-        tie, config = self._intake.loss_ties.get(submap), self._config
-        if tie is None or submap == self.first or tie.sigma_m > config.tie_m or tie.sigma_rad > config.tie_rad:
+        tie = self._intake.loss_ties.get(submap)
+        if tie is None or submap == self.first or tie.sigma_m > _TIE_M or tie.sigma_rad > _TIE_RAD:
             return False
         before, alone = submap_of_keyframe(tie.since), self._map.submaps_of_map(submap) == [submap]
         S_w_before, T_before_k = self.S_w_m.get(before), self._map.pose(tie.since)

@@ -26,6 +26,12 @@ F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]
 
 _SAME = 1e-4  # relative change of depths that is not sent: a fifth of the code of an inverse depth
+_MIN_SHARED = 100  # landmarks of two covisible keyframes joined by an edge
+_SIGMA_PATH = 0.01  # share of an edge's length, added to its deviation
+_SIGMA_SCALE = 0.003  # of the logarithm of the scale between neighbours in a monocular submap
+_LOOP_SIGMA_SCALE = 0.01  # of the logarithm of the scale of a loop edge
+_LOOP_SIGMA_DEPTH = 0.005  # of a loop edge: added share of the median depth
+_LOOP_SIGMA_RAD = 0.003  # rad; of a loop edge
 
 
 def keyframes_of(sparse_map: SparseMap, map_id: SubmapId) -> list[KeyframeId]:
@@ -50,16 +56,16 @@ def essential_graph_of(
     poses = sparse_map.keyframes.T_w_k[rows]
     above = [number.get(KeyframeId(k), -1) for k in sparse_map.keyframes.parent[rows].tolist()]
     tree = np.array([(p, i) for i, p in enumerate(above) if p >= 0], np.int64).reshape(-1, 2)
-    edges = np.unique(np.concatenate([tree, sparse_map.covisible_pairs(rows, config.min_shared)]), axis=0)
+    edges = np.unique(np.concatenate([tree, sparse_map.covisible_pairs(rows, _MIN_SHARED)]), axis=0)
     between = np.linalg.inv(poses[edges[:, 0]]) @ poses[edges[:, 1]]
     length = np.linalg.norm(between[:, :3, 3], axis=1)
-    sigma = np.column_stack([config.sigma_m + config.sigma_path * length, np.full(len(edges), config.sigma_rad)])
+    sigma = np.column_stack([config.sigma_m + _SIGMA_PATH * length, np.full(len(edges), config.sigma_rad)])
     inside = [e for e in loops if e.old in number and e.new in number]
     loop_edges = [graph_edge_of(sparse_map, e) for e in inside]
     loop_pairs = np.array([[number[e.old], number[e.new]] for e in inside], np.int64).reshape(-1, 2)
     measured = np.array([T for T, _ in loop_edges]).reshape(-1, 4, 4)
     loop_sigma = np.array(
-        [[config.sigma_m + config.loop_sigma_depth * depth_of(sparse_map, e), config.loop_sigma_rad] for e in inside]
+        [[config.sigma_m + _LOOP_SIGMA_DEPTH * depth_of(sparse_map, e), _LOOP_SIGMA_RAD] for e in inside]
     ).reshape(-1, 2)  # fmt: skip
     held = np.zeros(len(keyframes), np.bool_)
     held[number[KeyframeId(sparse_map.submaps[sparse_map.map_id(map_id)][0])]] = True
@@ -69,7 +75,7 @@ def essential_graph_of(
         free = np.array([submap_of_keyframe(k) in own for k in keyframes])
         scaled = Scaled(
             free, np.concatenate([np.ones(len(edges)), [scale for _, scale in loop_edges]]),
-            np.repeat([config.sigma_scale, config.loop_sigma_scale], [len(edges), len(loop_pairs)]),
+            np.repeat([_SIGMA_SCALE, _LOOP_SIGMA_SCALE], [len(edges), len(loop_pairs)]),
         )  # fmt: skip
     return GraphInputs(
         np.array(keyframes, np.int64), poses, held, np.concatenate([edges, loop_pairs]),

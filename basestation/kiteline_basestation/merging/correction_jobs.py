@@ -22,6 +22,8 @@ from kiteline_basestation.refinement.full_bundle_schedule import FullBundleSched
 from kiteline_basestation.refinement.odometry_factors import with_odometry_factors
 from kiteline_core.ids import AgentId, SubmapId
 
+_RETRY_GROWTH = 1.1  # growth of the map after which an insignificant offset is estimated again
+
 
 @dataclass(frozen=True, slots=True)
 class FullBundle:
@@ -164,7 +166,7 @@ class CorrectionJobs:
                 trials = self._config.graph.robust_trials, self._config.graph.final_trials
                 solver = replace(self._config.bundle, robust_trials=trials[0], final_trials=trials[1])
                 chain = segments_of(self._map, bundle.window.rows, bundle.window.problem) if self.fits(map_id) else ()
-                bundle = replace(bundle, inertial=tells_scale(chain, self._config.inertial_scale))
+                bundle = replace(bundle, inertial=tells_scale(chain))
                 chain = chain if bundle.inertial else ()
                 held = int(np.flatnonzero(~bundle.window.problem.free)[0])
                 inputs = BundleInputs(problem, solver, chain, held, self._config.inertial_scale)
@@ -176,7 +178,7 @@ class CorrectionJobs:
     def _with_calibration(self, bundle: FullBundle) -> FullBundle:
         """Add disparity offsets to the unknowns, unless they were too uncertain in a map hardly smaller than now."""
         size = len(keyframes_of(self._map, bundle.map_id))
-        enough = self._config.disparity.retry_growth * self.uncertain_at.get(bundle.map_id, 0)
+        enough = _RETRY_GROWTH * self.uncertain_at.get(bundle.map_id, 0)
         if not self.fits(bundle.map_id) or bundle.map_id in self._uncalibrated or size < enough:
             return bundle
         window = bundle.window

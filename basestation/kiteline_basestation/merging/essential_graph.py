@@ -28,6 +28,7 @@ I64 = NDArray[np.int64]
 _ITERATIONS = 8  # of Gauss-Newton
 _SCALE_ITERATIONS = 30  # of Levenberg-Marquardt, with scales: these graphs bend farther
 _FREE = 1e3  # rad, and units of lengths: a deviation that holds nothing
+_LEVEL_INFLATION = 4.5  # of deviations of gravity, whose errors are the same over some 20 keyframes
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +98,7 @@ def _rigid(inputs: GraphInputs) -> GraphResult:
         up_w = gtsam.Unit3(inputs.level.up_w)
         for i, sigma in zip(inputs.level.rows.tolist(), inputs.level.sigma.tolist()):
             kept = gtsam.Unit3(inputs.T_w_k[i, :3, :3].T @ inputs.level.up_w)
-            known: gtsam.noiseModel.Base = gtsam.noiseModel.Isotropic.Sigma(2, inputs.config.level_inflation * sigma)
+            known: gtsam.noiseModel.Base = gtsam.noiseModel.Isotropic.Sigma(2, _LEVEL_INFLATION * sigma)
             graph.add(gtsam.AttitudeFactorPose3(i, up_w, known, kept))
     params = gtsam.GaussNewtonParams()
     params.setMaxIterations(_ITERATIONS)
@@ -135,7 +136,7 @@ def _with_scale(inputs: GraphInputs, scaled: Scaled) -> GraphResult:
     if inputs.level is not None:
         for i, sigma in zip(inputs.level.rows.tolist(), inputs.level.sigma.tolist()):
             pose = inputs.T_w_k[i]
-            tilt = _tilt_noise(pose[:3, :3].T @ inputs.level.up_w, config.level_inflation * sigma)
+            tilt = _tilt_noise(pose[:3, :3].T @ inputs.level.up_w, _LEVEL_INFLATION * sigma)
             graph.add(gtsam.PriorFactorSimilarity3(i, _similarity(pose, 1.0), tilt))
     params = gtsam.LevenbergMarquardtParams()
     params.setMaxIterations(_SCALE_ITERATIONS)

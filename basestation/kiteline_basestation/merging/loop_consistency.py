@@ -17,6 +17,16 @@ from kiteline_core.ids import KeyframeId, submap_of_keyframe
 F64 = NDArray[np.float64]
 
 _PLANE_ROUNDS = 4  # plane fits, each to the points near the last one
+_DRIFT_RAD = 0.1  # rad; correction of a loop that drift explains
+_DRIFT_VOTES_APART = 1.0  # of the median depth; from the first to the farthest vote: they see other things
+_TILT_DEVIATIONS = 4.0  # of what two agents know gravity to, added to the tilt between their maps
+_DRIFT_RAD_M = 0.002  # rad/m; the same, added for each metre of the path
+_MAX_SCALE_DRIFT = 0.4  # logarithm of the scale drift along a loop
+_FUSE_M = 0.02  # m; smaller corrections need no pose graph: landmarks are fused at once
+_FUSE_RAD = 0.005  # rad; the same of rotations
+_FUSE_SCALE = 0.005  # the same of the logarithm of a scale
+_OFF_PLANE = 0.03  # of the median depth; landmarks farther from the common plane lie off it
+_MIN_OFF_PLANE = 0.15  # share of landmarks off the plane to merge maps: a wallpaper has copies
 
 
 def agreeing(sparse_map: SparseMap, matches: Sequence[LoopMatch], config: LoopConfig) -> list[LoopMatch]:
@@ -66,8 +76,8 @@ def within_drift(sparse_map: SparseMap, edge: LoopEdge, config: LoopConfig, time
     moved = float(np.linalg.norm(se3.transform(X, pose[None, :3, 3])[0] - pose[:3, 3]))
     return (
         moved <= times * (config.drift_m + share * path)
-        and _rotation_between(np.eye(4), X) <= times * (config.drift_rad + config.drift_rad_m * path)
-        and abs(float(np.log(sim3.scale_of(X)))) <= config.max_scale_drift
+        and _rotation_between(np.eye(4), X) <= times * (_DRIFT_RAD + _DRIFT_RAD_M * path)
+        and abs(float(np.log(sim3.scale_of(X)))) <= _MAX_SCALE_DRIFT
     )
 
 
@@ -80,7 +90,7 @@ def outvotes_drift(sparse_map: SparseMap, matches: Sequence[LoopMatch], config: 
     positions = sparse_map.keyframes.T_w_k[[sparse_map.rows[k] for k in voters], :3, 3]
     apart = float(np.linalg.norm(positions - positions[0], axis=1).max())  # a path to and fro shows one thing often
     return (
-        apart >= config.drift_votes_apart * depth_of(sparse_map, strong[-1])
+        apart >= _DRIFT_VOTES_APART * depth_of(sparse_map, strong[-1])
         and within_drift(sparse_map, strong[-1], config, config.most_drift)
         and keeps_level(sparse_map, strong[-1], config)
         and has_depth_relief(sparse_map, strong, config)
@@ -91,17 +101,17 @@ def keeps_level(sparse_map: SparseMap, edge: LoopEdge, config: LoopConfig) -> bo
     """False if the correction would tilt one map against the other, as far as both agents know gravity."""
     new, old = submap_of_keyframe(edge.new), submap_of_keyframe(edge.old)
     found = tilt_between(sparse_map, new, old, correction_of(sparse_map, edge))
-    return found is None or found[0] <= config.tilt_rad + config.tilt_deviations * found[1]
+    return found is None or found[0] <= config.tilt_rad + _TILT_DEVIATIONS * found[1]
 
 
-def is_fusible(sparse_map: SparseMap, edge: LoopEdge, config: LoopConfig) -> bool:
+def is_fusible(sparse_map: SparseMap, edge: LoopEdge) -> bool:
     """True if the correction of a loop is so small that fusing landmarks and a bundle suffice."""
     S_w_new = similarity(sparse_map, edge.new)
     error = sim3.inverse(S_w_new) @ similarity(sparse_map, edge.old) @ sim3.of(edge.scale, edge.T_old_new)
     moved = float(sim3.scale_of(S_w_new) * np.linalg.norm(error[:3, 3]))
     turned = float(np.linalg.norm(se3.so3_log(sim3.rigid(error)[:3, :3])))
     grown = abs(float(np.log(sim3.scale_of(error))))
-    return moved <= config.fuse_m and turned <= config.fuse_rad and grown <= config.fuse_scale
+    return moved <= _FUSE_M and turned <= _FUSE_RAD and grown <= _FUSE_SCALE
 
 
 def path_length(sparse_map: SparseMap, a: KeyframeId, b: KeyframeId) -> float:
@@ -124,7 +134,7 @@ def has_depth_relief(sparse_map: SparseMap, matches: Sequence[LoopMatch], config
     xyz = xyz[known]
     if len(xyz) < config.min_inliers:
         return False
-    limit = config.off_plane * float(np.median([depth_of(sparse_map, m) for m in matches]))
+    limit = _OFF_PLANE * float(np.median([depth_of(sparse_map, m) for m in matches]))
     inside = np.ones(len(xyz), np.bool_)
     distance = np.zeros(len(xyz))
     for _ in range(_PLANE_ROUNDS):
@@ -132,7 +142,7 @@ def has_depth_relief(sparse_map: SparseMap, matches: Sequence[LoopMatch], config
         normal = np.linalg.svd(xyz[inside] - centre, full_matrices=False)[2][2]
         distance = np.abs((xyz - centre) @ normal)
         inside = distance <= max(limit, float(np.median(distance)))
-    return float(np.mean(distance > limit)) >= config.min_off_plane
+    return float(np.mean(distance > limit)) >= _MIN_OFF_PLANE
 
 
 def _rotation_between(Sa: F64, Sb: F64) -> float:

@@ -34,6 +34,13 @@ _Frame = tuple[AgentId, int]  # an agent, and a time stamp
 
 _QUERIED = 12  # places queried for each candidate that is verified: most are of neighbouring keyframes
 _SAME_VIEW_COSINE = 0.5  # of the angle between optical axes: views of one place from nearby
+_CANDIDATES_SAME_MAP = 3  # most similar keyframes of the same map that are verified
+_MIN_GAP = 12  # keyframes of one submap between two that are matched
+_MAX_SHARED = 15  # landmarks that a candidate may share with the keyframe already
+_MIN_NEIGHBOUR_RATIO = 0.03  # in one map, of the similarity to the previous keyframe: drift leaves near views
+_MIN_KEYFRAMES = 3  # keyframes that agree on a correction
+_RECENT_KEYFRAMES = 24  # keyframes of a submap within which matches are counted together
+_AMBIGUOUS_M = 1.0  # m; similar places of one map that lie farther apart make it ambiguous
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,18 +186,18 @@ class LoopDetector:
         if len(observations.slots) < config.min_inliers:
             return []
         shared = sparse_map.covisibility(sparse_map.landmarks_of(keyframe))
-        known = set(sparse_map.keyframes.id[np.flatnonzero(shared > config.max_shared)].tolist())
+        known = set(sparse_map.keyframes.id[np.flatnonzero(shared > _MAX_SHARED)].tolist())
         same = sparse_map.submaps[submap_of_keyframe(keyframe)]
         at = sparse_map.number_of(keyframe)
-        near = same[max(0, at - config.min_gap) : at + config.min_gap + 1]
+        near = same[max(0, at - _MIN_GAP) : at + _MIN_GAP + 1]
         before = [k for k in near if k < keyframe][-1:]
         scores = self._index.scores(observations.descriptor)
         usual = scores.of(before[0]) if before and keyframe in self._index else 0.0
-        enough_same_map = max(config.min_likeness, config.min_neighbour_ratio * usual)
+        enough_same_map = max(config.min_likeness, _MIN_NEIGHBOUR_RATIO * usual)
         places = scores.best(known | set(near) | {keyframe}, _QUERIED * config.candidates)
         out: list[KeyframeId] = []
         taken: set[int] = set()
-        left = {True: config.candidates_same_map, False: config.candidates}
+        left = {True: _CANDIDATES_SAME_MAP, False: config.candidates}
         map_id = sparse_map.map_id(submap_of_keyframe(keyframe))
         for key, score in zip(places.keys.tolist(), places.score.tolist()):
             old = KeyframeId(key)
@@ -206,7 +213,7 @@ class LoopDetector:
             out.append(old)
             left[same_map] -= 1
             around = sparse_map.covisibility(sparse_map.landmarks_of(old))
-            taken |= set(sparse_map.keyframes.id[np.flatnonzero(around > config.max_shared)].tolist())
+            taken |= set(sparse_map.keyframes.id[np.flatnonzero(around > _MAX_SHARED)].tolist())
         return out
 
     def is_kept_apart(self, a: SubmapId, b: SubmapId) -> bool:
@@ -236,19 +243,19 @@ class LoopDetector:
                 self._matches[key] = []
                 return self._closure(best, chosen)
             self.rejected += 1
-            if new == old or len(supporters) < config.min_keyframes:
+            if new == old or len(supporters) < _MIN_KEYFRAMES:
                 return None
             self._contradicted[key] = self._contradicted.get(key, 0) + 1
             return Contradiction(key)
         if same_map and match.inliers < config.min_inliers_loop:
             return None
         against = {m.new for m in matches} - supporters
-        needed = config.min_keyframes * (1 + 2 * self._contradicted.get(key, 0)) + config.against * len(against)
+        needed = _MIN_KEYFRAMES * (1 + 2 * self._contradicted.get(key, 0)) + config.against * len(against)
         if _pair(self._map.map_id(new), self._map.map_id(old)) in self.requested:
             needed = 1
         if len(supporters) < needed or not (same_map or consistency.has_depth_relief(self._map, chosen, config)):
             return None
-        if not same_map and any(self._is_ambiguous(k) for m in chosen[-config.min_keyframes :] for k in (m.old, m.new)):
+        if not same_map and any(self._is_ambiguous(k) for m in chosen[-_MIN_KEYFRAMES:] for k in (m.old, m.new)):
             self.rejected += 1
             return None
         if same_map:
@@ -289,7 +296,7 @@ class LoopDetector:
         if submap_of_keyframe(match.new) != submap_of_keyframe(newest.new):
             return True
         between = self._map.number_of(match.new) - self._map.number_of(newest.new)
-        return abs(between) <= self._config.recent_keyframes
+        return abs(between) <= _RECENT_KEYFRAMES
 
     def _is_ambiguous(self, keyframe: KeyframeId) -> bool:
         """True if the map of a keyframe shows the same place elsewhere too."""
@@ -310,7 +317,7 @@ class LoopDetector:
             T_other = sparse_map.world_pose(other)
             if sparse_map.map_id(submap_of_keyframe(other)) != map_id or T_other is None:
                 continue
-            limit = config.ambiguous_m + share * consistency.path_length(sparse_map, other, keyframe)
+            limit = _AMBIGUOUS_M + share * consistency.path_length(sparse_map, other, keyframe)
             near = float(np.linalg.norm(T_other[:3, 3] - T[:3, 3])) <= limit
             if near and (T_other[:3, 2] @ T[:3, 2]) > _SAME_VIEW_COSINE:
                 continue

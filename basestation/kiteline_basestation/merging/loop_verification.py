@@ -35,6 +35,12 @@ U8 = NDArray[np.uint8]
 _UNIT_RATIO = 1.15  # of depths in two maps: monocular scale drift stays below it
 _NEAREST_M = 0.1  # of a landmark before a camera
 _UNIT_POINTS = 8  # with depth in both maps; fewer are not tested
+_OCTAVE_GAP = 1.5  # octaves between the predicted and the detected scale
+_MIN_SCALE_POINTS = 20  # landmarks with depth in both maps, from which a scale is estimated
+_SCALE_SPREAD = 0.2  # of the logarithm of depth ratios; ratios within it agree
+_SCALE_SHARE = 0.7  # of the depth ratios that must agree: two different objects fix no scale
+_CELL_INLIERS = 2  # inliers that fill a cell
+_MIN_CELLS = 8  # filled cells, of 24
 
 
 @dataclass(frozen=True, slots=True)
@@ -226,14 +232,14 @@ def _depths_in_own_map(sparse_map: SparseMap, new: KeyframeId, mine: KeyframeObs
 
 def depth_scale(own: F64, other: F64, config: LoopConfig) -> float | None:
     """Scale of the other map over its own, from depths (n,) of the same points; None if it is too uncertain."""
-    if len(own) < config.min_scale_points:
+    if len(own) < _MIN_SCALE_POINTS:
         return None
     ratio = np.log(np.maximum(other, 1e-3) / np.maximum(own, 1e-3))
     middle = float(np.median(ratio))
     apart = np.abs(ratio - middle)
-    close = apart < config.scale_spread
+    close = apart < _SCALE_SPREAD
     sigma = 1.2533 * 1.4826 * float(np.median(apart)) / np.sqrt(len(ratio))  # standard error of a median
-    if float(np.mean(close)) < config.scale_share or sigma > config.scale_sigma:
+    if float(np.mean(close)) < _SCALE_SHARE or sigma > config.scale_sigma:
         return None
     return float(np.exp(middle))
 
@@ -257,7 +263,7 @@ def spread_out(sparse_map: SparseMap, keyframe: KeyframeId, uv: F64, config: Loo
     column = np.clip(uv[:, 0] * (config.columns / camera.width), 0, config.columns - 1).astype(np.int64)
     row = np.clip(uv[:, 1] * (config.rows / camera.height), 0, config.rows - 1).astype(np.int64)
     filled = np.bincount(row * config.columns + column, minlength=config.rows * config.columns)
-    return int(np.count_nonzero(filled >= config.cell_inliers)) >= config.min_cells
+    return int(np.count_nonzero(filled >= _CELL_INLIERS)) >= _MIN_CELLS
 
 
 def _match_neighbours(
@@ -283,7 +289,7 @@ def _match_neighbours(
         wanted, offered = comparable(sparse_map.keypoints.descriptor[seen], mine.descriptor)
         near = matching.match_near(
             uv, radius * np.exp2(np.clip(octave, 0.0, 4.0)), octave, wanted, mine.uv, mine.octave,
-            offered, (size.width, size.height), config.octave_gap, config.match,
+            offered, (size.width, size.height), _OCTAVE_GAP, config.match,
         )  # fmt: skip
         if len(near.a) < config.min_inliers:
             return None

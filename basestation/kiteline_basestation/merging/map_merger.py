@@ -44,6 +44,9 @@ from kiteline_core.places.place_index import Vocabulary
 
 F64 = NDArray[np.float64]
 
+_LOOP_GAP = 30  # keyframes; landmarks observed again after so many count as a loop
+_REQUERIES = 2  # keyframes of merged maps that are matched to the other map in one step
+
 
 @dataclass(frozen=True, slots=True)
 class MergerState:
@@ -117,8 +120,7 @@ class MapMerger:
 
     def requery(self) -> MergeResult:
         """Match a few keyframes of merged maps to the landmarks of the other map, and search their place again."""
-        count = self._config.graph.requeries
-        now, self._requery = self._requery[:count], self._requery[count:]
+        now, self._requery = self._requery[:_REQUERIES], self._requery[_REQUERIES:]
         result = MergeResult(requeried=tuple(now))
         for keyframe in now:
             landmark_matching.match_landmarks(self._map, keyframe, self._config.landmark_matching, self._publisher)
@@ -158,7 +160,7 @@ class MapMerger:
         map_id, window, agents = bundle.map_id, bundle.window, bundle.calibrated
         result: BundleResult = without_odometry_factors(window, done.result)
         if agents and not disparity.is_significant(window.problem, result, self._config.disparity):
-            disparity.reset_offsets(self._map, agents, self._config.disparity)
+            disparity.reset_offsets(self._map, agents)
             self._corrections.uncertain_at[map_id] = len(keyframes_of(self._map, map_id))
             self._corrections.request_bundle(map_id, calibrate=False)
             return NOTHING
@@ -299,7 +301,7 @@ class MapMerger:
         self._edges.extend(match.edge for match in closure.matches)
         self._unfused.setdefault(map_id, []).extend(closure.matches)
         self._corrections.cancel_pending(map_id)
-        if any(not consistency.is_fusible(self._map, match, self._config.loops) for match in closure.matches):
+        if any(not consistency.is_fusible(self._map, match) for match in closure.matches):
             self._corrections.request_graph(map_id)
         else:
             self._fuse_matches(map_id)
@@ -311,7 +313,7 @@ class MapMerger:
         shared = self._map.covisibility(self._map.landmarks_of(keyframe))
         rows = np.flatnonzero(shared >= self._config.loops.min_inliers)
         submap = submap_of_keyframe(keyframe)
-        number = self._map.number_of(keyframe) - self._config.loops.loop_gap
+        number = self._map.number_of(keyframe) - _LOOP_GAP
         if number <= 0:
             return False
         ids = self._map.keyframes.id[rows]
@@ -321,9 +323,9 @@ class MapMerger:
         """True if the path returns to an old place with this keyframe, and did not a few keyframes ago."""
         submap = submap_of_keyframe(keyframe)
         at = self._map.number_of(keyframe)
-        before = self._last_return.get(submap, -self._config.loops.loop_gap - 1)
+        before = self._last_return.get(submap, -_LOOP_GAP - 1)
         self._last_return[submap] = at
-        return at - before > self._config.loops.loop_gap
+        return at - before > _LOOP_GAP
 
     def _merge(self, closure: LoopClosure) -> MergeResult:
         """Move the newer map onto the older one, and make its submaps part of it."""
@@ -381,7 +383,7 @@ class MapMerger:
             targets[keyframe] = pose
         before = self._map.keyframes.T_w_k.copy()
         moved = move_keyframes(self._map, map_id, targets, self._publisher, self._config.publish)
-        apply_bundle(self._map, window, result, self._publisher, self._config.cull, self._config.publish)
+        apply_bundle(self._map, window, result, self._publisher, self._config.publish)
         if bundle.part is not None and not moved:  # also those that came since and were carried along
             bent = np.flatnonzero((before != self._map.keyframes.T_w_k).any(axis=(1, 2)))
             return MergeResult(bent=frozenset(bent.tolist()))

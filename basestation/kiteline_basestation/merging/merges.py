@@ -17,6 +17,8 @@ from kiteline_core.optimisation.bundle import BundleResult
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
+_MIN_KEPT = 0.5  # share of inliers among observations that a merge fused: below it the merge is undone
+
 
 def _no_pairs() -> I64:
     return np.empty((0, 2), np.int64)
@@ -48,7 +50,7 @@ def is_contradicted(
     moved = np.isin(submap, sorted(merge.moved)) & np.isin(which, roots)
     if int(np.count_nonzero(moved)) < config.loops.min_inliers:
         return False
-    return float(np.mean(result.inlier[moved])) < config.graph.min_kept
+    return float(np.mean(result.inlier[moved])) < _MIN_KEPT
 
 
 @dataclass(frozen=True, slots=True)

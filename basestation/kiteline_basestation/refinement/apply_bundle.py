@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_basestation.config import CullConfig, PublishConfig
+from kiteline_basestation.config import PublishConfig
 from kiteline_basestation.exchange.publisher import Publisher
 from kiteline_basestation.map.map_tables import CULLED, LANDMARK, REFINED_POSE, REMOVED
 from kiteline_basestation.map.sparse_map import SparseMap
@@ -22,20 +22,21 @@ I32 = NDArray[np.int32]
 
 _ENDS = 8  # keyframes at the begin or the end of a submap where the change of scale is measured
 _MIN_LANDMARKS = 20  # landmarks for that
+_MIN_OBSERVATIONS = 2  # observations that must remain after the outlier test
+_MAX_OFFSET_PX = 8.0  # px at octave 0; from the keypoint to the refined projection: more is another landmark
 
 
 def apply_bundle(
-    sparse_map: SparseMap, window: BundleWindow, result: BundleResult, publisher: Publisher, cull: CullConfig,
-    publish: PublishConfig,
-) -> None:  # fmt: skip
+    sparse_map: SparseMap, window: BundleWindow, result: BundleResult, publisher: Publisher, publish: PublishConfig
+) -> None:
     """Write the results that differ enough from what both sides hold; a result that is not finite is dropped."""
     if not (np.isfinite(result.T_c_m).all() and np.isfinite(result.points).all()):
         return
     before = sparse_map.keyframes.T_w_k[window.rows].copy()
     _poses(sparse_map, window, result, publisher, publish)
     _move_culled(sparse_map, window, before, publisher)
-    dropped = _observations(sparse_map, window, result, publisher, cull)
-    _points(sparse_map, window, result, dropped, publisher, cull, publish)
+    dropped = _observations(sparse_map, window, result, publisher)
+    _points(sparse_map, window, result, dropped, publisher, publish)
 
 
 def _poses(
@@ -75,7 +76,7 @@ def _move_culled(sparse_map: SparseMap, window: BundleWindow, before: F64, publi
 
 
 def _observations(
-    sparse_map: SparseMap, window: BundleWindow, result: BundleResult, publisher: Publisher, cull: CullConfig
+    sparse_map: SparseMap, window: BundleWindow, result: BundleResult, publisher: Publisher
 ) -> NDArray[np.bool_]:
     """Remove outliers, and cull landmarks with too few observations left. Returns which of the window (n,)."""
     table = sparse_map.keypoints
@@ -87,20 +88,20 @@ def _observations(
         sparse_map.set_flags(bad, REMOVED)
         publisher.mark_changed_slots(RemovedObservations.KIND, bad)
     left = np.diff(sparse_map.observations(window.points)[0])
-    dropped = np.asarray((left < cull.min_observations) & (table.root[window.points] == window.points))
+    dropped = np.asarray((left < _MIN_OBSERVATIONS) & (table.root[window.points] == window.points))
     cull_landmarks(sparse_map, window.points[dropped], publisher)
     return dropped
 
 
 def _points(
     sparse_map: SparseMap, window: BundleWindow, result: BundleResult, dropped: NDArray[np.bool_], publisher: Publisher,
-    cull: CullConfig, publish: PublishConfig,
+    publish: PublishConfig,
 ) -> None:  # fmt: skip
     table = sparse_map.keypoints
     alive = ~dropped & (table.root[window.points] == window.points) & (table.flags[window.points] & CULLED == 0)
     points, positions = window.points[alive], result.points[alive]
     inv, offset, ahead = sparse_map.project_into_anchor(points, positions)
-    too_far = ~ahead | (np.abs(offset).max(axis=1, initial=0.0) > cull.max_offset_px * np.exp2(table.octave[points]))
+    too_far = ~ahead | (np.abs(offset).max(axis=1, initial=0.0) > _MAX_OFFSET_PX * np.exp2(table.octave[points]))
     cull_landmarks(sparse_map, points[too_far], publisher)
     points, inv, offset = points[~too_far], inv[~too_far], offset[~too_far]
     bf = sparse_map.keyframes.camera[table.row[points], 4]

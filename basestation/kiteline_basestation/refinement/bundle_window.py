@@ -19,6 +19,12 @@ F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]
 Bool = NDArray[np.bool_]
 
+_SIGMA_GROWTH = 1.4  # factor per octave; less than 2, as alignment is finer than the octave's pixels
+_SIGMA_CALIBRATED_PX = 0.2  # px at octave 0; of a disparity once the agent's disparity offset is known
+_SIGMA_FUSED_PX = 0.6  # px at octave 0; of a new landmark that was fused: two detections of one corner
+_SIGMA_FUSED_GROWTH = 2.0  # factor per octave; corners are detected to a fraction of the octave's pixels
+_MIN_LANDMARKS = 20  # landmarks of a bundle: fewer do not constrain the poses
+
 
 @dataclass(frozen=True, slots=True)
 class BundleWindow:
@@ -89,7 +95,7 @@ def bundle_window(
     seen = np.bincount(which[keep], minlength=len(points))
     keep &= seen[which] >= 2
     points = points[seen >= 2]
-    if len(points) < config.min_landmarks:
+    if len(points) < _MIN_LANDMARKS:
         return None
     slots = slots[keep]
     starts = np.concatenate([[0], np.cumsum(seen[seen >= 2])]).astype(np.int32)
@@ -128,7 +134,7 @@ def measurements(sparse_map: SparseMap, slots: I32, config: MeasurementConfig) -
         agent = agent_of_keyframe(KeyframeId(int(sparse_map.keyframes.id[row])))
         camera = sparse_map.cameras.get(agent)
         if agent in sparse_map.disparity_calibrated:
-            sigma[row] = config.sigma_calibrated_px
+            sigma[row] = _SIGMA_CALIBRATED_PX
         has_depth[row] = camera is not None and (camera.stereo or agent in sparse_map.measures_depth)
     ranged = (table.inv_depth[slots] > 0) & has_depth[rows]
     measured = np.empty((len(slots), 3))
@@ -136,9 +142,9 @@ def measurements(sparse_map: SparseMap, slots: I32, config: MeasurementConfig) -
     disparity = sparse_map.keyframes.camera[rows, 4] * table.inv_depth[slots] - offsets(sparse_map, slots)
     measured[:, 2] = np.where(ranged, np.maximum(disparity, 0.0), -1.0)
     octave = table.octave[slots].astype(np.float64)
-    aligned = config.sigma_growth**octave
+    aligned = _SIGMA_GROWTH**octave
     fused = (table.kind[slots] == LANDMARK) & (table.root[slots] != slots)
-    pixel = np.where(fused, config.sigma_fused_px * config.sigma_fused_growth**octave, config.sigma_px * aligned)
+    pixel = np.where(fused, _SIGMA_FUSED_PX * _SIGMA_FUSED_GROWTH**octave, config.sigma_px * aligned)
     return measured, np.stack([pixel, sigma[rows] * aligned], 1)
 
 

@@ -21,6 +21,12 @@ F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]
 I64 = NDArray[np.int64]
 
+_PRIOR_PX = 0.1  # px; standard deviation of a constant offset: the accuracy of calibrations
+_PRIOR_RAD = 3e-4  # rad; of the right camera's rotation (times the focal length: px where x or y is 1)
+_KNOWN_FROM = 2.0  # prior deviations, rms; from which the offset of earlier flights is that of a worn rig
+_USUAL_ROWS_PX = 0.25  # px; by which rows are off in good calibrations: more, and the motion does not matter
+_MIN_SIGNIFICANCE = 0.5  # standard deviations; from which an offset is accepted: by chance 1 in 20
+
 
 def at_keypoints(sparse_map: SparseMap, slots: I32) -> F64:
     """Terms (n,5) of a disparity offset at keypoints (n,)."""
@@ -56,14 +62,14 @@ def with_border(
     measured = problem.measured.copy()
     measured[ranged, 2] = (sparse_map.keyframes.camera[rows, 4] * table.inv_depth[slots])[ranged]
     focal = float(np.median(sparse_map.keyframes.camera[rows, 0]))
-    prior = _prior_px(focal, config)
+    prior = _prior_px(focal)
     told = [sparse_map.onboard_sigma_px.get(a) for a in agents]
     sigma = np.stack([prior if s is None else np.full(TERMS, s) for s in told])
     start = np.stack([sparse_map.disparity_offset_px.get(a, none()) for a in agents])
-    mean = np.stack([prior_mean(sparse_map, a, config) for a in agents])
+    mean = np.stack([prior_mean(sparse_map, a) for a in agents])
     tells = sideways_share(problem.T_c_m) >= config.min_sideways
     # What was found on board rests on this flight: data that contradict it are the fewer ones.
-    believed = np.array([s is None and (tells or has_bent(sparse_map, a, config)) for a, s in zip(agents, told)])
+    believed = np.array([s is None and (tells or has_bent(sparse_map, a)) for a, s in zip(agents, told)])
     border = Border(
         group, at_keypoints(sparse_map, slots), start, sigma / config.inflation, config.tail, config.determined,
         config.worn, np.where(believed, config.inflation**2 * config.contradicts, np.inf), mean,
@@ -71,7 +77,7 @@ def with_border(
     return replace(problem, measured=measured, border=border), agents
 
 
-def prior_mean(sparse_map: SparseMap, agent: AgentId, config: DisparityConfig) -> F64:
+def prior_mean(sparse_map: SparseMap, agent: AgentId) -> F64:
     """Offset (5,) px about which an agent's is expected: that found on board, or of earlier flights if it is a worn
     rig's, else zero.
 
@@ -81,27 +87,27 @@ def prior_mean(sparse_map: SparseMap, agent: AgentId, config: DisparityConfig) -
     known, camera = sparse_map.known_offset_px.get(agent), sparse_map.cameras.get(agent)
     if known is None or camera is None:
         return none()
-    return known if agent in sparse_map.onboard_sigma_px or _is_worn(known, camera.fx, config) else none()
+    return known if agent in sparse_map.onboard_sigma_px or _is_worn(known, camera.fx) else none()
 
 
-def _is_worn(offset: F64, focal: float, config: DisparityConfig) -> bool:
+def _is_worn(offset: F64, focal: float) -> bool:
     """True if an offset (5,) px is beyond those of good calibrations."""
-    return float(np.sqrt(np.mean((offset / _prior_px(focal, config)) ** 2))) > config.known_from
+    return float(np.sqrt(np.mean((offset / _prior_px(focal)) ** 2))) > _KNOWN_FROM
 
 
-def _prior_px(focal: float, config: DisparityConfig) -> F64:
+def _prior_px(focal: float) -> F64:
     """Standard deviations (5,) of a good calibration's offset."""
-    return np.array([config.prior_px, *[config.prior_rad * focal] * (TERMS - 1)])
+    return np.array([_PRIOR_PX, *[_PRIOR_RAD * focal] * (TERMS - 1)])
 
 
-def has_bent(sparse_map: SparseMap, agent: AgentId, config: DisparityConfig) -> bool:
+def has_bent(sparse_map: SparseMap, agent: AgentId) -> bool:
     """True if rows of an agent's right image say that its mount has bent.
 
     What bends a mount turns the camera about all axes. Rows show two of the three turns directly: their offset in the
     middle and its growth along x. The third moves disparities.
     """
     rows = sparse_map.rows_px.get(agent)
-    return rows is not None and float(np.sqrt(np.mean(np.square(rows[:2])))) > config.usual_rows_px
+    return rows is not None and float(np.sqrt(np.mean(np.square(rows[:2])))) > _USUAL_ROWS_PX
 
 
 def sideways_share(T_c_m: F64) -> float:
@@ -116,11 +122,11 @@ def _centres(T_c_m: F64) -> F64:
     return np.asarray(-np.einsum("kji,kj->ki", T_c_m[:, :3, :3], T_c_m[:, :3, 3]))
 
 
-def reset_offsets(sparse_map: SparseMap, agents: tuple[AgentId, ...], config: DisparityConfig) -> None:
+def reset_offsets(sparse_map: SparseMap, agents: tuple[AgentId, ...]) -> None:
     """Set the offsets of agents to what is expected without a bundle, where set before."""
     for agent in agents:
         if agent in sparse_map.disparity_offset_px:
-            sparse_map.disparity_offset_px[agent] = prior_mean(sparse_map, agent, config)
+            sparse_map.disparity_offset_px[agent] = prior_mean(sparse_map, agent)
             sparse_map.disparity_sigma_px.pop(agent, None)
             if agent in sparse_map.onboard_sigma_px:
                 sparse_map.disparity_sigma_px[agent] = sparse_map.onboard_sigma_px[agent]
@@ -131,7 +137,7 @@ def is_significant(problem: BundleProblem, result: BundleResult, config: Dispari
     known = None if problem.border is None else problem.border.mean
     for g, offset in enumerate(result.offset if known is None else result.offset - known):
         cov = config.inflation**2 * result.offset_cov[TERMS * g : TERMS * (g + 1), TERMS * g : TERMS * (g + 1)]
-        if np.isfinite(cov).all() and float(offset @ np.linalg.solve(cov, offset)) > config.min_significance**2 * TERMS:
+        if np.isfinite(cov).all() and float(offset @ np.linalg.solve(cov, offset)) > _MIN_SIGNIFICANCE**2 * TERMS:
             return True
     return False
 
@@ -154,7 +160,7 @@ def set_offsets(
         if sigma_px < config.calibrated_px:
             sparse_map.disparity_calibrated.add(agent)
         sparse_map.disparity_sigma_px.pop(agent, None)
-        if agent in sparse_map.onboard_sigma_px or _is_worn(result.offset[g], sparse_map.cameras[agent].fx, config):
+        if agent in sparse_map.onboard_sigma_px or _is_worn(result.offset[g], sparse_map.cameras[agent].fx):
             sparse_map.disparity_sigma_px[agent] = sigma_px
 
 

@@ -22,12 +22,19 @@ F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]
 U64 = NDArray[np.uint64]
 
+_MAX_COVISIBLE = 12  # covisible keyframes searched
+_MAX_NEARBY = 8  # other keyframes searched that view the same place: revisits
+_NEAR_RATIO = 0.5  # distance of such a keyframe over the median depth
+_NEAR_COSINE = 0.7  # cosine of the angle between the optical axes: 45 degrees
+_OCTAVE_GAP = 1.2  # octaves between the predicted and the detected scale
+_ANGLE_GAP = 24  # 1/256 turns; between the predicted and the detected orientation: 34 degrees
+
 
 def match_landmarks(
     sparse_map: SparseMap, keyframe: KeyframeId, config: LandmarkMatchingConfig, publisher: Publisher
 ) -> int:
     """Match a new keyframe with those that view the same place. Returns the number of fused landmarks."""
-    others = nearby_keyframes(sparse_map, keyframe, config)
+    others = nearby_keyframes(sparse_map, keyframe)
     if not others:
         return 0
     fused = 0
@@ -48,27 +55,27 @@ def _new_landmarks(sparse_map: SparseMap, keyframe: KeyframeId) -> I32:
     return np.asarray(observed[sparse_map.keypoints.row[observed] == sparse_map.rows[keyframe]])
 
 
-def nearby_keyframes(sparse_map: SparseMap, keyframe: KeyframeId, config: LandmarkMatchingConfig) -> list[KeyframeId]:
+def nearby_keyframes(sparse_map: SparseMap, keyframe: KeyframeId) -> list[KeyframeId]:
     """Covisible keyframes, then those that are near and have a similar viewing direction."""
-    covisible = sparse_map.covisible_keyframes(keyframe, 1)[: config.max_covisible]
+    covisible = sparse_map.covisible_keyframes(keyframe, 1)[:_MAX_COVISIBLE]
     table, row = sparse_map.keyframes, sparse_map.rows[keyframe]
     points = sparse_map.landmarks_of(keyframe)
     inverse = sparse_map.inverse_depths(points) / table.scale[sparse_map.keypoints.row[points]]
     inverse = inverse[inverse > 0]
     if len(inverse) == 0:
         return covisible
-    reach = config.near_ratio / float(np.median(inverse))
+    reach = _NEAR_RATIO / float(np.median(inverse))
     rows = sparse_map.rows_near(submap_of_keyframe(keyframe), table.T_w_k[row, :3, 3], reach)
     poses = table.T_w_k[rows]
     distance = np.linalg.norm(poses[:, :3, 3] - table.T_w_k[row, :3, 3], axis=1)
     cosine = poses[:, :3, 2] @ table.T_w_k[row, :3, 2]
-    near = (distance < reach) & (cosine > config.near_cosine) & (table.pose_source[rows] != NO_POSE)
+    near = (distance < reach) & (cosine > _NEAR_COSINE) & (table.pose_source[rows] != NO_POSE)
     near &= (rows != row) & (table.culled[rows] == 0)
     ids = table.id[rows[near]]
     order = np.lexsort((ids, distance[near]))
     taken = set(covisible)
     extra = [k for k in map(KeyframeId, ids[order].tolist()) if k not in taken]
-    return covisible + extra[: config.max_nearby]
+    return covisible + extra[:_MAX_NEARBY]
 
 
 def _match_projected(
@@ -95,7 +102,7 @@ def _match_projected(
         uv, octave, angle, disparity, projected,
         table.uv[slots].astype(np.float64), table.octave[slots], table.angle[slots], measured,
         detected,
-        config.radius_px, config.octave_gap, config.angle_gap, config.disparity_px, config.max_hamming, config.ratio,
+        config.radius_px, _OCTAVE_GAP, _ANGLE_GAP, config.disparity_px, config.max_hamming, config.ratio,
         best, distance,
     )  # fmt: skip
     fused = 0

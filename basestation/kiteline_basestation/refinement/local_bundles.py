@@ -139,5 +139,5 @@ class LocalBundles:
             return False
         window = pending[1]
         result = without_odometry_factors(window, done.result)
-        apply_bundle(self._map, window, result, self._publisher, self._config.cull, self._config.publish)
+        apply_bundle(self._map, window, result, self._publisher, self._config.publish)
         return True

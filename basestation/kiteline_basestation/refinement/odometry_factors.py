@@ -42,6 +42,8 @@ _UNKNOWN_DEPTH = 3.0  # where a keyframe has no disparities
 _LEAST_POINTS = 4  # synthetic points of a step
 _MOST_GROWTH = 1.1  # by which lengths in a map differ from those at its newest keyframes
 _NO_DISPARITY, _NO_GROUP = -1.0, -1
+_ROTATION_SIGMA_PX = 0.1  # px; of each of 6 far synthetic points: together they hold rotation to 0.15 mrad
+_SCALE_SIGMA_PX = 2.0  # px; of each of 12 more in monocular submaps in metres, whose images tell no scale
 
 
 class _Step(NamedTuple):
@@ -115,13 +117,13 @@ def _steps(
             continue
         gap_s = abs(float(table.t_ns[row] - table.t_ns[window.rows[p]])) * 1e-9
         worn_px = config.worn_px * np.sqrt(gap_s) if agent in sparse_map.disparity_sigma_px else 0.0
-        rotation_sigma = max(config.rotation_sigma_px, worn_px, difference_px)
+        rotation_sigma = max(_ROTATION_SIGMA_PX, worn_px, difference_px)
         few = max(0.0, 1.0 - min(counts[k], counts[p]) / config.enough_observations)
         point_sigma = 1.0 / np.hypot(few / max(config.sigma_px, worn_px), 1.0 / rotation_sigma)
         ranged = sparse_map.cameras[agent].stereo or agent in sparse_map.measures_depth
         sets = [(_DEPTHS if few > 0.0 else _ROTATION_DEPTHS, point_sigma)]
         if not ranged:
-            sets.append((_DEPTHS, config.scale_sigma_px))
+            sets.append((_DEPTHS, _SCALE_SIGMA_PX))
         own = submap_of_keyframe(KeyframeId(int(table.id[window.rows[p]]))) == submap
         T_p_k = sim3.with_scaled_translation(T_p_k, float(units[k] if own else units[p]))
         for depths, sigma_px in sets:

@@ -24,6 +24,9 @@ F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]
 Bool = NDArray[np.bool_]
 
+_MAX_COVISIBLE = 6  # covisible keyframes searched
+_MIN_BASELINE_RATIO = 0.01  # baseline over median depth: below it two keyframes have one viewpoint
+
 
 def triangulate_landmarks(
     sparse_map: SparseMap,
@@ -68,7 +71,7 @@ def _from_epipolar_matches(
     inverse = sparse_map.inverse_depths(seen) / keyframes.scale[table.row[seen]]
     inverse = inverse[inverse > 0]
     here = _new_without_depth(sparse_map, keyframe)
-    for other in sparse_map.covisible_keyframes(keyframe, 1)[: config.max_covisible]:
+    for other in sparse_map.covisible_keyframes(keyframe, 1)[:_MAX_COVISIBLE]:
         if len(here) == 0:
             break
         there = _new_without_depth(sparse_map, other)
@@ -76,7 +79,7 @@ def _from_epipolar_matches(
             continue
         T_w_a, T_w_b = keyframes.T_w_k[row], keyframes.T_w_k[sparse_map.rows[other]]
         baseline = float(np.linalg.norm(T_w_a[:3, 3] - T_w_b[:3, 3]))
-        if len(inverse) and baseline * float(np.median(inverse)) < config.min_baseline_ratio:
+        if len(inverse) and baseline * float(np.median(inverse)) < _MIN_BASELINE_RATIO:
             continue
         rotation = T_w_b[:3, :3].T @ T_w_a[:3, :3]
         essential = skew(T_w_b[:3, :3].T @ (T_w_a[:3, 3] - T_w_b[:3, 3])) @ rotation

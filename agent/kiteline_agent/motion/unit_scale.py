@@ -1,0 +1,53 @@
+"""Scale of a monocular map of unknown unit, from displacements by the odometer and by the images."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+F64 = NDArray[np.float64]
+
+WINDOW_S = 0.4  # s; window of a comparison
+_WINDOWS = 40  # newest windows that are kept
+_LEAST_WINDOWS = 5  # least number of agreeing windows for a scale
+_LEAST_SHARE = 0.7  # least share of the windows that must agree
+_LEAST_MOVED_M = 0.05  # m; least motion by the odometer in a window that counts
+_OUTLYING = 3.0  # deviations of a window from the median scale: slip, a moment of bad images
+
+
+class UnitScale:
+    """Windows in which odometer and images moved, and the metres per unit of the map that they give."""
+
+    def __init__(self, aligned: float) -> None:
+        """aligned: least cosine between both displacements of a window that agrees."""
+        self._aligned = aligned
+        # Displacement by the odometer times that by the images, m times units; the latter's square; agrees.
+        self._windows: list[tuple[float, float, bool]] = []
+
+    def clear(self) -> None:
+        """Drop all windows: the unit of the map is another one."""
+        self._windows = []
+
+    def add(self, by_odometer: F64, by_images: F64) -> None:
+        """Add a window: displacement (3,) in m by the odometer and in map units by the images."""
+        a, b = float(np.sqrt(by_odometer @ by_odometer)), float(np.sqrt(by_images @ by_images))
+        if a < _LEAST_MOVED_M or b <= 0.0:
+            return
+        along = float(by_odometer @ by_images)
+        self._windows.append((along, b * b, along > self._aligned * a * b))
+        del self._windows[:-_WINDOWS]
+
+    def metres_per_unit(self) -> tuple[float, float] | None:
+        """Metres per unit of the map and its standard deviation; None while unknown."""
+        agreed = np.array([window[:2] for window in self._windows if window[2]])
+        if len(agreed) < max(_LEAST_WINDOWS, _LEAST_SHARE * len(self._windows)):
+            return None
+        along, square = agreed.T
+        each = along / square
+        middle = float(np.median(each))
+        spread = 1.4826 * float(np.median(np.abs(each - middle)))
+        near = np.abs(each - middle) <= _OUTLYING * spread
+        metres = float(along[near].sum() / square[near].sum())
+        left = along[near] - metres * square[near]
+        count = np.count_nonzero(near)
+        return metres, float(np.sqrt(left @ left * count / (count - 1)) / square[near].sum())
