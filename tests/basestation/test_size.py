@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import time
 import tracemalloc
-from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
@@ -35,12 +34,13 @@ from kiteline_basestation.refinement.local_bundles import LocalBundles
 from kiteline_basestation.station import Station
 from kiteline_basestation.store.integrity import contradictions
 from kiteline_codec.channel import CodedChannel, coded_channel
-from kiteline_codec.schema import KEYFRAME_KINDS, CameraIntrinsics, CulledLandmarks, Key, KeyframePose
+from kiteline_codec.schema import KEYFRAME_KINDS, CameraIntrinsics, CulledLandmarks, KeyframePose
 from kiteline_codec.sync.resumption import agent_session
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import NO_KEYFRAME, KeyframeId, keyframe_id, submap_id, submap_of_keyframe
 from kiteline_core.optimisation.bundle import BundleResult
 from tests.basestation.feeding import STEP_NS, WITHOUT_GRID, feed
+from tests.entries import entries_of
 from tests.yardstick import slowness
 
 MakeFlight = Callable[..., Any]
@@ -394,24 +394,6 @@ def test_what_was_written_of_a_deleted_map_is_removed_once_the_agent_has_it(
 
 # Ids of what was deleted, which are ignored for ever, and times, of which the newest are kept.
 _MAY_GROW = (".deleted", ".grid_ns")
-
-
-def entries_of(root: object) -> Counter[str]:
-    """Number of entries of all containers that an object holds, by the attributes that lead there."""
-    found, seen, open_ = Counter[str](), set[int](), deque([(root, "")])
-    while open_:
-        item, name = open_.popleft()
-        if id(item) in seen or isinstance(item, type | str | bytes | Key):
-            continue
-        seen.add(id(item))
-        if isinstance(item, dict | list | set | frozenset | tuple | deque):
-            found[name] += len(item)
-            open_ += [(entry, name) for entry in (item.values() if isinstance(item, dict) else item)]
-            continue
-        slots = [slot for one in type(item).__mro__ for slot in getattr(one, "__slots__", ())]
-        fields = {slot: getattr(item, slot) for slot in slots if hasattr(item, slot)} | getattr(item, "__dict__", {})
-        open_ += [(value, f"{name}.{field}") for field, value in fields.items()]
-    return found
 
 
 def test_nothing_is_left_of_a_forgotten_submap_whose_keyframes_did_not_all_come(make_flight: MakeFlight) -> None:

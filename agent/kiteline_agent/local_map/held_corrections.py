@@ -21,14 +21,17 @@ F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 Removed = RemovedObservations | CulledLandmarks
 
+_MOST_KNOWN = 1024  # keyframes of which it is known whether the base has placed them: many local maps
+_NEWEST_KNOWN = 256
+
 
 @dataclass(slots=True)
 class HeldCorrections:
     """Of keyframes of the local map: poses (4,4), refined landmarks (index, rho, bearing), landmarks to remove.
 
-    placed: keyframes whose pose the base has set, in the map or not. moved: those that it has not, and that the agent
-    moved since it told them; of submaps in `moved_submaps`. offsets: the changes that moved them. adapted: of how many
-    changes poses and landmarks know that are held, by keyframe; those that the base told last are not in it.
+    placed: keyframes whose pose the base has set, in the map or lately in it. moved: those that it has not, and that
+    the agent moved since it told them; of submaps in `moved_submaps`. offsets: the changes that moved them. adapted: of
+    how many changes poses and landmarks know that are held, by keyframe; those that the base told last are not in it.
     """
 
     poses: dict[KeyframeId, F64] = field(default_factory=dict)
@@ -120,6 +123,16 @@ class HeldCorrections:
             held.pop(keyframe, None)
         for kind in (RemovedObservations.KIND, CulledLandmarks.KIND):
             self.removed.pop((keyframe, kind), None)
+
+    def forget_evicted(self, keyframe: I64, parent: I64) -> None:
+        """Drop what is known of keyframes that were evicted long ago, if that is much.
+
+        keyframe, parent (k,): of the local map; what is asked later is of them, or of newer keyframes.
+        """
+        for known in (self.placed, self.moved):
+            if len(known) > _MOST_KNOWN:
+                kept = {*keyframe.tolist(), *parent.tolist(), *sorted(known)[-_NEWEST_KNOWN:]}
+                known.intersection_update(kept)
 
     def clear(self) -> None:
         """Drop all: they were taken over."""

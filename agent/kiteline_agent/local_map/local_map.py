@@ -124,6 +124,7 @@ class LocalMap:
         uv, rho = new.uv, new.rho
         slot = self._free_slot(head.parent)
         self.held.forget(KeyframeId(int(self.keyframe[slot])))
+        self.held.forget_evicted(self.keyframe, self.parent)
         n = min(len(uv), self.slot_size)
         rows = slice(slot * self.slot_size, slot * self.slot_size + n)
         self.keyframe[slot], self.parent[slot] = head.keyframe, head.parent

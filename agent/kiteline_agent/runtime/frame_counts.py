@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from kiteline_agent.runtime.frame_reader import SAMPLES
 from kiteline_agent.step import Estimate, PredictedPose
 from kiteline_core.geometry import tum
-from kiteline_core.ids import KeyframeId, SubmapId
+from kiteline_core.ids import NO_KEYFRAME, KeyframeId, SubmapId, submap_of_keyframe
 
 F64 = NDArray[float64]
 
@@ -34,8 +34,9 @@ class FrameCounts:
     predicted: int = 0
     bytes_up: int = 0
     bytes_down: int = 0
-    keyframes: set[KeyframeId] = field(default_factory=set)
+    keyframes: int = 0
     submaps: set[SubmapId] = field(default_factory=set)
+    _newest: dict[SubmapId, KeyframeId] = field(default_factory=dict)  # keyframe of each submap
 
     @property
     def frames(self) -> int:
@@ -54,12 +55,15 @@ class FrameCounts:
             self.tracked += 1
             self.bridged += estimate.bridged
         if estimate is not None and estimate.keyframe >= 0:
-            self.keyframes.add(estimate.keyframe)
+            submap = submap_of_keyframe(estimate.keyframe)
+            if estimate.keyframe > self._newest.get(submap, NO_KEYFRAME):
+                self._newest[submap] = estimate.keyframe
+                self.keyframes += 1
             self.submaps.add(estimate.submap)
 
     def as_report(self) -> dict[str, int | float]:
         """The counts as report.json holds them."""
-        keyframes = len(self.keyframes)
+        keyframes = self.keyframes
         return {
             "frames": self.frames,
             "tracked": self.tracked,

@@ -56,5 +56,5 @@ def summary(counts: FrameCounts) -> str:
     """The flight so far in one line."""
     return (
         f"{counts.frames} frames: {counts.tracked} tracked, {counts.lost} lost, {counts.dropped} dropped; "
-        f"{len(counts.keyframes)} keyframes in {len(counts.submaps)} submap{'s' * (len(counts.submaps) != 1)}"
+        f"{counts.keyframes} keyframes in {len(counts.submaps)} submap{'s' * (len(counts.submaps) != 1)}"
     )

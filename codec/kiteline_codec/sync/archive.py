@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import heapq
 import struct
+from collections import OrderedDict
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Protocol
@@ -15,6 +16,8 @@ from kiteline_codec.sync.digest import MODULUS
 
 _ROW = struct.Struct("<BHqIB")  # kind, part, version, bytes of the code, flags
 _ACKNOWLEDGED, _SENT, _SEND_PLAIN = 1, 2, 4
+_MOST_WRITTEN = 256  # pages in memory whose place in the spill is known: some more than memory holds at once
+_SLACK = 64  # outdated entries that a heap may hold beyond twice the pages
 PAGE_BYTES = 300  # memory of a page beside its rows, roughly
 ROW_BYTES = _ROW.size
 
@@ -28,6 +31,10 @@ class Spill(Protocol):
 
     def get(self, where: int, n_bytes: int) -> bytes | None:
         """The bytes that were put at a position; None when they cannot be read."""
+        ...
+
+    def free(self, where: int, n_bytes: int) -> None:
+        """Bytes that were put at a position are not read again: the place may serve others."""
         ...
 
 
@@ -57,6 +64,15 @@ class _Page:
     session: int  # count of the peer's sessions when the page was made: its acknowledgements are for that session
 
 
+@dataclass(frozen=True, slots=True)
+class _Written:
+    """Where the codes of a page that was taken back are in the spill. versions: that identify them; none if lost."""
+
+    where: int
+    n_bytes: int
+    versions: bytes
+
+
 class Archive:
     """Pages by id. Without a spill, or when it fails, only pages that the peer holds are accepted, without codes."""
 
@@ -67,7 +83,7 @@ class Archive:
         self._session = 0
         self._unsent: list[int] = []  # heap of -id of pages with anything to send
         self._versions: list[tuple[int, int]] = []  # heap of (unacknowledged_from, id)
-        self._written: dict[int, tuple[int, bytes]] = {}  # position of codes of pages taken back, and their versions
+        self._written: OrderedDict[int, _Written] = OrderedDict()  # of pages taken back
         self.values = 0
         self.value_bytes = 0
 
@@ -114,14 +130,17 @@ class Archive:
         if from_version is not None:
             heapq.heappush(self._unsent, -id_)
             heapq.heappush(self._versions, (from_version, id_))
+            if len(self._unsent) > 2 * len(self._pages) + _SLACK:
+                self._queue_pages()
         return True
 
     def _write(self, spill: Spill, id_: int, rows: list[Row]) -> int | None:
         """Write the codes, unless the spill holds these versions already. Returns their position."""
-        versions = _versions_of(rows)
         written = self._written.pop(id_, None)
-        if written is not None and written[1] == versions:
-            return written[0]
+        if written is not None and written.versions == _versions_of(rows):
+            return written.where
+        if written is not None:
+            spill.free(written.where, written.n_bytes)
         return spill.put(b"".join(r.code or b"" for r in rows))
 
     def take(self, id_: int) -> list[Row]:
@@ -142,9 +161,21 @@ class Archive:
             rows.append(Row(kind, part, version, acknowledged, sent, plain, size, code))
         self.values -= len(rows)
         self.value_bytes -= _size_of(rows)
-        if codes is not None and page.where is not None:
-            self._written[id_] = page.where, _versions_of(rows)
+        if page.where is not None and self._spill is not None:
+            self._written[id_] = _Written(page.where, page.n_bytes, _versions_of(rows) if codes is not None else b"")
+            if len(self._written) > _MOST_WRITTEN:
+                _, oldest = self._written.popitem(last=False)
+                self._spill.free(oldest.where, oldest.n_bytes)
         return rows
+
+    def close(self) -> None:
+        """Free what the pages take in the spill; the archive is not used again."""
+        if self._spill is not None:
+            places = [(page.where, page.n_bytes) for page in self._pages.values() if page.where is not None]
+            for where, n_bytes in places + [(page.where, page.n_bytes) for page in self._written.values()]:
+                self._spill.free(where, n_bytes)
+        self._pages.clear()
+        self._written.clear()
 
     def hashes(self, id_: int) -> int:
         """Sum of the hashes of a page's values."""
@@ -178,11 +209,16 @@ class Archive:
             lost += len(self.take(id_))
         for page in self._pages.values():
             page.unacknowledged_from = page.least_version
-        self._unsent = [-id_ for id_ in self._pages]
-        self._versions = [(page.least_version, id_) for id_, page in self._pages.items()]
+        self._queue_pages()
+        return lost, hashes
+
+    def _queue_pages(self) -> None:
+        """Make the heaps anew of the pages with anything to send."""
+        due = [(p.unacknowledged_from, i) for i, p in self._pages.items() if p.unacknowledged_from is not None]
+        self._unsent = [-id_ for _, id_ in due]
+        self._versions = due
         heapq.heapify(self._unsent)
         heapq.heapify(self._versions)
-        return lost, hashes
 
 
 def _size_of(rows: Iterable[Row]) -> int:

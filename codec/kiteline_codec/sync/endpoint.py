@@ -264,6 +264,7 @@ class Endpoint:
             self._traffic.restarts += 1
         self.peer_session = session
         self.earlier.keep(self.peer_values())
+        self._in.close()
         self._in = Inbox(self.config.resident_inbox_bytes, self._spill)
         self._resumable.clear()
         self._out.restart(resumption.outlived(self.earlier.is_gone, session))

@@ -303,6 +303,10 @@ class Inbox:
             self._hashed.pop(key, None)
         return True
 
+    def close(self) -> None:
+        """Free what archived values take in the spill; nothing is read or taken in after that."""
+        self._archive.close()
+
     def _fetch_all(self) -> None:
         for id_ in list(self._archive):
             self._fetch(id_)

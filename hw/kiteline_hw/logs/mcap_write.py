@@ -45,7 +45,8 @@ class McapWriter:
         self._schemas: list[records.Schema] = []
         self._channels: list[records.Channel] = []
         self._metadata: list[records.MetadataIndex] = []
-        self._chunks: list[records.ChunkIndex] = []
+        self._chunks = 0
+        self._chunk_index = bytearray()  # of the chunks: as it is written, a tenth of what its records take
         self._counts: dict[int, int] = {}  # messages by channel
         self._lost: dict[int, int] = {}  # of them
         self._first_ns: int | None = None  # of the first message
@@ -115,7 +116,7 @@ class McapWriter:
             (Opcode.SCHEMA, b"".join(map(_packed, self._schemas))),
             (Opcode.CHANNEL, b"".join(map(_packed, self._channels))),
             (Opcode.STATISTICS, _packed(self._statistics())),
-            (Opcode.CHUNK_INDEX, b"".join(map(_packed, self._chunks))),
+            (Opcode.CHUNK_INDEX, bytes(self._chunk_index)),
             (Opcode.ATTACHMENT_INDEX, b""),
             (Opcode.METADATA_INDEX, b"".join(map(_packed, self._metadata))),
         ]
@@ -131,7 +132,7 @@ class McapWriter:
         counts = {channel: n - self._lost.get(channel, 0) for channel, n in self._counts.items()}
         return records.Statistics(
             attachment_count=0, channel_count=len(self._channels), channel_message_counts=counts,
-            chunk_count=len(self._chunks), message_count=sum(counts.values()), metadata_count=len(self._metadata),
+            chunk_count=self._chunks, message_count=sum(counts.values()), metadata_count=len(self._metadata),
             message_start_time=self._span_ns[0], message_end_time=self._span_ns[1], schema_count=len(self._schemas),
         )  # fmt: skip
 
@@ -175,7 +176,8 @@ class McapWriter:
             for record in (*self._schemas, *self._channels):  # those that were in it, too
                 self._append(_packed(record))
             raise
-        self._chunks.append(
+        self._chunks += 1
+        self._chunk_index += _packed(
             records.ChunkIndex(
                 chunk_length=len(head) + size, chunk_start_offset=begin, compression="", compressed_size=size,
                 message_end_time=last, message_index_length=at - begin - len(head) - size,

@@ -8,6 +8,7 @@ class Memory:
 
     def __init__(self, forgets: int = 0, room: int = 1 << 40) -> None:
         self.data: list[bytes] = []
+        self.freed: set[int] = set()
         self.forgets = forgets
         self.room = room
 
@@ -20,5 +21,10 @@ class Memory:
     def get(self, where: int, n_bytes: int) -> bytes | None:
         if self.forgets and where % self.forgets == 0:
             return None
-        assert len(self.data[where]) == n_bytes
+        assert where not in self.freed and len(self.data[where]) == n_bytes
         return self.data[where]
+
+    def free(self, where: int, n_bytes: int) -> None:
+        assert where not in self.freed and len(self.data[where]) == n_bytes
+        self.freed.add(where)
+        self.data[where] = b""
