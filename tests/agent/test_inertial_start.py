@@ -114,3 +114,22 @@ def test_windows_whose_keyframes_coincide_confirm_no_scale() -> None:
         assert not start._agrees(at(together), at(together))
         assert not start._agrees(at(together), at(apart))
         assert not start._agrees(at(apart), at(together))
+
+
+def test_a_lower_cost_at_the_same_scale_confirms_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    def solved(scale: float, cost: float) -> inertial_start._Solved:
+        state = SimpleNamespace(p=scale * np.arange(12.0).reshape(4, 3))
+        solution: Any = SimpleNamespace(state=state, cost=cost, scale_sigma=0.02)
+        return inertial_start._Solved(solution, np.full((5, 3), scale), np.zeros(5, np.int64))
+
+    def is_lowest(scale: float, cost: float) -> tuple[bool, float]:
+        """Whether a solution with cost 1000 stands beside this one from nothing; scale of the next start."""
+        found, start = solved(1.0, 1000.0), InertialStart(CAMERA, CALIBRATION, AgentConfig(), Work())
+        start._before = inertial_start._Window((0, 1, 2, 3), np.zeros(0, np.int64), found.xyz, found.solution)
+        monkeypatch.setattr(start, "_solve", lambda *_: solved(scale, cost))
+        stands = start._is_lowest(found, None, [], None)  # type: ignore[arg-type]
+        return stands, float(start._before.xyz[0, 0])
+
+    assert is_lowest(1.2, 1000.0) == (True, 1.0)
+    assert is_lowest(1.2, 990.0) == (False, 1.2)
+    assert is_lowest(1.005, 990.0) == (True, 1.0)  # it left out other corners

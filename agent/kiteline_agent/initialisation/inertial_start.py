@@ -29,6 +29,7 @@ F64 = NDArray[np.float64]
 _NEARLY = 1.3  # times the deviation of a known scale: below it the landmarks are aligned again, to know it sooner
 _MIN_VIEWS = 3  # keyframes in which a landmark is aligned again, to be kept
 _LOWER_COST = 1.0  # by which a solution from nothing must be better: a deviation of the scale is worth 0.5
+_SAME_SCALE = 0.5  # deviations of the scale: solutions that differ by less left out other corners
 _MIN_COMMON = 3  # keyframes of two windows whose distances are compared
 _MIN_DEPTH_M = 0.1  # m of a landmark in the newest camera
 
@@ -190,12 +191,15 @@ class InertialStart:
     def _is_lowest(
         self, found: _Solved, corners: CornerObservations, intervals: list[Samples], prior: BiasPrior
     ) -> bool:
-        """True if a solution from nothing has no lower cost: a warm start may stay in a wrong minimum.
+        """True if a solution from nothing has no lower cost, or the same scale.
 
-        Else that solution is the one to start from.
+        A warm start may stay in a wrong minimum. If so, the other solution is the one to start from.
         """
         cold = self._solve(corners, intervals, prior, None)
         if cold is None or cold.solution.cost > found.solution.cost - _LOWER_COST:
+            return True
+        apart = _lengths_apart(found.solution.state.p, cold.solution.state.p)
+        if apart < _SAME_SCALE * found.solution.scale_sigma:
             return True
         assert self._before is not None
         self._before = replace(self._before, xyz=cold.xyz, solution=cold.solution)
@@ -243,10 +247,7 @@ class InertialStart:
         if len(common) < _MIN_COMMON:
             return False
         a, b = (w.solution.state.p[[w.t_ns.index(t) for t in common]] for w in (before, now))
-        length_a, length_b = (float(np.linalg.norm(p - p.mean(axis=0))) for p in (a, b))
-        if min(length_a, length_b) <= 0.0:  # keyframes that coincide tell no scale
-            return False
-        return bool(abs(np.log(length_b / length_a)) < self._config.inertial_start.agreement)
+        return _lengths_apart(a, b) < self._config.inertial_start.agreement
 
     def _points(self, ctx: FrameContext, corners: CornerObservations, solution: WindowSolution) -> MetricPoints | None:
         """The corners of the newest keyframe whose depth is known."""
@@ -283,6 +284,14 @@ class InertialStart:
             self.clear()
             return None
         return complete
+
+
+def _lengths_apart(a: F64, b: F64) -> float:
+    """Relative difference of the lengths of two paths (n,3) of the same keyframes; infinite if either has none."""
+    length_a, length_b = (float(np.linalg.norm(p - p.mean(axis=0))) for p in (a, b))
+    if min(length_a, length_b) <= 0.0:  # keyframes that coincide tell no scale
+        return np.inf
+    return abs(float(np.log(length_b / length_a)))
 
 
 def _covering(corners: CornerObservations, longest: int, each: int) -> NDArray[np.int64]:
