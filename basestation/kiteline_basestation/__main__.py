@@ -34,9 +34,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         process.exit_now(
             process.run_child(options.link, partial(fly_lockstep, options), partial(fly_live, options), expected)
         )
-    for name, value in (("--down-bytes", a.down_bytes), ("--log-mib", a.log_mib)):
-        if value < 0:
-            p.error(f"{name} {value}: expected 0 (no limit) or more")
     sealing = sealing_of(a.link, "base", 0, a.key, insecure=a.insecure)
     a.key, a.told = sealing.key, sealing.lines
     if a.paired_only and not (a.key and a.link.startswith("zenoh:")):

@@ -14,7 +14,6 @@ from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_agent.imaging import alignment_kernels
 from kiteline_agent.motion.motion_model import MotionModel
 from kiteline_agent.step import Identity, StepInput
-from kiteline_agent.tracking import tracker
 from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_agent.tracking.track import Track
 from kiteline_agent.tracking.tracker import Tracker
@@ -72,7 +71,7 @@ def test_landmarks_that_move_alike_do_not_drag_the_pose(
     room_flight: RoomFlight, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     crowd = Crowd()
-    monkeypatch.setattr(tracker.alignment_kernels, "align", crowd.align)
+    monkeypatch.setattr(alignment_kernels, "align", crowd.align)
     begun_by_imu = worst_m(room_flight, fly(room_flight, crowd))
     monkeypatch.setattr(Tracker, "track_by_imu", lambda _self, _ctx: None)
     with_imu = worst_m(room_flight, fly(room_flight, crowd))

@@ -43,7 +43,11 @@ def test_a_corrected_image_shows_true_places(kind: Lens, distortion: tuple[float
     )
     focal, centre = np.array([200.0, 198.0]), np.array([158.0, 121.0])
     for lens in (0.5 * LENS, -1.5 * LENS):
-        rectifier.correct_left(lambda uv, lens=lens: moved((uv - centre) / focal, lens) * focal + centre)
+
+        def corrected(uv: NDArray[np.float64], lens: NDArray[np.float64] = lens) -> NDArray[np.float64]:
+            return moved((uv - centre) / focal, lens) * focal + centre
+
+        rectifier.correct_left(corrected)
     at = np.array([[0.4, -0.3]])
     told = moved(moved(at, -1.5 * LENS), 0.5 * LENS)  # pixels over focal by the calibration
     rays = np.append(told, np.ones((1, 1)), axis=1)

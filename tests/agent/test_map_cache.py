@@ -9,7 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from kiteline_agent.config import AgentConfig
-from kiteline_agent.relocalisation.map_cache import FrameFeatures, MapCache
+from kiteline_agent.relocalisation.frame_features import FrameFeatures
+from kiteline_agent.relocalisation.map_cache import MapCache
 from kiteline_codec.schema import CachedKeyframe, CachedLandmarks, Key
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera

@@ -26,9 +26,9 @@ def test_what_the_filter_has_no_use_for_is_refused(given: list[str], capsys: pyt
 @pytest.mark.parametrize(
     ("given", "words"),
     [
-        (["--cpu", "-5"], "--cpu -5.0: expected 0"),
-        (["--cpu", "nan"], "--cpu nan: expected 0"),
-        (["--up-bytes", "-1"], "--up-bytes -1: expected 0"),
+        (["--cpu", "-5"], "--cpu: -5: expected 0"),
+        (["--cpu", "nan"], "--cpu: nan: expected 0"),
+        (["--up-bytes", "-1"], "--up-bytes: -1: expected 0"),
         (["--obstacles"], "expected --mavlink URL"),
     ],
 )

@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from kiteline_agent.config import RowConfig
 from kiteline_agent.imaging import row_kernels
 from kiteline_agent.imaging.features import build_pyramid
-from kiteline_agent.imaging.row_alignment import RowAlignment, terms
+from kiteline_agent.imaging.row_alignment import RowAlignment, RowConfig, terms
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraModel, CameraRig, Lens, Rectifier
 

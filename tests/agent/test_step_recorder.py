@@ -68,7 +68,7 @@ def test_steps_tile_the_time_between_two_keyframes(tracker: Any) -> None:
     assert np.allclose(T, se3.inverse(pose(0)) @ pose(8), atol=1e-9)
     # the accelerometer's bias is left in, the gyro's taken off
     assert np.allclose(record.velocity[:, 2], 9.8 * record.dt_s, atol=0.02)
-    decoded = messages.decode(messages.key(record), messages.encode(record))
+    decoded: Any = messages.decode(messages.key(record), messages.encode(record))
     assert np.allclose(decoded.velocity, record.velocity, atol=2e-4)
     assert np.allclose(decoded.position, record.position, atol=4e-5)
     assert len(messages.encode(record)) < 25 * len(record.dt_s)

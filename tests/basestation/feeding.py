@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -12,7 +12,7 @@ from kiteline_basestation.jobs import Job, JobDone
 from kiteline_basestation.mapper import Mapper, MapperInput
 from kiteline_basestation.store.integrity import contradictions
 from kiteline_codec.schema import CameraIntrinsics, Record
-from kiteline_core.ids import AgentId
+from kiteline_core.ids import AgentId, KeyframeId
 
 STEP_NS = 250_000_000
 # A base that draws no landmarks into its grid, which takes a third of its time: for tests of the map alone.
@@ -59,3 +59,8 @@ def _step(
         done = tuple(run(job) for job in output.jobs)
         published += [record for _, records in output.publish for record in records]
     return published
+
+
+def keyframes_in(records: Iterable[Any]) -> list[KeyframeId]:
+    """The keyframes that records of one kind tell of."""
+    return [record.keyframe for record in records]

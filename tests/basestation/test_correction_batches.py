@@ -28,7 +28,7 @@ from kiteline_codec.schema import (
 from kiteline_codec.sync.config import SyncConfig
 from kiteline_core.ids import AgentId, KeyframeId
 from kiteline_hw.sim.links.link_model import LinkModel, LinkModelConfig
-from tests.basestation.feeding import WITHOUT_GRID
+from tests.basestation.feeding import WITHOUT_GRID, keyframes_in
 
 AGENT = AgentId(0)
 SECOND_NS = 1_000_000_000
@@ -143,7 +143,7 @@ def test_a_batch_over_several_steps_is_whole_with_its_last_ones() -> None:
     assert batches.numbered([], STEP_NS, unfinished=True) == []
     last = batches.numbered([], STEP_NS)  # what was left turned out to be void
     assert numbers(last) == [1] and not batches.is_open
-    assert [r.keyframe for r in holder.take(last, [])] == [1, 2, 3]
+    assert keyframes_in(holder.take(last, [])) == [1, 2, 3]
     link.missing.clear()
     assert batches.room_bytes(link, STEP_NS) is None
     assert numbers(batches.numbered([pose(4)], STEP_NS)) == [2, 2]
@@ -179,7 +179,7 @@ def test_values_that_a_crash_left_out_of_the_store_hold_up_no_batch() -> None:
     for record in saved:
         after.restore(record)
     assert after.release() is None
-    assert [r.keyframe for r in holder.take(after.numbered([pose(3), pose(4)], 0), [])] == [2, 3, 4]
+    assert keyframes_in(holder.take(after.numbered([pose(3), pose(4)], 0), [])) == [2, 3, 4]
     assert len(holder) == 0
 
 

@@ -200,7 +200,7 @@ def test_two_runs_are_equal_whatever_the_order_of_scans(make_flight: MakeFlight)
 def test_a_restored_map_has_the_same_grid(make_flight: MakeFlight) -> None:
     flight = make_flight(keyframes=20, turns=0.8)
     first = Mapper()
-    groups = [*with_scans(flight), between(flight)]
+    groups: list[list[Record]] = [*with_scans(flight), [*between(flight)]]
     published = feed(first, flight, groups)
     records = [r for group in groups for r in group]
     assert len(first.grid) == 3 * 20

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_basestation.refinement import landmark_matching_kernels as kernels
+from kiteline_core.imaging.matching_kernels import hamming
 from tests.core.helpers_from_python import from_python
 
 U64 = NDArray[np.uint64]
@@ -49,9 +50,9 @@ def chosen(distance: NDArray[np.int64], allowed: NDArray[np.bool_], limit: int, 
 def test_hamming_counts_bits() -> None:
     rng = np.random.default_rng(0)
     a, b = described(rng, 20), described(rng, 30)
-    expected, hamming = bits(a, b), from_python(kernels.hamming)
-    assert all(hamming(a, i, b, j) == expected[i, j] for i in range(20) for j in range(30))
-    assert hamming(np.zeros((1, 4), np.uint64), 0, np.full((1, 4), ~np.uint64(0)), 0) == 256
+    expected, counted = bits(a, b), from_python(hamming)
+    assert all(counted(a, i, b, j) == expected[i, j] for i in range(20) for j in range(30))
+    assert counted(np.zeros((1, 4), np.uint64), 0, np.full((1, 4), ~np.uint64(0)), 0) == 256
 
 
 def test_projected_points_find_their_keypoints() -> None:

@@ -25,7 +25,7 @@ def test_a_number_of_workers_that_no_machine_bears_is_refused(workers: str, caps
 def test_negative_limits_are_refused(given: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="2"):
         main(given)
-    assert f"{' '.join(given)}: expected 0" in capsys.readouterr().err
+    assert f"{': '.join(given)}: expected 0" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

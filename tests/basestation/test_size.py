@@ -39,7 +39,7 @@ from kiteline_codec.sync.resumption import agent_session
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import NO_KEYFRAME, KeyframeId, keyframe_id, submap_id, submap_of_keyframe
 from kiteline_core.optimisation.bundle import BundleResult
-from tests.basestation.feeding import STEP_NS, WITHOUT_GRID, feed
+from tests.basestation.feeding import STEP_NS, WITHOUT_GRID, feed, keyframes_in
 from tests.entries import entries_of
 from tests.yardstick import slowness
 
@@ -224,7 +224,7 @@ def test_keyframes_are_moved_together_to_the_bit_as_one_by_one(scale: float, mon
     assert np.array_equal(together.keyframes.T_m_k, single.keyframes.T_m_k)
     assert together.moved_rows == single.moved_rows
     ((_, records),) = publisher.collect()
-    assert [r.keyframe for r in records] == keyframes[1:]
+    assert keyframes_in(records) == keyframes[1:]
 
 
 def test_counts_of_landmarks_and_observations_follow_the_map(make_flight: MakeFlight) -> None:
@@ -272,7 +272,7 @@ def test_many_corrections_are_sent_newest_first_a_batch_at_a_time(mapped: tuple[
     sent = []
     while publisher.waiting:
         ((_, records),) = publisher.collect()
-        sent.append([r.keyframe for r in records])
+        sent.append(keyframes_in(records))
     live = flight.keyframes[1:]
     assert sent == [live[max(0, n - 8) : n] for n in range(len(live), 0, -8)]
 
@@ -287,14 +287,14 @@ def test_a_step_codes_a_part_of_a_batch_and_the_next_ones_the_rest(mapped: tuple
     sent: list[list[KeyframeId]] = []
     for _ in range(4):  # the batch goes on though it has not arrived
         for _, records in publisher.collect({agent: 0} if sent else {}):
-            sent.append([r.keyframe for r in records])
+            sent.append(keyframes_in(records))
         publisher.mark_changed(KeyframePose.KIND, live[-1])  # changes again
         publisher.mark_changed(KeyframePose.KIND, live[-9])  # the same, while it is chosen
     assert [len(part) for part in sent] == [6, 6, 6, 2]
     assert sorted(k for part in sent for k in part) == live[-20:]
     assert not publisher.unfinished and publisher.collect({agent: 0}) == ()
     ((_, records),) = publisher.collect()
-    assert publisher.unfinished == {agent} and [r.keyframe for r in records][-1] == live[-1]
+    assert publisher.unfinished == {agent} and keyframes_in(records)[-1] == live[-1]
 
 
 def test_what_moves_nothing_is_coded_over_several_steps_too(mapped: tuple[Any, Mapper]) -> None:
@@ -303,13 +303,13 @@ def test_what_moves_nothing_is_coded_over_several_steps_too(mapped: tuple[Any, M
     publisher = Publisher(mapper.map, replace(PublishConfig(), step_values=8))
     for keyframe in flight.keyframes:
         publisher.mark_changed(CulledLandmarks.KIND, keyframe)
-    sent = [[r.keyframe for _, records in publisher.collect() for r in records] for _ in range(4)]
+    sent = [[k for _, records in publisher.collect() for k in keyframes_in(records)] for _ in range(4)]
     assert sent == [flight.keyframes[n : n + 8] for n in range(0, 32, 8)]
     assert not publisher.waiting
     for keyframe in flight.keyframes:
         publisher.mark_deleted(keyframe)
     ((_, records),) = publisher.collect()  # they are forgotten in the next step
-    assert [r.keyframe for r in records] == flight.keyframes
+    assert keyframes_in(records) == flight.keyframes
 
 
 def test_deleted_maps_leave_their_memory_to_the_next_ones(make_flight: MakeFlight, words: Any) -> None:

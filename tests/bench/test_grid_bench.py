@@ -11,6 +11,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from kiteline_basestation.config import GridConfig
+from kiteline_basestation.grid.kept_scan import keep
+from kiteline_basestation.grid.scan_grid import ScanGrid
 from kiteline_bench.grid import costs, maps, obstacles, robust, scans, street
 from kiteline_bench.grid.accuracy import judged, objects_present
 from kiteline_bench.grid.flown import FlownGrid
@@ -125,15 +128,15 @@ def test_objects_are_present_or_missed() -> None:
 
 
 def test_a_loop_that_leaves_traces_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    config, rng = maps.GridConfig(), np.random.default_rng(0)
-    kept = maps.keep(config, maps.road_scan(rng), 175.0)
+    config, rng = GridConfig(), np.random.default_rng(0)
+    kept = keep(config, maps.road_scan(rng), 175.0)
     assert kept is not None
     level = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
     scans = [(kept, se3.from_rt(level, np.array([0.5 * k, 0.0, 0.6]))) for k in range(6)]
     (bar,) = maps._after_a_loop(config, scans)
     assert bar.met and "0 changed" not in bar.measured
-    put = maps.ScanGrid.put
-    monkeypatch.setattr(maps.ScanGrid, "put", lambda grid, k, scan, pose: k not in grid and put(grid, k, scan, pose))
+    put = ScanGrid.put
+    monkeypatch.setattr(ScanGrid, "put", lambda grid, k, scan, pose: k not in grid and put(grid, k, scan, pose))
     (bar,) = maps._after_a_loop(config, scans)
     assert not bar.met, "keyframes that stay where they were drawn first"
 

@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kiteline_agent.config import AgentConfig, KnownRigConfig
+from kiteline_agent.config import AgentConfig
 from kiteline_agent.inertial.calibration.known_imu import KnownImuConfig
+from kiteline_agent.known_rig import KnownRigConfig
 from kiteline_agent.runtime import rig_file
 from kiteline_agent.runtime.options import AgentOptions
 from kiteline_bench.vehicle import guided

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from pathlib import Path
 
 import pytest
@@ -50,9 +51,7 @@ def test_the_command_writes_what_it_measured_and_tells_of_a_bar_that_is_not_met(
 ) -> None:
     monkeypatch.setenv("KITELINE_DATA", str(tmp_path))
     monkeypatch.setattr(benchmark, "BENCHMARKS", {"fake": __name__})
-    monkeypatch.setattr(
-        benchmark.importlib, "import_module", lambda name: FakeBench if name == __name__ else __import__(name)
-    )
+    monkeypatch.setattr(importlib, "import_module", lambda name: FakeBench if name == __name__ else __import__(name))
     results = tmp_path / "docs" / "results.md"
     assert main(["fake", "--results", str(results)]) == 1
     assert "| speed | <= 1 ms | 2.000 ms | **no** |" in results.read_text()

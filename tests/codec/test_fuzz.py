@@ -42,6 +42,10 @@ def test_it_would_find_a_crash(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_doors_that_cost_less_are_fed_more_often() -> None:
     taken: list[str] = []
-    others = [Door(name, lambda data, draw, name=name: taken.append(name), (b"1",)) for name in ("slow", "fast")]
+
+    def door(name: str) -> Door:
+        return Door(name, lambda data, draw: taken.append(name), (b"1",))
+
+    others = [door("slow"), door("fast")]
     fuzz.fuzz([b"1"], values(), 2 * (7 + 1 + 4), seed=1, others=others, turns={"fast": 4})
     assert (taken.count("slow"), taken.count("fast")) == (30 + 2, 30 + 8)  # 30 before memory is measured

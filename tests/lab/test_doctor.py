@@ -8,7 +8,7 @@ import pytest
 from kiteline_hw.system import key_store
 from kiteline_lab.tools import doctor
 from kiteline_lab.tools.checks import keys
-from kiteline_lab.tools.doctor import DoctorCheck, Severity
+from kiteline_lab.tools.checks.check import DoctorCheck, Severity
 
 
 def test_every_plain_dependency_is_checked() -> None:

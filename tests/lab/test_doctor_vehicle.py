@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import socket
 import threading
 import time
@@ -121,7 +122,7 @@ def test_disk(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "not" / "there"))
     (found,) = vehicle.check_disk()
     assert str(tmp_path) in found.text
-    monkeypatch.setattr(vehicle.shutil, "disk_usage", lambda place: type("Usage", (), {"free": 100 * 2**20}))
+    monkeypatch.setattr(shutil, "disk_usage", lambda place: type("Usage", (), {"free": 100 * 2**20}))
     (found,) = vehicle.check_disk()
     assert found.severity is Severity.FAIL and found.text.startswith("100 MiB free")
 

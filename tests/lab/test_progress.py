@@ -1,10 +1,10 @@
 from __future__ import annotations
 
 import io
+import time
 
 import pytest
 
-from kiteline_lab.flights import progress
 from kiteline_lab.flights.progress import Progress
 
 
@@ -15,7 +15,7 @@ class Terminal(io.StringIO):
 
 def test_a_file_gets_whole_lines_and_few_of_them(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [0.0]
-    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
     out = io.StringIO()
     with Progress("flying", 100, "frames", out) as p:
         for i in range(1, 101):
@@ -30,7 +30,7 @@ def test_a_file_gets_whole_lines_and_few_of_them(monkeypatch: pytest.MonkeyPatch
 
 def test_the_time_before_the_first_unit_is_no_rate(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [0.0]
-    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
     out = io.StringIO()
     with Progress("flying", 100, "frames", out) as p:
         now[0] = 20.0  # kernels are loaded

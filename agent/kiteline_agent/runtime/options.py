@@ -15,6 +15,7 @@ from kiteline_codec.sync.resumption import agent_session
 from kiteline_codec.transport.link_traits import LinkTraits
 from kiteline_codec.transport.seal import seal_bytes, suite_for
 from kiteline_core import config as configuration
+from kiteline_core.arguments import count_limit, limit
 from kiteline_core.ids import MAX_AGENTS
 
 GRIDS = ("agent", "base", "off")  # who makes scans of ground and obstacles
@@ -153,9 +154,6 @@ def check(p: argparse.ArgumentParser, a: argparse.Namespace) -> None:
         p.error("a SOURCE is required")
     if not 0 <= a.agent < MAX_AGENTS:
         p.error(f"--agent {a.agent}: expected 0 to {MAX_AGENTS - 1}")
-    for name in ("--cpu", "--up-bytes", "--log-mib"):
-        if not (value := getattr(a, name[2:].replace("-", "_"))) >= 0:  # neither is "nan"
-            p.error(f"{name} {value}: expected 0 (no limit) or more")
     if unused := _unused_by_filter(a):
         p.error(f"--tracker ekf uses no {' and no '.join(unused)}: leave them out, or fly --tracker map")
     if a.obstacles and not a.mavlink:
@@ -194,11 +192,11 @@ def _add_tracking(p: argparse.ArgumentParser) -> None:
         "base's grid); or nobody",
     )  # fmt: skip
     p.add_argument(
-        "--cpu", metavar="PERCENT", type=float, default=0.0, help="limit to so much of one core (default: no limit)"
+        "--cpu", metavar="PERCENT", type=limit, default=0.0, help="limit to so much of one core (default: no limit)"
     )
     p.add_argument("--log", metavar="DIR", default="", help="log each start to DIR/agentN/bootNNNNN.mcap, …_1.mcap")
     p.add_argument(
-        "--log-mib", metavar="N", type=int, default=LOG_MIB,
+        "--log-mib", metavar="N", type=count_limit, default=LOG_MIB,
         help="MiB that the logs of all starts may take: the oldest are deleted, also in flight (default: %(default)s; "
         "0: no limit)",
     )  # fmt: skip
@@ -209,7 +207,9 @@ def _add_link(p: argparse._ArgumentGroup) -> None:
     p.add_argument(
         "--agent", metavar="N", type=int, default=0, help=f"number of this agent in its group, 0 to {MAX_AGENTS - 1}"
     )
-    p.add_argument("--up-bytes", metavar="N", type=int, default=0, help="B/s that may be sent, headers included")
+    p.add_argument(
+        "--up-bytes", metavar="N", type=count_limit, default=0, help="B/s that may be sent, headers included"
+    )
     p.add_argument("--profile", choices=("wifi", "radio"), default="", help="default: as the link allows")
     p.add_argument("--key", metavar="FILE", default="", help="seal packets; take none but sealed ones "
                    "(default: the file of `kiteline keys pair`)")  # fmt: skip

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_basestation.inertial.ties import moved
+from kiteline_basestation.inertial.ties import body_poses, moved
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_codec.schema import InertialSteps
 from kiteline_core.geometry import se3
@@ -165,12 +165,7 @@ def _by_bias(s: Segment) -> F64:
 def _shape(s: Segment, T_w_first: F64, T_w_last: F64) -> tuple[F64, F64]:
     """Rotations (n+1,3,3) and positions (n+1,3) of the camera in w."""
     T_b_c = se3.inverse(s.T_c_b)
-    T = np.eye(4)
-    relative = [np.eye(4)]
-    for turn, step in zip(s.steps.turn, s.steps.moved, strict=True):
-        T = T @ se3.from_rt(se3.so3_exp(turn), step)
-        relative.append(s.T_c_b @ T @ T_b_c)
-    chain = np.array(relative)
+    chain = np.array([np.eye(4), *(s.T_c_b @ T @ T_b_c for T in body_poses(s.steps)[1:])])
     target = se3.inverse(T_w_first) @ T_w_last
     share = np.concatenate([[0.0], np.cumsum(s.steps.dt_s)]) / float(np.sum(s.steps.dt_s))
     apart, seen = float(np.linalg.norm(target[:3, 3])), float(np.linalg.norm(chain[-1, :3, 3]))

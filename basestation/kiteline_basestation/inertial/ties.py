@@ -92,7 +92,12 @@ def moved_camera(sparse_map: SparseMap, record: InertialSteps) -> F64:
 
 def moved(record: InertialSteps) -> F64:
     """Motion (4,4) of the body along the steps, as the images saw it."""
-    T = np.eye(4)
+    return se3.orthonormalise(body_poses(record)[-1])
+
+
+def body_poses(record: InertialSteps) -> list[F64]:
+    """Poses (4,4) of the body before and after each step, in the first one, as the images saw them."""
+    poses = [np.eye(4)]
     for turn, step in zip(record.turn, record.moved, strict=True):
-        T = T @ se3.from_rt(se3.so3_exp(turn), step)
-    return se3.orthonormalise(T)
+        poses.append(poses[-1] @ se3.from_rt(se3.so3_exp(turn), step))
+    return poses

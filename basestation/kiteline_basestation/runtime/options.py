@@ -12,6 +12,7 @@ from kiteline_codec.channel import RecordChannel, coded_channel
 from kiteline_codec.transport.link_traits import LinkTraits
 from kiteline_codec.transport.seal import seal_bytes, suite_for
 from kiteline_core import config as configuration
+from kiteline_core.arguments import count_limit
 from kiteline_core.ids import AgentId
 
 DEFAULT_LINK = "zenoh:tcp/127.0.0.1:7447"
@@ -77,10 +78,10 @@ def parser(link_forms: str = "") -> argparse.ArgumentParser:
     p.add_argument("--web", metavar="HOST:PORT", default="", help="serve a status page")
     p.add_argument("--config", metavar="F", default="", help="a TOML file with a [base] section")
     p.add_argument("--log", metavar="DIR", default="", help="log each start to DIR; the map is left there too")
-    p.add_argument("--log-mib", metavar="N", type=int, default=LOG_MIB,
+    p.add_argument("--log-mib", metavar="N", type=count_limit, default=LOG_MIB,
                    help="MiB that the logs of all starts may take: the oldest are deleted, also while the base runs "
                    "(default: %(default)s; 0: no limit)")  # fmt: skip
-    p.add_argument("--down-bytes", metavar="N", type=int, default=0, help="B/s to each agent, headers included")
+    p.add_argument("--down-bytes", metavar="N", type=count_limit, default=0, help="B/s to each agent, headers included")
     p.add_argument("--key", metavar="FILE", default="", help="seal packets; drop those of agents without a key in it "
                    "(default, beyond this machine: a file that is made at the first start)")  # fmt: skip
     p.set_defaults(told=())

@@ -185,19 +185,3 @@ def from_quaternions(q: F64, t: F64) -> F64:
     out[:, :3, :3] = np.stack(_rotation_numbers(*(q / lengths[:, None]).T), 1).reshape(-1, 3, 3)
     out[:, :3, 3] = t
     return out
-
-
-def quaternions_from_rotations(r: F64) -> F64:
-    """`quaternion_from_rotation` of many: (n,4) of rotation matrices (n,3,3), to the same bits."""
-    (a, b, c), (d, e, f), (g, h, k) = np.moveaxis(r, 0, 2)
-    trace = a + e + k
-    x_first, y_first, z_first = 1.0 + a - e - k, 1.0 - a + e - k, 1.0 - a - e + k
-    largest = np.argmax([trace, a, e, k], axis=0)
-    cases = np.array([
-        [1.0 + trace, h - f, c - g, d - b], [h - f, x_first, b + d, c + g], [c - g, b + d, y_first, f + h],
-        [d - b, c + g, f + h, z_first],
-    ])  # fmt: skip
-    out = cases[largest, :, np.arange(len(r))]
-    w, x, y, z = out.T
-    n = np.sqrt(w * w + x * x + y * y + z * z)
-    return np.asarray(out / np.where(w < 0.0, -n, n)[:, None])

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from kiteline_agent.runtime.options import GRIDS, TRACKERS
 from kiteline_basestation.runtime import base_runtime
+from kiteline_core.arguments import limit
 from kiteline_hw.logs.mcap_repair import repair
 from kiteline_hw.ports import LinkError, SourceError
 from kiteline_hw.sources.kinds import source_forms
@@ -48,7 +49,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument(
         "--cpu",
         metavar="PERCENT",
-        type=float,
+        type=limit,
         default=0.0,
         help="of one core: for each agent, or for all together with --mode local or monolith; default: all there is",
     )
@@ -68,7 +69,7 @@ def parser() -> argparse.ArgumentParser:
                    "makes no scans and reads no IMU")  # fmt: skip
     p.add_argument("--seed", metavar="N", type=int, default=0, help="of the link model")
     p.add_argument(
-        "--seconds", metavar="S", type=float, default=0.0, help="fly only so much of the source; default: all"
+        "--seconds", metavar="S", type=limit, default=0.0, help="fly only so much of the source; default: all"
     )
     p.add_argument("--store", metavar="DIR", default="", help="the base keeps its map here, and goes on from it")
     for hook in ("--kill-base-at", "--restart-base-at", "--kill-agent-at"):
@@ -90,8 +91,6 @@ def options(argv: list[str]) -> Options:
         p.error(f"--link-loss {a.link_loss}: expected a probability from 0 to below 1")
     if a.rig and len(a.sources) > 1:
         p.error("--rig is the file of one rig: it goes with one SOURCE")
-    if not (a.cpu >= 0.0 and a.seconds >= 0.0):
-        p.error("--cpu and --seconds: expected 0 (no limit) or more")
     if a.out.exists() and not a.out.is_dir():
         p.error(f"--out {a.out} is a file: name a folder")
     return Options(

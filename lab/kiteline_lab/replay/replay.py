@@ -22,6 +22,7 @@ from kiteline_basestation.runtime.warm import warm as base_warm
 from kiteline_basestation.station import Station
 from kiteline_basestation.store.restore import restore
 from kiteline_basestation.store.saved_map import unpack
+from kiteline_core.arguments import limit
 from kiteline_core.ids import AgentId
 from kiteline_hw.links.kinds import link_traits
 from kiteline_hw.logs.log_parts import WholeLog
@@ -157,15 +158,15 @@ def main(argv: list[str]) -> int:
         "--verify", action="store_true", help="compare all packets and estimates bit for bit; exit 1 where one differs"
     )
     p.add_argument(
-        "--cpu", metavar="PERCENT", type=float, default=0.0, help="fly the log's frames anew with so much of one core"
+        "--cpu", metavar="PERCENT", type=limit, default=0.0, help="fly the log's frames anew with so much of one core"
     )
     p.add_argument(
         "--virtual", action="store_true", help="with --cpu: the modelled core, also where the kernel could limit us"
     )
     p.add_argument("--out", metavar="DIR", type=Path, help="leave trajectories here")
     a = p.parse_args(argv)
-    if not a.cpu >= 0.0 or (a.cpu and a.verify):
-        p.error("--cpu is a percentage above 0, and goes without --verify: its flight is a new one")
+    if a.cpu and a.verify:
+        p.error("--cpu goes without --verify: its flight is a new one")
     if a.cpu:
         from kiteline_lab.replay.replay_cpu import refly
 

@@ -10,7 +10,7 @@ import pytest
 
 from kiteline_agent.ekf.ekf_slam import EkfSlam
 from kiteline_agent.ekf.filter_state import FilterState, Motion
-from kiteline_agent.ekf.odometer_motion import OdometerMotion
+from kiteline_agent.ekf.odometer_motion import OdometerMotion, camera_motion
 from kiteline_agent.ekf_config import EkfConfig
 from kiteline_bench.papers import ekf
 from kiteline_bench.papers import simulated_vehicle as vehicle
@@ -55,7 +55,7 @@ def test_vehicle_that_sees_nothing_follows_its_odometry() -> None:
     slam, poses, none = EkfSlam(vehicle.camera(), EkfConfig()), vehicle.loop(planar=True), np.zeros(0, np.int64)
     cam = vehicle.camera()
     for before, after in pairwise(poses[:41]):
-        motion = vehicle.camera_motion(se3.inverse(before) @ after, 1e-6 * np.eye(6), cam.T_b_c)
+        motion = camera_motion(se3.inverse(before) @ after, 1e-6 * np.eye(6), cam.T_b_c)
         slam.predict(motion)
         slam.update(none, np.zeros((0, 2)))
     np.testing.assert_allclose(slam.state.T_o_c @ se3.inverse(cam.T_b_c), poses[40], atol=1e-9)

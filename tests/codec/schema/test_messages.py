@@ -450,6 +450,7 @@ def test_a_keyframe_is_coded_quickly() -> None:
 
 
 def test_a_measured_record_is_coded_as_any_other() -> None:
+    record: Any
     for record in some_records(5, 40):
         code = messages.encode(record)
         assert messages.length(record) == len(code)

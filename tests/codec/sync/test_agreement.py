@@ -359,7 +359,8 @@ def the_budget_forgets(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def silence_is_forever(monkeypatch: pytest.MonkeyPatch) -> None:
-    rto = RoundTrip.timeout_ns.fget
+    timeout: Any = RoundTrip.timeout_ns
+    rto = timeout.fget
 
     def planted(self: RoundTrip) -> int:
         return 1 << 62 if self.doublings >= 4 else int(rto(self))  # type: ignore[misc]

@@ -192,7 +192,7 @@ def test_pixels_near_a_height_and_a_path() -> None:
     used = near & (counts > 0)
     used[:3] = used[31:] = False
     out = np.empty((3, counts.size))
-    m = profile_kernels.cells_near(counts, *sums, path, 3, 30, sigma_px, out)
+    m = profile_kernels.cells_near(counts, sums[0], sums[1], path, 3, 30, sigma_px, out)
     assert np.array_equal(
         out[:, :m], np.stack([counts[used], sums[0][used] / counts[used], sums[1][used] / counts[used]])
     )

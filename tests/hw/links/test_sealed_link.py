@@ -35,8 +35,8 @@ class Wire:
 
 def test_sealed_packets_both_ways(tmp_path: Path) -> None:
     path = tmp_path / "keys"
-    for agent in (1, 2):
-        new_key(path, agent)
+    for number in (1, 2):
+        new_key(path, number)
     keys = read_keys(path)
     down, up = Wire(), Wire()
     hub = SealedHub(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from pymavlink.dialects.v20 import common
@@ -25,7 +27,7 @@ from kiteline_hw.ports import PoseSample, SourceReport
 S, FLU = 1_000_000_000, mounting("flu")
 
 
-def read(frames: list[bytes]) -> list[object]:
+def read(frames: list[bytes]) -> list[Any]:
     """The messages of frames by pymavlink alone."""
     parser = common.MAVLink(None)
     return [message for frame in frames for message in parser.parse_buffer(frame) or []]
@@ -41,7 +43,7 @@ def test_the_vehicle_is_learnt_and_others_are_not_mixed_in() -> None:
     requests = read(session.receive(ours.encode(Heartbeat(2, 3)), 0))
     assert requests
     for m in requests:
-        assert m.get_type() == "COMMAND_LONG" and m.target_system == 7 and m.get_srcSystem() == 7  # type: ignore[attr-defined]
+        assert m.get_type() == "COMMAND_LONG" and m.target_system == 7 and m.get_srcSystem() == 7
     for i in range(1, 6):
         now_ns = i * 5_000_000
         assert session.receive(other.encode(Heartbeat(2, 12)), now_ns) == []
@@ -64,7 +66,7 @@ def test_a_system_that_was_told_is_the_only_one() -> None:
     assert session.autopilot(0) is None
     session.receive(MavlinkCodec(4, 1).encode(Heartbeat(2, 3)), 0)
     assert session.autopilot(0) is not None
-    assert read(session.step(None, S))[0].get_srcSystem() == 4  # type: ignore[attr-defined]
+    assert read(session.step(None, S))[0].get_srcSystem() == 4
 
 
 def test_an_origin_is_set_while_disarmed_until_the_controller_has_one() -> None:
@@ -74,7 +76,7 @@ def test_an_origin_is_set_while_disarmed_until_the_controller_has_one() -> None:
     sent = [len(session.receive(wire.encode(Heartbeat(2, 3)), i * S)) for i in range(1, 8)]
     assert sent == [1, 0, 0, 0, 0, 1, 0]
     m = read(session.receive(wire.encode(Heartbeat(2, 3)), 20 * S))[0]
-    assert (m.target_system, m.latitude, m.longitude, m.altitude) == (2, 473_566_100, 85_190_300, 408_000)  # type: ignore[attr-defined]
+    assert (m.target_system, m.latitude, m.longitude, m.altitude) == (2, 473_566_100, 85_190_300, 408_000)
     session.receive(wire.encode(GlobalOrigin(1, 2, 3)), 21 * S)  # it has one
     assert session.receive(wire.encode(Heartbeat(2, 3)), 40 * S) == []
 
@@ -85,17 +87,17 @@ def test_the_older_messages_say_the_same_as_odometry() -> None:
     pose.T_o_b[:3, 3] = [3.0, 4.0, 1.0]
     session = ControllerSession(FLU, SessionConfig(vision=True))
     _, position, speed = read(session.step(pose, 0))
-    assert position.get_type() == "VISION_POSITION_ESTIMATE" and speed.get_type() == "VISION_SPEED_ESTIMATE"  # type: ignore[attr-defined]
-    assert [position.x, position.y, position.z] == [3.0, -4.0, -1.0]  # type: ignore[attr-defined]
+    assert position.get_type() == "VISION_POSITION_ESTIMATE" and speed.get_type() == "VISION_SPEED_ESTIMATE"
+    assert [position.x, position.y, position.z] == [3.0, -4.0, -1.0]
     np.testing.assert_allclose(
         [position.roll, position.pitch, position.yaw],
         [0.0, 0.0, -np.pi / 2],
-        atol=1e-6,  # type: ignore[attr-defined]
+        atol=1e-6,
     )
-    np.testing.assert_allclose([speed.x, speed.y, speed.z], [1.0, -2.0, -0.5], atol=1e-6)  # type: ignore[attr-defined]
-    assert position.usec == speed.usec == S // 1000  # type: ignore[attr-defined]
+    np.testing.assert_allclose([speed.x, speed.y, speed.z], [1.0, -2.0, -0.5], atol=1e-6)
+    assert position.usec == speed.usec == S // 1000
     lost = PoseSample(2 * S, np.eye(4), False, -1, velocity=np.zeros(3), rate=np.zeros(3))
-    assert [m.get_type() for m in read(session.step(lost, 2 * S))] == ["HEARTBEAT"]  # type: ignore[attr-defined]
+    assert [m.get_type() for m in read(session.step(lost, 2 * S))] == ["HEARTBEAT"]
 
 
 @pytest.mark.parametrize(
@@ -112,8 +114,8 @@ def test_golden_frames(message: Heartbeat | GlobalOrigin, frame: str) -> None:
 
 def test_the_computers_state() -> None:
     m = read([MavlinkCodec().encode(ComputerStatus(5, 6, (10, 30), 512, None, 61))])[0]
-    assert m.get_type() == "ONBOARD_COMPUTER_STATUS"  # type: ignore[attr-defined]
-    assert m.cpu_cores == [10, 30, *[255] * 6] and m.cpu_combined[0] == 20  # type: ignore[attr-defined]
-    assert (m.ram_usage, m.ram_total, m.temperature_core[0]) == (512, 2**32 - 1, 61)  # type: ignore[attr-defined]
+    assert m.get_type() == "ONBOARD_COMPUTER_STATUS"
+    assert m.cpu_cores == [10, 30, *[255] * 6] and m.cpu_combined[0] == 20
+    assert (m.ram_usage, m.ram_total, m.temperature_core[0]) == (512, 2**32 - 1, 61)
     empty = read([MavlinkCodec().encode(ComputerStatus(5, 6, (), None, None, None))])[0]
-    assert empty.cpu_combined == [255] * 10 and empty.temperature_core == [127] * 8  # type: ignore[attr-defined]
+    assert empty.cpu_combined == [255] * 10 and empty.temperature_core == [127] * 8

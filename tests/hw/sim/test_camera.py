@@ -51,7 +51,7 @@ def test_box_hit_equals_the_reference() -> None:
         d /= np.linalg.norm(d)
         near, far = slabs(box, o, d)
         for inside in (False, True):
-            t, face = box_hit(box[None], 0, o, *d, inside)
+            t, face = box_hit(box[None], 0, o, d[0], d[1], d[2], inside)
             expected = (far if inside else near) if near <= far and (far if inside else near) > 0 else np.inf
             assert t == pytest.approx(expected, abs=1e-9)
             if np.isfinite(t):
@@ -74,7 +74,7 @@ def test_ground_hit_lies_on_the_ground() -> None:
     for _ in range(500):
         d = rng.normal(0, 1, 3) * [1, 1, 0.4]
         d /= np.linalg.norm(d)
-        t = ground_hit(field, frame, o, *d, 28.0)
+        t = ground_hit(field, frame, o, d[0], d[1], d[2], 28.0)
         steps = o + np.linspace(0, 28.0, 6000)[:, None] * d
         below = steps[:, 2] < bilinear(field[0], frame, steps[:, :2])
         if np.isfinite(t):

@@ -99,7 +99,7 @@ def test_a_turned_grid_gives_the_same_way() -> None:
     origin = (3.0, -1.0, 0.5 * math.pi)
     plain = find_path(grid(hall_with_wall()), at(2.01, 2.01), at(6.01, 2.01), 0.15)
     there = [np.array([3.0 - y, -1.0 + x]) for x, y in ((2.01, 2.01), (6.01, 2.01))]
-    turned = find_path(grid(hall_with_wall(), 0.1, origin), *there, 0.15)
+    turned = find_path(grid(hall_with_wall(), 0.1, origin), there[0], there[1], 0.15)
     assert turned.length_m == pytest.approx(plain.length_m, abs=1e-9)
     assert np.allclose(turned.places[:, 0], 3.0 - plain.places[:, 1])
 

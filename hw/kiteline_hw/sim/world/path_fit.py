@@ -27,7 +27,7 @@ def fit(t_s: F64, poses: F64, knot_s: float, smoothing: float) -> Path:
 
     smoothing: weight of the squared third differences of the coefficients, relative to one mean data row per knot.
     """
-    q = se3.quaternions_from_rotations(poses[:, :3, :3])
+    q = np.array([se3.quaternion_numbers(T[:3, :3]) for T in poses])
     signs = np.cumprod(np.concatenate([[1.0], np.where((q[1:] * q[:-1]).sum(1) < 0, -1.0, 1.0)]))
     data = np.concatenate([poses[:, :3, 3], q * signs[:, None]], 1)
     length = float(t_s[-1])
