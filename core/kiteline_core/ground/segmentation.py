@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from kiteline_core.geometry import disparity_offset
 from kiteline_core.geometry.cameras import RectifiedCamera
-from kiteline_core.ground import label_kernels, level_kernels, profile_kernels
+from kiteline_core.ground import column_kernels, label_kernels, level_kernels, profile_kernels
 from kiteline_core.ground.column_scan import ColumnScan, level_rotation
 from kiteline_core.ground.config import GroundConfig
 from kiteline_core.ground.disparity import DisparityCamera
@@ -119,7 +119,7 @@ class GroundSegmenter:
         self._column, self._known = np.empty((h, w), np.int16), np.empty((n, 2), np.int32)
         self.labels = np.zeros((h, w), np.uint8)
         self._textured = np.ones((h, w), np.bool_)
-        self._counts, self._sums = np.empty((5, n, bins), np.int32), np.empty((n, bins))
+        self._counts, self._sums = np.empty((6, n, bins), np.int32), np.empty((n, bins))
         self._ground_heights = np.empty((n, bins))
         self._slab_sums = np.empty((n, bins))
         self._surface, self._surface_sums = np.empty((n, 2)), np.empty((n, 2, 5))
@@ -310,7 +310,7 @@ class GroundSegmenter:
             height_m = ground.height_m
         elif expected is not None:
             slope, height_m = borders * (expected.height_m / self.bf), expected.height_m
-        grounds, obstacles, falls, slab = self._counts[1:]
+        grounds, obstacles, falls, astray, slab = self._counts[1:]
         self.labels.fill(label_kernels.UNKNOWN)
         summed = self._sums, self._ground_heights, self._in_band, self._slab_sums, self._surface_sums
         for counts in (self._counts[1:], *summed):
@@ -318,7 +318,7 @@ class GroundSegmenter:
         on, under = label_kernels.label_points(
             self.x, self.z, self._column, self._textured, slope, seen, self.bf, self.sigma_px, config.ground_m,
             config.ground_sigmas, config.ground_most_m, self._bands, config.slab_m, self.labels, grounds, obstacles,
-            falls, self._ground_heights, self._sums, self._in_band, slab, self._slab_sums,
+            falls, astray, self._ground_heights, self._sums, self._in_band, slab, self._slab_sums,
         )  # fmt: skip
         if ground is not None and under > _UNDER * on:
             return self._scan(None, view, expected)[0], True
@@ -333,9 +333,10 @@ class GroundSegmenter:
                 self.labels, config.slab_m, surface, self._surface_sums,
             )  # fmt: skip
         free_from, free, obstacle, clear = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
-        label_kernels.collect_scan(
-            grounds, self._ground_heights, obstacles, falls, config.column_pixels, surface, bands, self._bands,
-            height_m, self._azimuths, self.bf, lowest, self.sigma_px, _GAP_M, free_from, free, obstacle, clear,
+        column_kernels.collect_scan(
+            grounds, self._ground_heights, obstacles, falls, astray, config.column_pixels, surface, bands, self._bands,
+            height_m, self._azimuths, self.bf, 1.0 / float(self._camera[1]), lowest, self.sigma_px, _GAP_M, free_from,
+            free, obstacle, clear,
         )  # fmt: skip
         # A column beside a nearer obstacle shows some of it: what is free there ends where that begins.
         padded = np.concatenate([[np.inf], obstacle, [np.inf]])

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from kiteline_core.ground import label_kernels
+from kiteline_core.ground import column_kernels
 from kiteline_core.ground.column_scan import ColumnScan
 from kiteline_core.ground.level_kernels import BIN_PX
 from kiteline_core.ground.segmentation import ExpectedGround
@@ -15,6 +15,7 @@ from tests.core.ground.test_segmentation import HEIGHT_M, Surface, level_ground,
 
 KNOWN = ExpectedGround(HEIGHT_M, 0.1)
 BEHIND_EDGE_M = 0.05  # a cell
+ROW_RAD = 0.0093  # between two rows of a disparity image
 
 
 def floor_without(near_m: float, far_m: float, half_width_m: float) -> Surface:
@@ -88,14 +89,14 @@ def behind_a_low_box(wall_m: float) -> float:
     """Where free ground ends that is seen over a low box up to 3.5 m, with a wall beyond."""
     bf, bins, height = 25.0, 192, 1.5
     centres = bf / ((np.arange(bins) + 0.5) * BIN_PX)
-    grounds, obstacles, heights = np.zeros((3, 1, bins), np.int32)
+    grounds, obstacles, none = np.zeros((3, 1, bins), np.int32)
     grounds[0, (centres > 2.6) & (centres < 3.5)] = 20
     obstacles[0, int(bf / wall_m / BIN_PX)] = 40
     free_from, free, obstacle, clear = np.zeros((4, 1))
-    label_kernels.collect_scan(
-        grounds, -height * grounds.astype(float), obstacles, heights, 5, np.array([[bf / 2.0, 0.0]]),
-        np.array([1], np.uint8), np.array([0.1, 0.5, 1.2, 2.0]), height, np.zeros(1), bf, 10, 0.25, 0.25, free_from,
-        free, obstacle, clear,
+    column_kernels.collect_scan(
+        grounds, -height * grounds.astype(float), obstacles, none, none, 5, np.array([[bf / 2.0, 0.0]]),
+        np.array([1], np.uint8), np.array([0.1, 0.5, 1.2, 2.0]), height, np.zeros(1), bf, ROW_RAD, 10, 0.25, 0.25,
+        free_from, free, obstacle, clear,
     )  # fmt: skip
     return float(free[0])
 
@@ -105,6 +106,28 @@ def test_a_wall_beyond_a_gap_is_not_what_ends_free_ground() -> None:
     assert behind_a_low_box(4.5) == behind_a_low_box(20.0) < behind_a_low_box(3.6)
 
 
+def free_to_from_low_above(looks_into_hole: int) -> float:
+    """Where free ground ends that a camera 0.4 m above sees in rows, without that at 3.3 m; pixels of a hole there."""
+    bf, bins, height = 25.0, 192, 0.4
+    grounds, astray, none = np.zeros((3, 1, bins), np.int32)
+    rows_m = height / np.tan(ROW_RAD * np.arange(10, 40))
+    rows_m = rows_m[np.abs(rows_m - 3.3) > 0.15]
+    grounds[0, (bf / rows_m / BIN_PX).astype(int)] = 5
+    astray[0, int(bf / 3.3 / BIN_PX)] = looks_into_hole
+    free_from, free, obstacle, clear = np.zeros((4, 1))
+    column_kernels.collect_scan(
+        grounds, -height * grounds.astype(float), none, none, astray, 5, np.zeros((1, 2)), np.zeros(1, np.uint8),
+        np.array([0.1, 0.5, 1.2, 2.0]), height, np.zeros(1), bf, ROW_RAD, 10, 0.25, 0.25, free_from, free, obstacle,
+        clear,
+    )  # fmt: skip
+    return float(free[0])
+
+
+def test_rows_that_lie_far_apart_on_the_ground_are_no_gap_unless_they_show_a_hole() -> None:
+    assert free_to_from_low_above(0) > 3.9
+    assert 2.3 < free_to_from_low_above(5) < 3.1
+
+
 def test_ground_below_nearer_ground_by_more_than_a_slope_is_a_step() -> None:
     """Compared with sums that are taken anew for each pair of bins."""
     random, bf, bins = np.random.default_rng(0), 25.0, 160
@@ -112,7 +135,7 @@ def test_ground_below_nearer_ground_by_more_than_a_slope_is_a_step() -> None:
     z = -1.5 - 0.15 * (np.arange(bins) < 50) + random.normal(0.0, 0.01, bins)
     heights = grounds * z
     means, steps = np.empty(bins), np.empty(bins, np.bool_)
-    kernel: Any = label_kernels._mark_steps
+    kernel: Any = column_kernels._mark_steps
     kernel.py_func(grounds, heights, bf, 10, means, steps)
 
     def is_step(j: int) -> bool:
