@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
+from collections.abc import Sequence
 from dataclasses import fields
 
 import numpy as np
@@ -166,6 +167,11 @@ class MapView:
     def landmarks_of(self, keyframe: KeyframeId) -> I32:
         """Slots of the landmarks that a keyframe observes, in order of id."""
         return self.sorted_by_id(self.keypoints.root[self.observations_of(keyframe)])
+
+    def landmarks_of_all(self, keyframes: Sequence[KeyframeId]) -> I32:
+        """Slots of the landmarks that any of some keyframes observes, in order of id."""
+        slots = np.concatenate([self.slots_of(keyframe) for keyframe in keyframes])
+        return self.sorted_by_id(self.keypoints.root[slots[self._is_valid(slots)]])
 
     def sorted_by_id(self, landmarks: I32) -> I32:
         """Unique landmarks in order of id, which does not depend on the order of arrival."""

@@ -12,7 +12,7 @@ from kiteline_basestation.config import BundleWindowConfig, MeasurementConfig
 from kiteline_basestation.map.map_tables import LANDMARK, NO_POSE
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.refinement.disparity_calibration import offsets
-from kiteline_core.ids import KeyframeId, agent_of_keyframe, submap_of_keyframe
+from kiteline_core.ids import BOOT_BITS, SEQUENCE_BITS, SUBMAP_BITS, AgentId, KeyframeId, submap_of_keyframe
 from kiteline_core.optimisation.bundle import BundleProblem
 
 F64 = NDArray[np.float64]
@@ -62,7 +62,7 @@ def bundle_window(
     table, keyframes = sparse_map.keypoints, sparse_map.keyframes
     submaps = sparse_map.submaps_of_map(submap_of_keyframe(free[0]))
     held = {sparse_map.submaps[s][0] for s in submaps} if held is None else held
-    points = sparse_map.sorted_by_id(np.concatenate([sparse_map.landmarks_of(k) for k in free]))
+    points = sparse_map.landmarks_of_all(free)
     _, known = sparse_map.positions(points)
     points = points[known]
     starts, slots = sparse_map.observations(points)
@@ -130,12 +130,13 @@ def measurements(sparse_map: SparseMap, slots: I32, config: MeasurementConfig) -
     rows = table.row[slots]
     has_depth = np.zeros(sparse_map.height, bool)
     sigma = np.full(sparse_map.height, config.sigma_disparity_px)
-    for row in np.unique(rows).tolist():
-        agent = agent_of_keyframe(KeyframeId(int(sparse_map.keyframes.id[row])))
-        camera = sparse_map.cameras.get(agent)
+    here = np.flatnonzero(np.bincount(rows, minlength=1))
+    agents = sparse_map.keyframes.id[here] >> (SEQUENCE_BITS + SUBMAP_BITS + BOOT_BITS)
+    for agent in map(AgentId, np.unique(agents).tolist()):
+        own, camera = here[agents == agent], sparse_map.cameras.get(agent)
         if agent in sparse_map.disparity_calibrated:
-            sigma[row] = _SIGMA_CALIBRATED_PX
-        has_depth[row] = camera is not None and (camera.stereo or agent in sparse_map.measures_depth)
+            sigma[own] = _SIGMA_CALIBRATED_PX
+        has_depth[own] = camera is not None and (camera.stereo or agent in sparse_map.measures_depth)
     ranged = (table.inv_depth[slots] > 0) & has_depth[rows]
     measured = np.empty((len(slots), 3))
     measured[:, :2] = table.uv[slots]

@@ -71,19 +71,19 @@ def with_odometry_factors(sparse_map: SparseMap, window: BundleWindow, config: O
         points.append(step.world)
         k, p = (step.k, step.in_k, of_camera[step.k]), (step.p, step.in_p, _NO_GROUP)
         (first, in_first, of_first), (second, in_second, of_second) = (p, k) if step.p < step.k else (k, p)
-        for i in range(len(step.world)):
-            camera += [first, second]
-            measured += [in_first[i], in_second[i]]
-            sigma += [[step.sigma_px, step.sigma_px]] * 2
-            group += [of_first, of_second]
-            terms += [step.terms[i]] * 2
+        n = len(step.world)
+        camera += [first, second] * n
+        measured.append(np.concatenate([in_first, in_second], axis=1).reshape(2 * n, 3))
+        sigma += [step.sigma_px] * (2 * n)
+        group += [of_first, of_second] * n
+        terms.append(np.repeat(step.terms, 2, axis=0))
     if not points:
         return problem
     added = np.concatenate(points)
     if border is not None:
-        groups = np.where(np.any(terms, axis=1), group, _NO_GROUP).astype(np.int32)
+        groups = np.where(np.any(own := np.concatenate(terms), axis=1), group, _NO_GROUP).astype(np.int32)
         border = replace(
-            border, group=np.concatenate([border.group, groups]), terms=np.concatenate([border.terms, np.array(terms)])
+            border, group=np.concatenate([border.group, groups]), terms=np.concatenate([border.terms, own])
         )
     return replace(
         problem,
@@ -92,8 +92,8 @@ def with_odometry_factors(sparse_map: SparseMap, window: BundleWindow, config: O
             [problem.starts, problem.starts[-1] + 2 * np.arange(1, len(added) + 1, dtype=np.int32)]
         ).astype(np.int32),
         camera=np.concatenate([problem.camera, np.array(camera, np.int32)]),
-        measured=np.concatenate([problem.measured, np.array(measured)]),
-        sigma=np.concatenate([problem.sigma, np.array(sigma)]),
+        measured=np.concatenate([problem.measured, *measured]),
+        sigma=np.concatenate([problem.sigma, np.repeat(np.array(sigma)[:, None], 2, axis=1)]),
         border=border,
     )
 

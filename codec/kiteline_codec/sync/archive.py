@@ -143,6 +143,16 @@ class Archive:
             spill.free(written.where, written.n_bytes)
         return spill.put(b"".join(r.code or b"" for r in rows))
 
+    def peek(self, id_: int, kind: int, part: int) -> tuple[int, bytes] | None:
+        """Version and code of a value of a packed page, which stays as it is; None if the page lacks it."""
+        page, at = self._pages[id_], 0
+        assert page.packed is not None
+        for found, number, version, size, _ in _ROW.iter_unpack(page.rows):
+            if found == kind and number == part:
+                return version, page.packed[at : at + size]
+            at += size
+        return None
+
     def take(self, id_: int) -> list[Row]:
         """Remove a page and return its values. Codes are None if they are not kept or cannot be read."""
         page = self._pages.pop(id_)

@@ -121,7 +121,8 @@ class Inbox:
         """resident_bytes: memory for values of keyframes that are at hand, roughly; None: all are."""
         self._values: dict[Key, tuple[int, bytes]] = {}
         self._hashed: dict[Key, int] = {}  # parts of the digest, of values that were not archived since they came
-        self._archive = Archive(spill, packed=spill is None)
+        self._packed = spill is None  # archived values stay in memory, where one can be read by itself
+        self._archive = Archive(spill, packed=self._packed)
         self._resident = ResidentValues(resident_bytes, VALUE_BYTES)
         self.digest = Digest()
         self.value_bytes = 0  # of codes
@@ -138,12 +139,20 @@ class Inbox:
 
     def held(self, key: Key) -> tuple[int, bytes] | None:
         """Version and code of a value, None when there is none."""
-        held = self._values.get(key)
-        if held is None and key.kind in KEYFRAME_KINDS and key.id in self._archive:  # archived are all values of an id
+        if self._is_archived(key) and self._packed:
+            return self._archive.peek(key.id, key.kind, key.part)
+        return self._fetched(key)
+
+    def _is_archived(self, key: Key) -> bool:
+        """True if the values of the key's id are in the archive: all of them, or none."""
+        return key.kind in KEYFRAME_KINDS and key.id in self._archive
+
+    def _fetched(self, key: Key) -> tuple[int, bytes] | None:
+        """Version and code of a value, which is not in the archive then."""
+        if self._is_archived(key):
             self._fetch(key.id)
             self._make_room(key.id)
-            held = self._values.get(key)
-        return held
+        return self._values.get(key)
 
     def codes(self) -> dict[Key, bytes]:
         """The codes of all values."""
@@ -216,7 +225,7 @@ class Inbox:
         """Take in an item. Returns the value that changed, if any."""
         key, version = item.key, item.version
         self.newest = max(self.newest, version)
-        held = self.held(key)
+        held = self._fetched(key)
         known = held[0] if held is not None else max(self._removed.get(key, 0), self.watermark)
         if version <= known:
             return None

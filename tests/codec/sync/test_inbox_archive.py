@@ -117,3 +117,19 @@ def test_without_a_spill_old_values_are_packed() -> None:
     line.settle()
     assert line.b.peer_values() == line.a.own_values()
     assert line.b.stats.mismatches == line.a.stats.mismatches == 0
+
+
+def test_values_are_read_where_they_are_packed() -> None:
+    """After a full bundle hundreds of corrections are predicted from old values: none of those moves for that."""
+    line = Line(None)
+    for keyframe in range(60):
+        line.say(keyframe)
+    inbox = line.b._in
+    packed = list(inbox._archive)
+    assert len(packed) > 20
+    own = line.a.own_values()
+    assert all(line.b.peer_value(key) == code for key, code in own.items())
+    assert line.b.peer_value(Key(RefinedLandmarks.KIND, packed[0], 7)) is None
+    assert list(inbox._archive) == packed
+    line.say(packed[0])  # a new version of one that is packed
+    assert line.b.peer_values() == line.a.own_values()
