@@ -24,6 +24,7 @@ from kiteline_hw.sources.kinds import source_table
 
 EXIT_ERROR = 2  # as argparse uses for a wrong command line
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells report it
+_WHILE_WRITING = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)  # such errors of a disk name no file
 _IMPORTER = "<frozen importlib._bootstrap>"  # the file of frames that load a module
 
 # Which extra brings a package that the plain install leaves out.
@@ -156,9 +157,10 @@ def explanation(error: Exception) -> str | None:
     if isinstance(error, ModuleNotFoundError) and (error.name or "").split(".")[0] in EXTRAS:
         extra = EXTRAS[(error.name or "").split(".")[0]]
         return f"{error.name} is not installed; this needs: pip install 'kiteline[{extra}]'"
-    if isinstance(error, OSError) and error.filename is not None:
+    if isinstance(error, OSError) and (error.filename is not None or error.errno in _WHILE_WRITING):
         mend = _MENDS.get(error.errno or 0)
-        return f"{error.filename}: {error.strerror}" + (f": {mend}" if mend else "")
+        named = "" if error.filename is None else f"{error.filename}: "
+        return f"{named}{error.strerror}" + (f": {mend}" if mend else "")
     return None
 
 

@@ -69,6 +69,7 @@ def test_arguments_after_the_command_are_handed_on_untouched(monkeypatch: pytest
         (FileNotFoundError(2, "No such file or directory", "gone.tum"), "gone.tum: No such file or directory"),
         (NotADirectoryError(20, "Not a directory", "out.txt/base"), "a file stands where a folder is expected"),
         (PermissionError(13, "Permission denied", "/root/out"), "name another place"),
+        (OSError(28, "No space left on device"), "No space left on device: free some"),  # a write names no file
         (ModuleNotFoundError("No module named 'matplotlib'", name="matplotlib.figure"), "pip install 'kiteline[lab]'"),
     ],
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections import deque
 from collections.abc import Callable
@@ -16,6 +17,7 @@ from kiteline_agent.config import AgentConfig
 from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_agent.governor.cost_model import cost_ns
 from kiteline_agent.governor.virtual_cpu import VirtualCpu
+from kiteline_agent.known_rig import KnownRigConfig
 from kiteline_agent.onboard import onboard_agent
 from kiteline_agent.runtime.camera_reader import CameraReader
 from kiteline_agent.runtime.flight_log import STEP
@@ -77,6 +79,7 @@ class AgentRuntime:
         grid = "agent" if options.grid == "base" and isinstance(channel, NoBaseChannel) else options.grid
         config = config or agent_config(options.config, options.cpu_percent, options.rig, grid, options.tracker)
         self._rig_file = RigFile(options.rig) if options.rig else None
+        self._saving: threading.Thread | None = None  # what writes the rig file
         begin_ns = time.process_time_ns()
         codec_warm.warm()
         warm(config)
@@ -301,15 +304,25 @@ class AgentRuntime:
         return self._notices.take()
 
     def _save_rig(self) -> None:
-        if self._rig_file is not None:
-            try:
-                self._rig_file.save(self.agent.known_rig())
-            except ConfigError as error:
-                self._notices.say("rig", f"rig: {error}")
+        """Write the rig file in a thread, for a flight cannot wait for a disk; nothing while the last one writes."""
+        if self._rig_file is not None and not (self._saving and self._saving.is_alive()):
+            known = self.agent.known_rig()
+            self._saving = threading.Thread(target=self._write_rig, args=(known,), name="rig-file", daemon=True)
+            self._saving.start()
+
+    def _write_rig(self, known: KnownRigConfig | None) -> None:
+        assert self._rig_file is not None
+        try:
+            self._rig_file.save(known)
+        except ConfigError as error:
+            self._notices.say("rig", f"rig: {error}")
 
     def close(self) -> None:
         """Finish the files."""
-        self._save_rig()
+        if self._saving is not None:
+            self._saving.join()
+        if self._rig_file is not None:
+            self._write_rig(self.agent.known_rig())
         self._files.close()
 
 

@@ -48,20 +48,23 @@ def load(path: str) -> KnownRigConfig:
 
 
 class RigFile:
-    """Keeps a rig file up to date. A cut write leaves the old file."""
+    """Keeps a rig file up to date. A write that is cut, also by a loss of power, leaves the old file."""
 
     def __init__(self, path: str) -> None:
         self._path = Path(path)
         self._written = ""
 
     def save(self, known: KnownRigConfig | None) -> None:
-        """Write what is known, if that changed. Raises ConfigError if the file cannot be written."""
+        """Write what is known, if that changed, and wait for the disk. Raises ConfigError if it cannot be written."""
         if known is None or (text := text_of(known)) == self._written:
             return
         part = self._path.with_name(f".{self._path.name}.part")
         try:
             self._path.parent.mkdir(parents=True, exist_ok=True)
-            part.write_text(text, encoding="utf-8")
+            with part.open("w", encoding="utf-8") as file:
+                file.write(text)
+                file.flush()
+                os.fsync(file.fileno())  # else its name may be on the disk before its content: an empty file
             os.replace(part, self._path)
         except OSError as error:
             raise ConfigError(f"{self._path}: cannot write the rig file ({error})") from error

@@ -16,6 +16,7 @@ from pathlib import Path
 
 from kiteline_core.ids import MAX_AGENTS
 from kiteline_hw.ports import LinkError
+from kiteline_hw.system.process import sync_folder
 
 KEY_BYTES = 32
 MAPS = "maps"
@@ -198,6 +199,7 @@ def _write(path: Path, keys: Keys) -> None:
             _keep_owner(path, fd)
             os.fsync(out.fileno())
         os.replace(new, path)
+        sync_folder(path.parent)  # agents are paired with these keys from now on
     except OSError as error:
         raise LinkError(f"cannot write keys to {path}: {error.strerror or error}; name another file") from error
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import os
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import Any
 from pymavlink.dialects.v20 import common
 
 from kiteline_hw.ports import LinkError
+from kiteline_hw.system.process import write_atomically
 
 _EPOCH_S = 1420070400  # s: 1 January 2015, at which stamps begin
 _TICKS = 100_000  # stamps count 10 us
@@ -50,14 +50,8 @@ class StampFile:
         """Store a stamp ahead of `stamp`, unless the stored one is ahead of it already. Raises LinkError."""
         if stamp < self._reserved - _AHEAD // 2:
             return
-        part = self._path.with_name(f".{self._path.name}.part")
         try:
-            self._path.parent.mkdir(parents=True, exist_ok=True)
-            with part.open("w", encoding="ascii") as file:
-                file.write(str(stamp + _AHEAD))
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(part, self._path)
+            write_atomically(self._path, str(stamp + _AHEAD).encode())
         except OSError as error:
             raise LinkError(f"{self._path}: cannot keep the stamp of MAVLink's signatures ({error})") from error
         self._reserved = stamp + _AHEAD

@@ -1,0 +1,48 @@
+"""Small files that outlive a process are whole, and the newest, after a loss of power: content first, then its name."""
+
+from __future__ import annotations
+
+import os
+import stat
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from kiteline_agent.known_rig import KnownRigConfig
+from kiteline_agent.runtime.rig_file import RigFile
+from kiteline_hw.mavlink.transport.signing import StampFile
+from kiteline_hw.system import key_store
+from kiteline_hw.system.process import write_atomically
+
+# What writes a file, and whether an older one may come back: what the rig file knew before does no harm.
+WRITERS: list[tuple[Callable[[Path], object], bool]] = [
+    (lambda path: RigFile(str(path)).save(KnownRigConfig(rows_px=(0.5, 0.0, 0.0, 0.0, 0.0))), True),
+    (lambda path: StampFile(path, lambda: 2e9), False),
+    (lambda path: key_store.new_key(path, 3), False),
+    (lambda path: write_atomically(path, b"7"), False),
+]
+
+
+@pytest.mark.parametrize(("write", "may_come_back"), WRITERS, ids=["rig", "stamp", "keys", "number"])
+def test_the_content_is_on_the_disk_before_the_name(
+    write: Callable[[Path], object], may_come_back: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    done: list[str] = []
+    fsync, replace = os.fsync, os.replace
+
+    def noted_fsync(fd: int) -> None:
+        done.append("folder" if stat.S_ISDIR(os.fstat(fd).st_mode) else f"{os.fstat(fd).st_size} bytes")
+        fsync(fd)
+
+    def noted_replace(a: Path, b: Path) -> None:
+        done.append("name")
+        replace(a, b)
+
+    monkeypatch.setattr(os, "fsync", noted_fsync)
+    monkeypatch.setattr(os, "replace", noted_replace)
+    path = tmp_path / "file"
+    write(path)
+    content = f"{path.stat().st_size} bytes"
+    assert content != "0 bytes"
+    assert done == [content, "name"] if may_come_back else done == [content, "name", "folder"]
