@@ -46,10 +46,7 @@ class OdometerConfig:
     floor_m_s: float = 0.02  # velocity error that no device states: its axes, its place, its stamps
     floor_rad_s: float = 0.005  # the same of a rotation rate
     aligned: float = 0.9  # least cosine between both displacements for their lengths to be compared
-    scale_walk: float = 0.003  # relative, per sqrt(s): load and temperature change
-    rise: float = 0.5  # weight of such an error: a slip is detected within 0.2 s
     tolerance_m_s: float = 0.12  # noise above which it is not used; that of a good one is 0.05
-    settled: float = 0.4  # share of a rejected jump below which the velocity must fall before it is used again
     accel_m_s2: float = 2.0  # acceleration of the constant-velocity model: leaning by twelve degrees
     turn_rad_s2: float = 4.0  # the same about the body's axes: a small multicopter that tilts
     unit_wait_s: float = 20.0  # s for which poses wait for that scale; then they are given in a unit of their own
@@ -69,7 +66,6 @@ class StereoConfig:
 
     min_depth_m: float = 0.25  # m: nearest surface; bounds the search along the row
     search_px: float = 3.0  # px of the level: range around the predicted disparity
-    iterations: int = 6  # Gauss-Newton steps; it converges in 3
     points: int = 240  # disparities measured in a frame, spread over the landmarks found; 0: none
     sigma_px: float = 0.25  # px at octave 0: standard deviation of a disparity
 
@@ -93,7 +89,6 @@ class AlignConfig:
 class PoseConfig:
     """Motion-only optimisation."""
 
-    rounds: int = 3  # outliers are chosen anew after each
     iterations: int = 4  # Gauss-Newton steps a round
     chi2: float = 9.21  # 99 % of a chi-square with 2 degrees of freedom
     min_inliers: int = 15  # with fewer a pose is not trusted
@@ -112,7 +107,6 @@ class KeyframeConfig:
     min_cover: float = 0.45  # share of coarse image cells that hold a tracked landmark
     baseline_ratio: float = 0.12  # translation over median depth: new views of the same scene
     rotation_rad: float = 0.30  # rad: a rotation that has replaced a quarter of the view
-    thin: float = 3.0  # times the fewest inliers of a pose; with fewer a keyframe does not wait for CPU time
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,13 +121,6 @@ class LocalMapConfig:
     camera_px: float = 1.0  # px by which corrections move the camera in its own image, to be taken over (stereo)
     inertial_px: float = 2.0  # the same of an agent whose IMU runs: its poses err half as much, the base's do not
     first_points: int = 40  # landmarks with depth that the first keyframe of a submap needs
-
-
-@dataclass(frozen=True, slots=True)
-class DepthFilterConfig:
-    """How observations sharpen a landmark's depth until the base sends a better one."""
-
-    inflation: float = 6.0  # factor on variances: successive observations share the template's error
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,13 +145,9 @@ class DepthFromMotionConfig:
 
     per_frame: int = 150  # seeds searched in a frame; each costs about 10 us
     nearer: float = 2.0  # times the inverse depth of the nearest twentieth of the landmarks: end of the search
-    reach: float = 2.5  # standard deviations of inverse depth that are searched
-    step_px: float = 0.7  # px of the level between two tries: half the width of the correlation peak
-    distinct: float = 0.93  # share of the best correlation that nothing else on the segment may reach
     off_line_px: float = 1.5  # px at octave 0 between the aligned pixel and the epipolar line
     gate: float = 3.0  # standard deviations between measured and held inverse depth
     sigma_px: float = 0.5  # px: standard deviation of an aligned pixel, with the pose's own error
-    inflation: float = 2.0  # factor on variances: successive frames share the template's error
     known: float = 0.12  # deviation over inverse depth below which a seed becomes a landmark
     min_hits: int = 3  # frames that agree
     max_misses: int = 6  # frames without a match: it moved, or was an occlusion edge
@@ -178,15 +161,10 @@ class DisparityConfig:
     every: int = 4  # frames between two pairs: each costs a quarter of a millisecond
     points: int = 120  # most of them that are used
     sigma_px: float = 0.3  # px at octave 0; of aligned coordinates and disparities
-    inflation: float = 2.0  # of variance: templates and lens errors are common to neighbouring points
-    iterations: int = 3  # Gauss-Newton steps; two converge from a scale that is off by a tenth
     growth: float = 1.2  # of the parallax between two pairs of the same keyframe
     good_px: float = 0.1  # px; standard deviation of all terms of a good calibration
     worn_share: float = 0.2  # probability of a worn rig before the flight
     sure: float = 0.95  # the same, above which the offset is applied
-    refuted: float = 5.0  # log likelihood without earlier flights over that with them, from which those are dropped
-    least_px: float = 0.2  # px, rms over the image; of an offset that is applied: good calibrations have a tenth
-    min_sideways: float = 0.2  # share of the motion across the optical axis below which errors of a lens pass for such
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,8 +179,6 @@ class RelocalisationConfig:
     min_inliers: int = 30  # of the tracker from that pose
     min_share: float = 0.4  # of the landmarks the tracker searched for; a place that only looks similar has fewer
     dead_reckoning_m: float = 0.08  # m: standard deviation up to which dead reckoning extends the map; below good_m
-    failures: int = 2  # failed searches in frames with texture before a new submap is opened
-    agree_rad: float = 0.035  # rad: rotation between two results beside a new submap, 2 degrees
 
 
 @dataclass(frozen=True, slots=True)
@@ -305,7 +281,6 @@ class AgentConfig:
     pose: PoseConfig = field(default_factory=PoseConfig)
     keyframe: KeyframeConfig = field(default_factory=KeyframeConfig)
     local_map: LocalMapConfig = field(default_factory=LocalMapConfig)
-    depth_filter: DepthFilterConfig = field(default_factory=DepthFilterConfig)
     inertial: InertialConfig = field(default_factory=InertialConfig)
     controller_imu: ControllerImuConfig = field(default_factory=ControllerImuConfig)
     odometer: OdometerConfig = field(default_factory=OdometerConfig)

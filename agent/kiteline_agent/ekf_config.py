@@ -14,16 +14,8 @@ class EkfConfig:
     sigma_px: float = 1.0  # deviation of a tracked pixel: templates err by a tenth, but alike over frames
     walk_px: float = 0.4  # px per sqrt(px of parallax): templates err by 0.6 % of the parallax, alike over frames
     gate: float = 10.6  # squared deviations of a pixel beyond which a match is wrong: 0.5 % of right ones
-    seeds: int = 6  # matches with which a compatible set is begun before the largest set is taken
-    agree: float = 0.6  # share of the matches in a set at which no other set is tried
-    updated: int = 16  # landmarks that one frame updates at most: bounds its cost
     residual_gate: float = 2.0  # chi-square over its degrees of freedom above which its rays do not meet
-    ended: int = 6  # tracks lost before they were landmarks that correct the views at one frame at most
-    entries: int = 6  # landmarks that enter at one frame at most
-    in_view: int = 45  # landmarks in view from which no more enter: the state is kept for what is seen next
-    misses: int = 4  # rejected matches in excess of the good ones after which a landmark is dropped
     scale_sigma: float = 0.01  # relative deviation of the odometry's scale, constant over a flight
     path_noise: float = 0.02  # m per sqrt(m) of way: the odometry's white error, along each axis
     turn_noise: float = 0.005  # rad per sqrt(m) of way: the same of the heading
     corners: int = 120  # followed in the image at most
-    replenish: float = 0.75  # share of them below which new ones are searched

@@ -27,6 +27,7 @@ U8 = NDArray[np.uint8]
 _BORDER_PX = 8.0  # a window of the flow and its gradients lie inside
 _WINDOW_PX = 21  # px of the flow's window
 _SLIDE_PX = 3.0  # px of its octave between the flow and a corner's template at most
+_REPLENISH = 0.75  # share of the option `corners` below which new ones are searched
 
 
 class CornerFlow:
@@ -74,7 +75,7 @@ class CornerFlow:
 
     def replenish(self, left: Pyramid, T_o_c: F64) -> None:
         """Find new corners where few are left."""
-        if len(self.ids) >= self._config.replenish * self._config.corners:
+        if len(self.ids) >= _REPLENISH * self._config.corners:
             return
         found = features.detect(left, self.uv, self._detector)
         n = min(len(found.uv), self._config.corners - len(self.ids))

@@ -37,6 +37,11 @@ _DEPTH_SHARE = (
 _ENDED_RAYS = (
     5  # rays of an ended track that correct the views: seven equations each, the cost of as many landmarks in view
 )
+_UPDATED = 16  # landmarks that one frame updates at most: bounds its cost
+_ENDED_TRACKS = 6  # tracks lost before they were landmarks that correct the views at one frame at most
+_ENTRIES = 6  # landmarks that enter at one frame at most
+_IN_VIEW = 45  # landmarks in view from which no more enter: the state is kept for what is seen next
+_MISSES = 4  # rejected matches in excess of the good ones after which a landmark is dropped
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +93,7 @@ class EkfSlam:
         fresh = np.flatnonzero(slots < 0)
         entered: I64 = np.zeros(0, np.int64)
         if self._is_view_due():
-            if int(good.sum()) < self._config.in_view:  # else the landmarks tell enough
+            if int(good.sum()) < _IN_VIEW:  # else the landmarks tell enough
                 entered = self._enter(ids[fresh], xy[fresh], coarse[fresh], self._ended(ids))
             self._tracks.keep(ids)
             self._add_view(ids[fresh], xy[fresh], coarse[fresh])
@@ -128,14 +133,14 @@ class EkfSlam:
             # Those that waited longest: all that are in view get their turn.
             waiting = np.flatnonzero(fits)
             order = np.argsort(self._updated_at[found.slots[waiting]], kind="stable")
-            chosen = np.sort(waiting[order[: self._config.updated]])
+            chosen = np.sort(waiting[order[:_UPDATED]])
             self._updated_at[found.slots[chosen]] = self._frame
             part = landmark_update.Innovation(found.slots[chosen], found.residual[chosen], found.M[chosen])
             landmark_update.update(self.state, part, self._sigma)
         self._good[slots[good]] += 1
         self._bad[slots[bad]] += 1
         self._seen_at[slots[good]] = self._frame
-        for slot in slots[bad][self._bad[slots[bad]] - self._good[slots[bad]] > self._config.misses].tolist():
+        for slot in slots[bad][self._bad[slots[bad]] - self._good[slots[bad]] > _MISSES].tolist():
             self.forget(int(self._ids[slot]))
         return good, bad
 
@@ -188,7 +193,7 @@ class EkfSlam:
         order = np.argsort(-parallax, kind="stable")
         enough = (parallax > _PARALLAX_RAD) & (seen.sum(axis=1) >= _LEAST_RAYS)
         out = []
-        for k in order[enough[order]][: config.entries].tolist():
+        for k in order[enough[order]][:_ENTRIES].tolist():
             views = np.flatnonzero(seen[k, :-1])
             sightings = points[k, np.append(views, config.views)]
             out.append((int(known[k]), Track(views, sightings, self._sigma * float(coarse[known[k]]))))
@@ -196,26 +201,26 @@ class EkfSlam:
 
     def _may_enter(self, track: Track) -> bool:
         """True if the rays of a track meet, and tell its distance."""
-        state, config = self.state, self._config
+        state = self.state
         rays = linearised(state, track, state.T_o_c, state.view_T_o_c)
-        if rays is None or not rays_meet(state, rays, config.residual_gate):
+        if rays is None or not rays_meet(state, rays, self._config.residual_gate):
             return False
         return distance_share(state, rays) <= _DEPTH_SHARE
 
     def _ended(self, ids: I64) -> list[Track]:
         """Tracks that are followed no more, were seen often enough, and whose rays meet. ids: (n,) followed ones."""
-        tracks, config = self._tracks, self._config
+        tracks = self._tracks
         ended = np.flatnonzero(~np.isin(tracks.ids, ids))
         out: list[Track] = []
         for row in ended[tracks.seen[ended].sum(axis=1) >= _LEAST_RAYS].tolist():
-            if len(out) == config.ended:
+            if len(out) == _ENDED_TRACKS:
                 break
             views = np.flatnonzero(tracks.seen[row])
             views = views[np.argsort(self._view_way[views], kind="stable")]
             views = views[np.unique(np.linspace(0, len(views) - 1, _ENDED_RAYS).round().astype(np.int64))]
             track = Track(views, tracks.xy[row, views], self._sigma * float(tracks.coarse[row]))
             rays = linearised(self.state, track, self.state.T_o_c, self.state.view_T_o_c)
-            if rays is not None and rays_meet(self.state, rays, config.residual_gate):
+            if rays is not None and rays_meet(self.state, rays, self._config.residual_gate):
                 out.append(track)
         return out
 

@@ -15,6 +15,9 @@ F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
+_FIRST_MATCHES = 6  # matches with which a compatible set is begun before the largest set is taken
+_AGREE = 0.6  # share of the matches in a set at which no other set is tried
+
 
 @dataclass(frozen=True, slots=True)
 class Innovation:
@@ -62,13 +65,13 @@ def compatible(state: FilterState, found: Innovation, sigma: float, config: EkfC
     order = order[alone[order] <= config.gate]
     L, white, taken = np.zeros((2 * m, 2 * m)), np.zeros(2 * m), np.zeros(m, np.int64)
     best: Bools = np.zeros(m, np.bool_)
-    for seed in range(min(config.seeds, len(order))):
+    for seed in range(min(_FIRST_MATCHES, len(order))):
         begun = np.concatenate([order[seed : seed + 1], order[:seed], order[seed + 1 :]])
         count = kernels.compatible_set(S, residual, begun, config.gate, L, white, taken)
         if count > best.sum():
             best = np.zeros(m, np.bool_)
             best[taken[:count]] = True
-        if count >= config.agree * m:
+        if count >= _AGREE * m:
             break
     return best
 

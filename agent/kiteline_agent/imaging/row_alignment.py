@@ -35,6 +35,8 @@ _SIGMA_SHARE = 0.3  # of the standard deviations by sigma_px: what estimates of 
 _GOOD_PX = 0.1  # px; standard deviation of level, slope along x and x y with a good calibration
 _WORN_SLOPE_PX = 0.3  # px where x is 1; of the slope along x: the mount is twisted by 0.04 degrees
 _WORN_TURN_PX = 0.6  # px where x y is 1; of x y: it is turned about y by 0.07 degrees
+_ITERATIONS = 10  # Gauss-Newton steps; it converges in 4 from 1 px
+_SHOWN_SHARE = 0.7  # share of worn rigs whose rows are off; focal lengths do not move them
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,9 +45,7 @@ class RowConfig:
 
     on: bool = True  # False: the right image is read where the calibration says
     sigma_px: float = 0.5  # px at octave 0; of a measured offset, with what points of a keyframe have in common
-    iterations: int = 10  # Gauss-Newton steps; it converges in 4 from 1 px
     worn_px: float = 0.9  # px; standard deviation of the level with a worn rig: both centres moved
-    shown: float = 0.7  # share of worn rigs whose rows are off; focal lengths do not move them
 
 
 def terms(xy: F64) -> F64:
@@ -88,7 +88,7 @@ class RowAlignment:
         offset, found = np.zeros(len(uv)), np.zeros(len(uv), np.bool_)
         row_kernels.measure_rows(
             left, right, np.zeros((0, 0, 2), np.float32) if grid is None else grid, uv, octave, disparity,
-            config.iterations, _MAX_PX, _MIN_NCC, offset, found,
+            _ITERATIONS, _MAX_PX, _MIN_NCC, offset, found,
         )  # fmt: skip
         count = int(np.count_nonzero(found))
         if count < _MIN_POINTS:
@@ -175,7 +175,7 @@ class RowAlignment:
         cov = _SIGMA_SHARE**2 * np.linalg.inv(self._information)[np.ix_(at, at)]
         self.roll_px = math.sqrt(float(found[1] ** 2 + cov[1, 1]))
         good, worn = (_log_normal(found, cov + np.diag(np.square(s))) for s in (np.full(len(at), _GOOD_PX), worn_px))
-        self.worn_evidence = float(np.logaddexp(math.log1p(-c.shown), math.log(c.shown) + worn - good))
+        self.worn_evidence = float(np.logaddexp(math.log1p(-_SHOWN_SHARE), math.log(_SHOWN_SHARE) + worn - good))
 
     def _read_at(self, rows_px: F64) -> None:
         self.applied_px = rows_px

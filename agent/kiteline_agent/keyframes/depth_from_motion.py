@@ -30,6 +30,11 @@ _MAX_STEPS = 40  # tries on an epipolar segment; longer ones are searched on a s
 _MIN_SEARCH_NCC = 0.7  # correlation at a try, up to half a step from the peak
 _FAR_SHARE = 0.4  # of the typical inverse depth: the option `known` counts from there for farther landmarks
 _MAX_TRIES = 60  # frames in view without a depth
+_FILTER_INFLATION = 6.0  # factor on variances of tracked landmarks: successive observations share the template's error
+_REACH = 2.5  # standard deviations of inverse depth that are searched
+_STEP_PX = 0.7  # px of the level between two tries: half the width of the correlation peak
+_DISTINCT = 0.93  # share of the best correlation that nothing else on the segment may reach
+_INFLATION = 2.0  # factor on variances of seeds: successive frames share the template's error
 
 
 class DepthFromMotion:
@@ -44,7 +49,7 @@ class DepthFromMotion:
         """Count tries and hits of the tracked landmarks, and update their depths."""
         self._map.note_tracking(track.rows, track.inlier, ctx.number)
         self._map.update_depths(
-            track.T_c_m, track.rows, track.inlier, track.observed, track.sigma_px, ctx.config.depth_filter.inflation
+            track.T_c_m, track.rows, track.inlier, track.observed, track.sigma_px, _FILTER_INFLATION
         )
 
     def search_seeds(self, ctx: FrameContext, track: Track) -> int:
@@ -68,7 +73,7 @@ class DepthFromMotion:
         direction, centre = np.empty((2, n, 3))
         start, end = np.empty((2, n, 2))
         kernels.seed_segments(
-            track.T_c_m, m.intrinsics, rows, m.T_m_k, m.bearing, rho, sigma, config.reach, ceiling,
+            track.T_c_m, m.intrinsics, rows, m.T_m_k, m.bearing, rho, sigma, _REACH, ceiling,
             direction, centre, start, end,
         )  # fmt: skip
         uv, found = self._search(images, rows, warp, start, end)
@@ -97,12 +102,12 @@ class DepthFromMotion:
 
     def _search(self, images: FrameImages, rows: I64, warp: F64, start: F64, end: F64) -> tuple[F64, NDArray[np.int8]]:
         """Find the templates: correlation along the segment, then alignment. Pixels (n,2), found (n,) 1 or 0."""
-        config, align = self._config.depth_from_motion, self._config.align
+        align = self._config.align
         octave = self._map.octave[rows]
         uv, found = np.zeros((len(rows), 2)), np.zeros(len(rows), np.int8)
         search_segments(
-            images.sampled, images.grid, self._map.templates, rows, octave, warp, start, end, config.step_px,
-            _MAX_STEPS, _MIN_SEARCH_NCC, config.distinct, uv, found,
+            images.sampled, images.grid, self._map.templates, rows, octave, warp, start, end, _STEP_PX,
+            _MAX_STEPS, _MIN_SEARCH_NCC, _DISTINCT, uv, found,
         )  # fmt: skip
         seen = (found == 1).nonzero()[0]
         place, aligned, ncc = uv[seen], np.zeros(len(seen), np.bool_), np.zeros(len(seen))
@@ -129,7 +134,7 @@ class DepthFromMotion:
         """Average inverse depths. Returns how many seeds are known well enough and became landmarks."""
         config = self._config.depth_from_motion
         rho, sigma = self._map.rho.reshape(-1), self._map.sigma_rho.reshape(-1)
-        variance = variance * config.inflation
+        variance = variance * _INFLATION
         prior = sigma[rows] ** 2
         rho[rows] = np.maximum((rho[rows] * variance + measured * prior) / (variance + prior), 1e-6)
         sigma[rows] = np.sqrt(variance * prior / (variance + prior))

@@ -32,6 +32,11 @@ _PRIOR_PX = 0.9  # px; standard deviation of a constant offset of a worn rig: bo
 _PRIOR_SLOPE_PX = 0.5  # px where x or y is 1; the same of the other terms
 _LEAST_CHANGE_PX = 0.04  # px, rms over the image; of a later change that is applied
 _ROWS_SURE = 0.99  # probability of a worn rig by rows alone, above which it is applied in any motion
+_INFLATION = 2.0  # factor on variances: templates and lens errors are common to neighbouring points
+_ITERATIONS = 3  # Gauss-Newton steps; two converge from a scale that is off by a tenth
+_REFUTED = 5.0  # log likelihood without earlier flights over that with them, from which those are dropped
+_LEAST_PX = 0.2  # px, rms over the image; of an offset that is applied: good calibrations have a tenth
+_MIN_SIDEWAYS = 0.2  # share of the motion across the optical axis below which errors of a lens pass for such
 
 
 class DisparityAlignment:
@@ -184,7 +189,7 @@ class DisparityAlignment:
         T, offset = T_c_m @ m.T_m_k[slot], self._estimate.copy()
         rho = np.maximum((disparity - terms(m.bearing[slot, index]) @ offset) / m.camera.bf, _LEAST_RHO)
         system, point = np.empty((kernels.UNKNOWNS, kernels.UNKNOWNS + 1)), np.empty((len(at), kernels.UNKNOWNS + 1))
-        for _ in range(config.iterations):
+        for _ in range(_ITERATIONS):
             kernels.linearise_pair(uv, disparity, sigma, seen, T, m.intrinsics, offset, rho, system, point)
             h, b = system[:, :-1].copy(), system[:, -1].copy()
             h[6:, 6:] += self._prior
@@ -198,7 +203,7 @@ class DisparityAlignment:
             offset = offset + step[6:]
         square = kernels.linearise_pair(uv, disparity, sigma, seen, T, m.intrinsics, offset, rho, system, point)
         to_pose = np.linalg.solve(system[:6, :6] + 1e-6 * np.eye(6), system[:6, 6:]).T
-        scale = config.inflation * max(square, 1.0)
+        scale = _INFLATION * max(square, 1.0)
         information = (system[6:, 6:-1] - to_pose[:TERMS] @ system[:6, 6:-1]) / scale
         side = (system[6:, -1] - to_pose[:TERMS] @ system[:6, -1]) / scale + information @ offset
         score = -float(np.trace(self._grid @ np.linalg.solve(information + self._prior, self._grid.T)))
@@ -214,13 +219,13 @@ class DisparityAlignment:
 
         What earlier flights found is dropped if the flight is likelier without it: the rig was repaired.
         """
-        config, good = self._config, self._good
+        good = self._good
         h, b = self._evicted_h + self._pair_h.sum(0), self._evicted_b + self._pair_b.sum(0)
         log_odds = self._prior_log_odds
         if self._earlier_h.any() and self._moves_sideways():
             worn, usual = _log_evidence(h, b, self._prior), _log_evidence(h, b, good)
             unknown = np.logaddexp(log_odds + worn, usual) - np.logaddexp(log_odds, 0.0)
-            if unknown - _log_evidence(h, b, self._prior + self._earlier_h, self._earlier_b) > config.refuted:
+            if unknown - _log_evidence(h, b, self._prior + self._earlier_h, self._earlier_b) > _REFUTED:
                 self._earlier_h, self._earlier_b = np.zeros_like(self._earlier_h), none()
                 self._refuted, self.applied = True, False
                 self._events.append("disparities are not those of the rig file: estimated anew")
@@ -247,7 +252,7 @@ class DisparityAlignment:
     def _moves_sideways(self) -> bool:
         """True if enough of the motion was across the optical axis: else errors of a lens pass for an offset."""
         moved = self._evicted_moved + self._moved.sum(0)
-        return bool(moved[:2].sum() >= self._config.min_sideways * moved.sum())
+        return bool(moved[:2].sum() >= _MIN_SIDEWAYS * moved.sum())
 
     def _rows_are_worn(self) -> bool:
         """True if the right camera's rows alone tell a worn rig: then what passes for an offset is one."""
@@ -264,7 +269,7 @@ class DisparityAlignment:
         """Change the offset of the map's disparities where the rig is worn, unless the base knows better."""
         if self._base_sigma_px is not None and self._base_sigma_px <= self.sigma_px:
             return None
-        config, offset = self._config, self._estimate
+        offset = self._estimate
         if not self._moves_sideways() and not self._rows_are_worn():
             return None
         if not self.applied and not self._is_sure():
@@ -272,7 +277,7 @@ class DisparityAlignment:
                 return None
             offset = none()
         change = offset - self._map.disparity_offset
-        least = _LEAST_CHANGE_PX if self.applied or self._refuted else config.least_px
+        least = _LEAST_CHANGE_PX if self.applied or self._refuted else _LEAST_PX
         if float(np.sqrt(np.mean((self._grid @ change) ** 2))) < least:
             return None
         self.applied, self._refuted, self._base_sigma_px = bool(offset.any()), False, None

@@ -21,6 +21,7 @@ F64 = NDArray[float64]
 
 _WAIT_RIGHT_S = 0.26  # s that a keyframe waits for a lost right image: without it points have no depth
 _DEAD_RECKONING_RAD = 0.02  # rad: standard deviation up to which dead reckoning extends the map, a degree
+_THIN_TRACK = 3.0  # times the fewest inliers of a pose; with fewer a keyframe does not wait for CPU time
 
 
 class KeyframeStage:
@@ -45,7 +46,7 @@ class KeyframeStage:
         need = self._camera.reference.keyframe_need(ctx, track)
         if need is None:
             return []
-        urgent = track.inliers < ctx.config.keyframe.thin * ctx.config.pose.min_inliers
+        urgent = track.inliers < _THIN_TRACK * ctx.config.pose.min_inliers
         if not self._governor.may(Extra.KEYFRAME, urgent=urgent):
             return ["governor: keyframe postponed"]
         if not urgent and 0.0 < (ctx.t_ns - self._right_t_ns) * 1e-9 < _WAIT_RIGHT_S:

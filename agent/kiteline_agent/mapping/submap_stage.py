@@ -32,6 +32,7 @@ from kiteline_core.ids import NO_KEYFRAME, KeyframeId, SubmapId
 F64 = NDArray[np.float64]
 
 _TRACKED_M, _TRACKED_RAD = 0.005, 0.002  # deviations of a tracked frame to its reference keyframe
+_FAILURES = 2  # failed searches in frames with texture before a new submap is opened
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +84,7 @@ class SubmapStage:
         submaps = self._camera.submaps
         if not submaps.any:
             return True
-        tried = failed_searches >= ctx.config.relocalisation.failures
+        tried = failed_searches >= _FAILURES
         return tried and submaps.room and self._governor.may(Extra.SUBMAP)
 
     def open(self, ctx: FrameContext) -> OpenedSubmap | None:

@@ -34,12 +34,15 @@ _SCALE_SIGMA_M_S = 0.05  # m/s; expected noise of a window in the scale estimate
 _START_M_S = 0.08  # m/s; expected noise at the start, weighted as one window
 _START_RAD_S = 0.03  # rad/s; the same of the rotation rate
 _MEMORY_S = 3.0  # s; time constant of the noise estimate
-_UNUSUAL = 5.0  # times the expected squared error, above which the option `rise` applies
+_UNUSUAL = 5.0  # times the expected squared error, above which `_RISE` applies
 _TOLERANCE_SHARE = 0.10  # of the speed: noise above which an odometer is not used, beside tolerance_m_s
 _PROOFS = 3  # consecutive moving windows that must agree before an odometer is used
 _SURPRISE = 4.0  # deviations from the prediction above which a sample is rejected: 8 m/s^2
 _SEEN_M_S = 0.05  # m/s; error of the velocity between two frames placed by images
 _SEEN_RAD_S = 0.02  # rad/s; the same of the rotation rate
+_SCALE_WALK = 0.003  # relative change of the scale per sqrt(s): load and temperature
+_RISE = 0.5  # weight of such an unusual error: a slip is detected within 0.2 s
+_SETTLED = 0.4  # share of a rejected jump below which the velocity must fall before it is used again
 
 
 class Odometer:
@@ -179,7 +182,7 @@ class Odometer:
         """Kalman update of the velocity; False if the sample is rejected: a wheel slips or the sensor is dead."""
         update = self._updated_velocity(mean, prior)
         jump = float(np.linalg.norm(self.scale * mean.velocity - self._velocity))
-        if not update.accepted or jump > self._config.settled * self._jump > 0.0:
+        if not update.accepted or jump > _SETTLED * self._jump > 0.0:
             self._jump = max(self._jump, jump) if self.image_loss_s > 0.0 else 0.0
             return False
         self._jump = self._alone_s = 0.0
@@ -339,7 +342,7 @@ class Odometer:
         distance = float(np.sqrt(by_images @ by_images))
         self._speed = distance / dt
         square = float(by_odometer @ by_odometer)
-        self._scale_var += c.scale_walk**2 * dt
+        self._scale_var += _SCALE_WALK**2 * dt
         if square > _LEAST_MOVED_M**2:
             along = float(by_odometer @ by_images)
             # Over the part along the images' motion: the odometer's own noise in its square would shorten it.
@@ -361,9 +364,8 @@ class Odometer:
 
     def _filtered(self, before: float, square: float, dt: float) -> float:
         """Noise variance after a squared error, with a faster rise for unusual ones."""
-        c = self._config
         usual = max(1.0 - float(np.exp(-dt / _MEMORY_S)), 1.0 / (self._compared + 1.0))
-        share = max(usual, c.rise) if square > _UNUSUAL * before else usual
+        share = max(usual, _RISE) if square > _UNUSUAL * before else usual
         return before + share * (square - before)
 
 

@@ -37,6 +37,7 @@ _AMBIGUOUS_CANDIDATES = 2  # further places of the same submap that are tried; e
 _AMBIGUOUS_SHARE = 0.6  # of the inliers: with so many another place is as likely
 _AMBIGUOUS_RATIO = 0.2  # of the depth: difference up to which two results are the same place
 _AMBIGUOUS_RAD = 0.15  # rad: the same for the rotation
+_AGREE_RAD = 0.035  # rad: rotation between two results beside a new submap, 2 degrees
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,10 +139,9 @@ class Relocaliser:
         before, self._unconfirmed = self._unconfirmed, (found.submap, T_old_new)
         if before is None or before[0] != found.submap:
             return None
-        limits = self._config.relocalisation
         change = found.T_c_m @ T_old_new @ se3.inverse(before[1]) @ se3.inverse(found.T_c_m)  # at the camera
         angle = float(np.linalg.norm(se3.so3_log(change[:3, :3])))
-        if np.linalg.norm(change[:3, 3]) > _AGREE_RATIO * found.depth_m or angle > limits.agree_rad:
+        if np.linalg.norm(change[:3, 3]) > _AGREE_RATIO * found.depth_m or angle > _AGREE_RAD:
             return None
         self._join_until_ns = None
         return found

@@ -21,6 +21,7 @@ F64 = NDArray[np.float64]
 
 NO_GRID = np.zeros((0, 0, 2), np.float32)  # the image needs no rectification
 _MIN_NCC = 0.85  # correlation of the two patches; lower at occlusions and depth edges
+_ITERATIONS = 6  # Gauss-Newton steps; it converges in 3
 
 
 class RightImage:
@@ -68,7 +69,7 @@ class RightImage:
         disparity[wanted] = np.maximum(disparity[wanted] + offset[wanted], 0.0)
         stereo_kernels.refine_rows(
             left, left_grid, self.raw(), NO_GRID if grid is None else grid, uv, octave, sure,
-            config.iterations, search_px, _MIN_NCC, disparity, found,
+            _ITERATIONS, search_px, _MIN_NCC, disparity, found,
         )  # fmt: skip
         disparity[wanted] = np.maximum(disparity[wanted] - offset[wanted], 0.0)
 

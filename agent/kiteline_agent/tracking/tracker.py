@@ -24,6 +24,7 @@ _SURE_PX = 0.4  # px of the octave: deviation of the predicted disparity below w
 _COARSEST = 2  # template level at which the coarse pass begins
 _MARGIN_PX = 8.0  # nearer to the border a template hangs over the edge
 _COARSE_STEP_PX = 7.0  # px of the coarse level: half a template
+_ROUNDS = 3  # rounds of the pose optimisation: outliers are chosen anew after each
 
 
 class Tracker:
@@ -166,7 +167,7 @@ class Tracker:
         T, inlier = T_c_m.copy(), np.ones(n, np.bool_)
         xyz, ray = candidates.xyz.take(chosen, 0), candidates.ray.take(chosen, 0)
         inliers, rms = pose_kernels.optimise_pose(
-            T, xyz, ray, observed, sigma_px, self._map.intrinsics, pose.rounds, pose.iterations, pose.chi2, inlier
+            T, xyz, ray, observed, sigma_px, self._map.intrinsics, _ROUNDS, pose.iterations, pose.chi2, inlier
         )
         return Track(
             T_c_m=se3.orthonormalise(T), rows=candidates.rows[chosen], observed=observed, sigma_px=sigma_px,
