@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hmac
 import json
-from collections import OrderedDict
 from collections.abc import Callable
 from hashlib import blake2b
 from typing import Any
@@ -63,7 +62,8 @@ class QuestionGuard:
     def __init__(self, key: Callable[[], bytes | None], start: str) -> None:
         """key: that of the right, now; None if nobody has it. start: drawn at this start of the base."""
         self._key, self._start = key, start
-        self._taken: OrderedDict[str, int] = OrderedDict()  # nonces, and when they may be forgotten
+        self._taken: dict[str, int] = {}  # nonces, and when they may be forgotten
+        self._after_s = 0  # no question up to this time is taken: those whose nonces were forgotten are older
 
     def open(self, verb: str, text: str, now_s: int) -> str | None:
         """The question in a signed one; None for one that is not signed. Raises WireError for a wrong one,
@@ -86,10 +86,14 @@ class QuestionGuard:
                 "the question is signed with another key than this base's for maps: `kiteline maps --key FILE`, with "
                 "the file of its keys"
             )
-        while self._taken and next(iter(self._taken.values())) < now_s:
-            self._taken.popitem(last=False)
+        for old in [nonce for nonce, until_s in self._taken.items() if until_s < now_s]:
+            self._after_s = max(self._after_s, self._taken.pop(old) - _NEAR_S)
         if abs(now_s - t_s) > _NEAR_S:
             raise WireError(f"the question is of {t_s - now_s:+d} s from now: set the clocks of both machines")
+        if t_s <= self._after_s:
+            raise WireError(
+                "the base's clock was set back, and the question may have been asked before: restart the base"
+            )
         if nonce in self._taken or len(self._taken) >= _REMEMBERED:
             raise WireError("the question was asked before, or too many were asked")
         self._taken[nonce] = now_s + 2 * _NEAR_S

@@ -7,6 +7,7 @@ import pytest
 from kiteline_codec.coding.packing import WireError
 from kiteline_codec.sync.config import SyncConfig
 from kiteline_codec.sync.endpoint import Endpoint
+from kiteline_codec.transport import signed_question
 from kiteline_codec.transport.packet import PROTOCOL_VERSION
 from kiteline_codec.transport.seal import Direction, Opener, Sealer, Suite
 from kiteline_codec.transport.seal_watch import SealWatch, Trouble, notice, read_notice
@@ -156,6 +157,25 @@ def test_a_question_is_not_taken_by_another_start_of_the_base() -> None:
     moved = text.replace('"start": "first"', '"start": "second"')
     with pytest.raises(WireError, match="another key"):
         QuestionGuard(lambda: OURS, "second").open("delete", moved, 1020)
+
+
+def test_a_clock_that_is_set_back_brings_no_question_back() -> None:
+    guard = QuestionGuard(lambda: OURS, "a")
+    early = [sign(OURS, "delete", "{}", 1000, "n1", "a"), sign(OURS, "delete", "{}", 1300, "n2", "a")]
+    assert [guard.open("delete", text, 1000) for text in early] == ["{}", "{}"]
+    for n, now_s in enumerate(range(1601, 4000, 150)):  # those before are forgotten in turn
+        assert guard.open("delete", sign(OURS, "delete", "{}", now_s - 300, f"m{n}", "a"), now_s) == "{}"
+    for text in early:
+        with pytest.raises(WireError, match="set back"):
+            guard.open("delete", text, 1010)
+
+
+def test_questions_of_a_clock_that_was_ahead_are_forgotten_like_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(signed_question, "_REMEMBERED", 5)
+    guard = QuestionGuard(lambda: OURS, "a")
+    assert guard.open("list", sign(OURS, "list", "{}", 10**6, "ahead", "a"), 10**6) == "{}"
+    for now_s in range(1000, 9000, 400):
+        assert guard.open("list", sign(OURS, "list", "{}", now_s, f"{now_s}", "a"), now_s) == "{}"
 
 
 @pytest.mark.parametrize("agent", [0, 5, 63, 255])
