@@ -416,6 +416,24 @@ def test_a_far_view_frees_alone_what_lies_well_before_its_obstacle_and_two_what_
     assert at(grid, end - 0.15, 0.0) == 0
 
 
+def test_a_far_view_of_ground_that_ends_before_no_obstacle_frees_alone_nearly_up_to_its_end() -> None:
+    bf, end = 48.0, 5.0
+    bare = ColumnScan(
+        np.array([0.0, -1.0, 0.0]), -0.7 + 0.01, 0.02, np.full(70, 1.0), np.full(70, end), np.full(70, np.inf),
+        np.zeros(70, np.uint8), np.zeros(70), HEIGHT_M,
+    )  # fmt: skip
+    found = keep(CONFIG, bare, bf)
+    assert found is not None
+    grid = ScanGrid(CONFIG)
+    grid.put(0, found, camera(0.0, 0.0, 0.0))
+    row = np.concatenate([grid.log_odds(Place(0, 0, k))[0, 1] for k in range(2)])
+    columns = (np.arange(128) + 0.5) * CONFIG.cell_m
+    sure = end - CONFIG.open_sigmas * CONFIG.sigma_px / bf * end**2
+    assert (row[(columns > found.accurate_m(CONFIG) + 0.1) & (columns < sure - 0.06)] == -CONFIG.log_free_sure).all()
+    assert (row[(columns > sure + 0.06) & (columns < end - 0.06)] == -CONFIG.log_free_far).all()
+    assert sure > end - CONFIG.sure_sigmas * CONFIG.sigma_px / bf * end**2 + 0.1
+
+
 @given(st.floats(0.0, 1.2), st.floats(1.0, 2.2))
 def test_a_wall_that_is_seen_aslant_is_drawn_as_a_line(turn: float, far_m: float) -> None:
     """Columns are wider than cells, and the range of such a wall changes within one."""

@@ -82,7 +82,8 @@ def sectors_of(config: GridConfig, scan: KeptScan, lattice: Lattice) -> Sectors:
     end = np.where((free > 0.0)[:, None], end, 0.0)
     accurate_m = scan.accurate_m(config)
     last_m = np.where(bands > 0, near_m, ranges[3])
-    sure = np.maximum(end.min(1) - config.sure_sigmas * scan.sigma_per_m2 * last_m**2 * unit, 0.0)
+    margin = np.where(bands > 0, config.sure_sigmas, config.open_sigmas)
+    sure = np.maximum(end.min(1) - margin * scan.sigma_per_m2 * last_m**2 * unit, 0.0)
     weight = np.clip(np.rint(config.log_hit * accurate_m / np.maximum(near_m, accurate_m)), 1, 127).astype(np.int64)
     camera_band = int(np.searchsorted(config.bands_m, scan.height_m, side="right")) - 1
     accurate = np.full(scan.columns, accurate_m / config.cell_m)
