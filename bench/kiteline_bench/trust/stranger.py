@@ -141,7 +141,8 @@ def _with_agent(bench: Bench, processes: _Processes, endpoint: str, recording: s
         f"Sent {found['bytes'] / 1e6:.0f} MB in {found['packets']} packets in {found['seconds']:.0f} s "
         f"({found['bytes'] / found['seconds'] / 1e6:.1f} MB/s), with a name and a question every 50 ms; it heard "
         f"{found['heard']} sealed packets of the base. The agent flew "
-        f"{alone[0]} frames with {alone[2]} keyframes without, {flooded[0]} frames with {flooded[2]} under the flood."
+        f"{alone[0]} frames, {alone[1]} of them tracked, with {alone[2]} keyframes without, {flooded[0]} frames, "
+        f"{flooded[1]} of them tracked, with {flooded[2]} under the flood."
     )
     return [
         at_most("memory of the base, grown under the flood", grown_mib, _GROWN_MIB, "MiB", 1),
