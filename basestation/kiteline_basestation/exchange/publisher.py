@@ -145,7 +145,7 @@ class Publisher:
         """The changes since the last call for which there is room, by agent, in order of kind and keyframe.
 
         room_bytes: for corrections that move the agent's map; no limit for agents that are not in it. What waits is
-        sent at its newest value later.
+        sent at its newest value later, but values of a batch that goes on as they were when it was chosen.
         """
         room = dict(room_bytes or {})
         out: dict[AgentId, dict[Key, Record]] = {}

@@ -18,9 +18,9 @@ F64 = NDArray[np.float64]
 
 _PLANE_ROUNDS = 4  # plane fits, each to the points near the last one
 _DRIFT_RAD = 0.1  # rad; correction of a loop that drift explains
+_DRIFT_RAD_M = 0.002  # rad/m; the same, added for each metre of the path
 _DRIFT_VOTES_APART = 1.0  # of the median depth; from the first to the farthest vote: they see other things
 _TILT_DEVIATIONS = 4.0  # of what two agents know gravity to, added to the tilt between their maps
-_DRIFT_RAD_M = 0.002  # rad/m; the same, added for each metre of the path
 _MAX_SCALE_DRIFT = 0.4  # logarithm of the scale drift along a loop
 _FUSE_M = 0.02  # m; smaller corrections need no pose graph: landmarks are fused at once
 _FUSE_RAD = 0.005  # rad; the same of rotations

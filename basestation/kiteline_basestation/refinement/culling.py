@@ -22,7 +22,7 @@ _KEYFRAME_OTHERS = 3  # other keyframes that observe them, at a scale at most on
 
 
 def cull_weak_landmarks(sparse_map: SparseMap, keyframe: KeyframeId, publisher: Publisher) -> int:
-    """Test the landmarks first observed `landmark_age` keyframes before this one. Returns how many were culled."""
+    """Test the landmarks first observed _LANDMARK_AGE keyframes before this one. Returns how many were culled."""
     same = sparse_map.submaps[submap_of_keyframe(keyframe)]
     number = sparse_map.number_of(keyframe)
     if number < _LANDMARK_AGE:

@@ -130,7 +130,7 @@ class Archive:
         if from_version is not None:
             heapq.heappush(self._unsent, -id_)
             heapq.heappush(self._versions, (from_version, id_))
-            if len(self._unsent) > 2 * len(self._pages) + _SLACK:
+            if max(len(self._unsent), len(self._versions)) > 2 * len(self._pages) + _SLACK:
                 self._queue_pages()
         return True
 

@@ -10,6 +10,7 @@ import pytest
 
 from kiteline_codec.schema import FusedLandmarks, Key, KeyframeHeader, KeyframePose, Observations, RefinedLandmarks
 from kiteline_codec.sync import archive
+from kiteline_codec.sync.archive import Archive, Row
 from kiteline_codec.sync.config import SyncConfig
 from kiteline_codec.sync.endpoint import Endpoint
 from kiteline_hw.logs.spill_file import SpillFile
@@ -67,6 +68,21 @@ def test_maps_that_come_are_corrected_and_deleted_leave_nothing(
     early, late = ([max(one[name] for one in part) for name in held[-1]] for part in (held[4:10], held[10:]))
     assert {name for name, before, after in zip(held[-1], early, late) if after > 1.3 * before + 10} == set()
     assert max(disk[10:]) <= 1.1 * max(disk[4:10])
+
+
+def test_pages_that_come_and_go_behind_an_older_one_leave_nothing(tmp_path: Path) -> None:
+    pages = Archive(SpillFile(tmp_path))
+
+    def put(id_: int, version: int) -> None:
+        pages.put(id_, [Row(KeyframeHeader.KIND, 0, version, False, False, False, 1, b"a")], 0)
+
+    put(1, 1)  # waits all the time
+    for n in range(1000):
+        put(2, 2 + n)
+        pages.take(2)
+        assert pages.newest_unacknowledged() == 1
+        assert pages.oldest_unacknowledged() == (1, 1)
+    assert sum(entries_of((pages,)).values()) < 400
 
 
 def exchange(a: Endpoint, b: Endpoint, now_ns: int) -> int:
