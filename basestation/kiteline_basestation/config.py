@@ -233,7 +233,7 @@ class GridConfig:
     sure_sigmas: float = (
         2.0  # standard deviations beyond gap_sigmas from which on a far view is well before what it sees
     )
-    open_sigmas: float = 1.0  # the same before the end of ground without an obstacle: scans end two before it
+    open_sigmas: float = 1.0  # the same before a scan's end without an obstacle, which lies two before the last ground
     side_columns: int = (
         2  # of a scan at either side of its view that count as far ones: what stands there is not seen whole
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 
 class Notices:
-    """Lines for the user; one of each subject."""
+    """Lines for the user, from any thread; one of each subject."""
 
     def __init__(self) -> None:
         self._said: set[str] = set()
@@ -18,5 +18,6 @@ class Notices:
 
     def take(self) -> list[str]:
         """The lines since the last call."""
-        new, self._new = self._new, []
+        new = self._new[:]
+        del self._new[: len(new)]  # the list stays: another thread may be adding a line to it
         return new
