@@ -32,13 +32,13 @@ _AT_BASE = {
     "that it shows",
     Trouble.OTHER_KEY: "agent {n} has another key than this base: run `kiteline keys pair {n}` here, and at the agent "
     "the command that it shows",
-    Trouble.SEALED: "agent {n} seals its packets, and this base has no keys: start it without --insecure, or with "
-    "--key FILE",
+    Trouble.SEALED: "agent {n} seals its packets, and this base has no keys: start it again, without --insecure "
+    "or with --key FILE",
     Trouble.EARLIER_BOOT: "agent {n} comes with an earlier start than was seen: are there two agents {n} (--agent N), "
     "or was its state folder lost or copied? It is refused",
 }
 _AT_AGENT = {
-    Trouble.UNSEALED: "the base sends without seals: start it without --insecure, or this agent with --insecure",
+    Trouble.UNSEALED: "the base sends without seals: start it again, without --insecure, or this agent with it",
     Trouble.OTHER_KEY: "the base has another key: run `kiteline keys pair {n}` there, and here the command that it "
     "shows",
     Trouble.SEALED: "the base seals its packets, and this agent has no key: run `kiteline keys pair {n}` there, and "

@@ -85,7 +85,8 @@ def _pair(path: Path, agent: int, code: str) -> None:
     print(f"agent {agent}  {fingerprint(key)}  in {path}")
     if not code:
         print(f"at agent {agent}: kiteline keys pair {agent} {shown}")
-        print("a base that runs takes the new key within a second; show the code to nobody else")
+        print("show the code to nobody else; a base that runs takes the new key within a second")
+        print('one that said "not sealed" has to be started again: it seals once there are keys')
 
 
 def _agent(p: argparse.ArgumentParser, text: str) -> int:
