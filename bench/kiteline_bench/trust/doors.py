@@ -83,6 +83,7 @@ def doors(folder: Path) -> list[Door]:
         Door("store's rows", by_file(f"rows/{FILE}", read), tuple(_odd_rows(folder / "odd", store))),
         Door("log", by_file("fuzzed.mcap", _read_log), (log,)),
         Door("log as a source", by_file("source.mcap", _open_log), (log,)),
+        Door("ROS 2 bag", by_file("bag.db3", _open_log), (_sqlite_bag(),)),
         Door("log to import", by_file("import.mcap", lambda path: import_map(path, _no_station)), (log,)),
         Door("rig", lambda data, draw: rig_from_json(_json(data)), (rig,)),
         Door("image", lambda data, draw: decode_grey(EncodedImage(data, "png")), tuple(images.values())),
@@ -185,6 +186,18 @@ def _read_log(path: Path) -> None:
 def _open_log(path: Path) -> None:
     for _ in mcap.open_source(str(path), False, True):
         pass
+
+
+def _sqlite_bag() -> bytes:
+    """A ROS 2 bag in SQLite storage with one message."""
+    with contextlib.closing(sqlite3.connect(":memory:")) as bag:
+        bag.executescript(
+            "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT);"
+            "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB);"
+            "INSERT INTO topics VALUES(1, '/image', 'sensor_msgs/msg/CompressedImage', 'cdr');"
+            "INSERT INTO messages VALUES(1, 1, 5, x'00010000000000000000000001000000000000000000000000000000');"
+        )
+        return bag.serialize()
 
 
 def _no_station(metadata: object) -> Station:

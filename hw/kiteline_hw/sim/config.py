@@ -38,6 +38,11 @@ class SimConfig:
     lens: str = "radtan"  # or equidistant, none
     baseline: float = 0.11  # m
     scale: float = 1.0  # of image size and focal length
+    width: int = 0  # px, before scale; 0: 752
+    height: int = 0  # px, before scale; 0: 480
+    fov_deg: float = 0.0  # angle of view along the width, without what distortion adds; 0: that of 752 px
+    rate: float = 20.0  # Hz of the frames
+    imu_rate: float = 200.0  # Hz of the inertial samples
     exposure_s: float = 0.010  # indoor exposure of a small drone camera
     readout_s: float = 0.0  # from the first row's exposure to the last row's: a rolling shutter; 0: a global one
     exposure_step: float = 0.18  # logarithm of the factor by which the exposure steps up or down
@@ -98,6 +103,7 @@ def read_config(scene: str, **options: object) -> SimConfig:
         raise SourceError(f"agent {config.agent} has no trajectory: {1 + len(config.also)} are given")
     if config.seed < 0 or config.seconds < 0 or config.start < 0 or not 0.05 <= config.scale <= 4:
         raise SourceError("seed, seconds and start of a simulated scene cannot be negative; scale must be 0.05 to 4")
+    _check_camera(config)
     if not 0 <= config.readout_s < 0.05 or not 0 <= config.flicker <= 1 or config.exposure_every <= 0:
         raise SourceError(
             "readout_s of a simulated scene must be 0 to 0.05, flicker 0 to 1, exposure_every larger than 0"
@@ -109,6 +115,17 @@ def read_config(scene: str, **options: object) -> SimConfig:
             "odometry of a simulated scene must be 0 to 1000 Hz, its noise not negative, its slip below 1"
         )
     return config
+
+
+def _check_camera(config: SimConfig) -> None:
+    """Raise SourceError for a camera or rates that cannot be simulated."""
+    if any(side and not 64 <= side <= 4096 for side in (config.width, config.height)):
+        raise SourceError("width and height of a simulated scene must be 64 to 4096 px")
+    most_deg = 200.0 if config.lens == Lens.EQUIDISTANT.value else 130.0
+    if config.fov_deg and not 10.0 <= config.fov_deg <= most_deg:
+        raise SourceError(f"fov_deg of a simulated {config.lens} lens must be 10 to {most_deg:g}")
+    if not 1.0 <= config.rate <= 200.0 or not 10.0 <= config.imu_rate <= 4000.0:
+        raise SourceError("rate of a simulated scene must be 1 to 200 Hz, imu_rate 10 to 4000 Hz")
 
 
 def _default(key: str) -> object:

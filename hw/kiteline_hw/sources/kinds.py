@@ -35,7 +35,7 @@ SOURCES: tuple[SourceKind, ...] = (
     SourceKind("kitti", "DIR", "KITTI odometry sequence",
                "kiteline_hw.sources.kitti", ("calib.txt", "image_[0123lr]/"), "calib.txt with image_0/ (KITTI)"),
     SourceKind("mcap", "FILE", "ROS 2 bag, Foxglove recording or kiteline log",
-               "kiteline_hw.sources.mcap", ("*.mcap",), "*.mcap", told=True),
+               "kiteline_hw.sources.mcap", ("*.mcap", "*.db3"), "*.mcap or *.db3 (ROS 2)", told=True),
     SourceKind("images", "GLOB[,GLOB]", "plain images beside a camera.yaml", "kiteline_hw.sources.images", told=True),
     SourceKind("sim", "SCENE", "simulated flight: room, hall, corridor or street", "kiteline_hw.sim.source"),
     SourceKind("v4l2", "DEV[,DEV]", "live camera, or a pair", "kiteline_hw.cameras.v4l2", told=True),
@@ -43,6 +43,25 @@ SOURCES: tuple[SourceKind, ...] = (
     SourceKind("stream", "URL[,URL]", "network camera (RTSP, UDP, HTTP) through ffmpeg", "kiteline_hw.cameras.stream",
                told=True),
     SourceKind("ros2", "TOPIC[,TOPIC]", "live topics of ROS 2, where rclpy is", "kiteline_hw.cameras.ros2", told=True),
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class ForeignLayout:
+    """A layout that is known but not read. marks: glob patterns, all of which a folder matches. mend: what to do."""
+
+    name: str
+    marks: tuple[str, ...]
+    mend: str
+
+
+FOREIGN: tuple[ForeignLayout, ...] = (
+    ForeignLayout("UZH-FPV", ("left_images.txt", "imu.txt"),
+                  "convert the sequence's .bag with `pip install rosbags` and `rosbags-convert --src FILE.bag --dst "
+                  "FOLDER`, and fly FOLDER with --calibration camchain-imucam.yaml,imu.yaml"),
+    ForeignLayout("4Seasons", ("undistorted_images/cam0",),
+                  "fly images:'DIR/undistorted_images/cam0/*.png,DIR/undistorted_images/cam1/*.png' with a camera.yaml "
+                  "of undistorted_calib_*.txt beside them (fx fy cx cy width height baseline_m)"),
 )  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""MCAP recordings as sources: ROS 2 bags, Foxglove recordings and kiteline logs (which yield identical frames)."""
+"""Recordings of messages as sources: ROS 2 bags, Foxglove recordings, kiteline logs (which yield identical frames)."""
 
 from __future__ import annotations
 
@@ -35,6 +35,8 @@ from kiteline_hw.sensors.images import ImageRef, decode_grey
 from kiteline_hw.sensors.imu_buffer import ImuStream, NoImu
 from kiteline_hw.sensors.odometry_buffer import OdometerStream, insert_before_frames
 from kiteline_hw.sensors.raw_pixels import BadImage, RawPixels
+from kiteline_hw.sources.bags.bag_files import open_bag, unpacked
+from kiteline_hw.sources.bags.sqlite_bag import SqliteBag
 from kiteline_hw.sources.mcap_messages import (
     KINDS,
     BadMessage,
@@ -66,24 +68,14 @@ _MAX_DYNAMIC_TRANSFORMS = 2000  # messages of moving transforms that are read be
 
 
 def open_source(path_name: str, mono: bool, imu: bool, told: ToldCalibration | None = None) -> McapSource:
-    """Open a recording, or the only one in a folder. told: in place of a bag's calibration. Raises SourceError."""
-    path = Path(path_name)
-    if path.is_dir():
-        files = sorted(path.glob("*.mcap"))
-        if not files:
-            raise SourceError(f"{path}: no *.mcap in this folder: expected one")
-        if len(files) > 1:
-            raise SourceError(
-                f"{path}: {len(files)} MCAP files: name one, or join them with `kiteline log merge OUT.mcap FILES…`"
-            )
-        path = files[0]
-    return McapSource(McapFile(path), mono, imu, told)
+    """Open a recording, or the bag in a folder. told: in place of a bag's calibration. Raises SourceError."""
+    return McapSource(open_bag(Path(path_name)), mono, imu, told)
 
 
 class McapSource:
-    """A FrameSource over an MCAP file, whose messages are read while iterating."""
+    """A FrameSource over an MCAP file or a ROS 2 bag, whose messages are read while iterating."""
 
-    def __init__(self, file: McapFile, mono: bool, imu: bool, told: ToldCalibration | None = None) -> None:
+    def __init__(self, file: McapFile | SqliteBag, mono: bool, imu: bool, told: ToldCalibration | None = None) -> None:
         self.name = f"mcap:{file.path}"
         self.report = SourceReport()
         self._file = file
@@ -307,7 +299,8 @@ class McapSource:
         return round(self._file.counts.get(channel, 0) / span_s, 1) if span_s > 0 else 0.0
 
     def _decode(self, raw: RawMessage) -> Any:
-        return self._decoder.decode(self._file.channels[raw.channel], self._file.schema_of(raw.channel), raw.data)
+        data = unpacked(raw.data)
+        return self._decoder.decode(self._file.channels[raw.channel], self._file.schema_of(raw.channel), data)
 
     # Reading
 

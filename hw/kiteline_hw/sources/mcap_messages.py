@@ -24,7 +24,7 @@ from kiteline_hw.logs.mcap_log_read import read_odometry
 from kiteline_hw.sensors.images import detect_format
 from kiteline_hw.sensors.odometry_buffer import RATE_SIGMA_RAD_S, VELOCITY_SIGMA_M_S, reported_covariance
 from kiteline_hw.sensors.raw_pixels import BadImage, RawPixels
-from kiteline_hw.sources.ros2_samples import fast_decoder
+from kiteline_hw.sources.bags.ros2_samples import fast_decoder
 
 F64 = NDArray[np.float64]
 

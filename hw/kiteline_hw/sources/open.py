@@ -10,10 +10,9 @@ from kiteline_hw.calibration.files import read_calibration
 from kiteline_hw.calibration.told import ToldCalibration
 from kiteline_hw.ports import FrameSource, SourceError, is_live
 from kiteline_hw.sources import kinds
+from kiteline_hw.sources.bags.bag_heads import MCAP_MAGIC, SQLITE_MAGIC, refuse_unreadable
 from kiteline_hw.sources.kinds import SourceKind
 from kiteline_hw.sources.overrides import with_calibration
-
-_MCAP_MAGIC = b"\x89MCAP0\r\n"
 
 
 def open_source(
@@ -53,15 +52,21 @@ def recognise(spec: str) -> SourceKind:
     if path.is_file():
         with path.open("rb") as file:
             head = file.read(16)
-        if head.startswith(_MCAP_MAGIC) or path.suffix == ".mcap":
+        if head.startswith((MCAP_MAGIC, SQLITE_MAGIC)) or path.suffix == ".mcap":
             return _known("mcap")
-        if path.suffix in (".db3", ".bag"):
-            raise SourceError(f"{path}: a {path.suffix} bag: convert it first with `ros2 bag convert` to MCAP storage")
-        raise SourceError(f"{path}: expected an MCAP file or a data set folder; it starts with {head[:8]!r}")
+        refuse_unreadable(path)
+        raise SourceError(
+            f"{path}: expected an MCAP file, a .db3 bag or a data set folder; it starts with {head[:8]!r}"
+        )
     if path.is_dir():
         for kind in kinds.SOURCES:
             if any(_holds(path, pattern) for pattern in kind.layout):
                 return kind
+        for layout in kinds.FOREIGN:
+            if all(any(path.glob(mark)) for mark in layout.marks):
+                raise SourceError(f"{path}: the layout of {layout.name} is not read: {layout.mend}")
+        for entry in sorted(path.iterdir()):
+            refuse_unreadable(entry)
         *shown, last = [kind.shown for kind in kinds.SOURCES if kind.shown]
         raise SourceError(
             f"{path}: layout not recognised: expected {', '.join(shown)} or {last}; plain images are opened as "

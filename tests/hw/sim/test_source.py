@@ -98,6 +98,24 @@ def test_errors_name_what_was_expected(text: str, words: str) -> None:
         open_sim(text, texture_bits=6)
 
 
+def test_the_options_of_a_scene_make_another_rig() -> None:
+    source = open_sim("room", texture_bits=5, seconds=1, width=160, height=120, fov_deg=90.0, lens="none", rate=30.0,
+                      imu_rate=400.0)  # fmt: skip
+    left = source.rig.left
+    assert (left.width, left.height) == (160, 120)
+    assert left.fx == pytest.approx(80.0) and left.fy == pytest.approx(80.0, rel=0.01), "tan 45 degrees is 1"
+    assert (left.cx, left.cy) == (pytest.approx(80.0, abs=3), pytest.approx(60.0, abs=3))
+    assert source.frame_count == 30 and source.imu is not None and source.imu.rate_hz == 400.0
+    assert np.diff(source.imu_samples().t_ns).tolist() == [2_500_000] * (len(source.imu_samples().t_ns) - 1)
+
+
+def test_a_fisheye_sees_to_both_sides_and_nothing_behind() -> None:
+    options = {"scale": 1.0, "seconds": 0.1, "rest": 0.0, "imu": False, "mono": True}
+    (frame,) = frames("room", lens="equidistant", width=96, height=96, fov_deg=190.0, rate=10.0, **options)
+    assert frame.left[40:56, 10:86].mean() > 20, "what is before the camera is seen"
+    assert frame.left[:6, :6].mean() < 10, "corners of the image, beyond 90 degrees, are dark"
+
+
 def test_every_agent_of_every_seed_draws_its_own_noise() -> None:
     """Agent 64 of a seed drew what agent 0 of the next one did."""
     seeds = [SimConfig(seed=seed, agent=agent).flight_seed for seed in range(9) for agent in range(MAX_AGENTS)]

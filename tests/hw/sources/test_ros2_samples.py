@@ -12,8 +12,8 @@ from mcap.records import Schema
 from mcap_ros2.decoder import DecoderFactory
 
 from kiteline_hw.logs.mcap_file import McapFile
+from kiteline_hw.sources.bags.ros2_samples import fast_decoder
 from kiteline_hw.sources.mcap_messages import read_frame_id, read_imu, read_pose, read_stamp
-from kiteline_hw.sources.ros2_samples import fast_decoder
 from tests.hw.sources.ros2_schemas import LEAVES, ROS2
 
 IMU, POSE = "sensor_msgs/msg/Imu", "geometry_msgs/msg/PoseStamped"

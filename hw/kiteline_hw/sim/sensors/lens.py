@@ -74,5 +74,5 @@ def pixel_rays(camera: CameraModel) -> F32:
 
 
 def vignette(directions: F32) -> F32:
-    """Relative brightness (h, w) of the inner pixels: cos^2.2 of the angle to the optical axis."""
-    return np.ascontiguousarray(directions[1:-1, 1:-1, 2] ** 2.2, np.float32)
+    """Relative brightness (h, w) of the inner pixels: cos^2.2 of the angle to the optical axis, 0 beyond 90 degrees."""
+    return np.ascontiguousarray(np.maximum(directions[1:-1, 1:-1, 2], 0.0) ** 2.2, np.float32)

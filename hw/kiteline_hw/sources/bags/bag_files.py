@@ -1,0 +1,53 @@
+"""Files of recorded messages: which are the parts of a bag, and in which storage and compression."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import zstandard
+
+from kiteline_hw.logs.mcap_file import MOST_CHUNK_BYTES, McapFile
+from kiteline_hw.ports import SourceError
+from kiteline_hw.sources.bags.bag_heads import SQLITE_MAGIC, ZSTD_MAGIC, refuse_unreadable
+from kiteline_hw.sources.bags.sqlite_bag import SqliteBag
+from kiteline_hw.sources.mcap_messages import BadMessage
+
+
+def open_bag(path: Path) -> McapFile | SqliteBag:
+    """Open an MCAP file, a SQLite bag, or the bag in a folder. Raises SourceError."""
+    if path.is_dir():
+        return _bag_in_folder(path)
+    refuse_unreadable(path)
+    with path.open("rb") as file:
+        head = file.read(len(SQLITE_MAGIC))
+    return SqliteBag([path]) if head == SQLITE_MAGIC else McapFile(path)
+
+
+def _bag_in_folder(folder: Path) -> McapFile | SqliteBag:
+    files = sorted(folder.glob("*.mcap"))
+    if len(files) > 1:
+        raise SourceError(
+            f"{folder}: {len(files)} MCAP files: name one, or join them with `kiteline log merge OUT.mcap FILES…`"
+        )
+    if files:
+        return McapFile(files[0])
+    parts = sorted(folder.glob("*.db3"))
+    if parts:
+        return SqliteBag(parts)
+    for path in sorted(folder.iterdir()):
+        refuse_unreadable(path)
+    raise SourceError(f"{folder}: no *.mcap and no *.db3 in this folder: expected a recording")
+
+
+def unpacked(message: bytes) -> bytes:
+    """A message of a bag that packs each message by itself (compression mode MESSAGE); others are returned as they are.
+
+    Raises BadMessage.
+    """
+    if not message.startswith(ZSTD_MAGIC):  # CDR begins with its representation, 0x00
+        return message
+    try:
+        with zstandard.ZstdDecompressor(max_window_size=MOST_CHUNK_BYTES).stream_reader(message) as stream:
+            return bytes(stream.read(MOST_CHUNK_BYTES))
+    except zstandard.ZstdError as error:
+        raise BadMessage(f"packed message cannot be unpacked ({error})") from error

@@ -1,0 +1,123 @@
+"""ROS 2 bags in SQLite storage, in parts, packed message by message; and bags that are refused with what helps."""
+
+from __future__ import annotations
+
+import sqlite3
+from contextlib import closing, suppress
+from pathlib import Path
+
+import pytest
+import zstandard
+from mcap.writer import Writer
+
+from kiteline_hw.logs.mcap_file import McapFile, RawMessage
+from kiteline_hw.ports import SourceError
+from kiteline_hw.sources.bags.ros2_definitions import definition_of
+from kiteline_hw.sources.mcap_messages import KINDS
+from kiteline_hw.sources.open import open_source
+from tests.hw.sources.camera_messages import read
+from tests.hw.sources.test_mcap import Bag, check_stereo, stereo_bag
+
+_TABLES = """
+CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT NOT NULL, type TEXT NOT NULL,
+    serialization_format TEXT NOT NULL, offered_qos_profiles TEXT NOT NULL);
+CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER NOT NULL, timestamp INTEGER NOT NULL,
+    data BLOB NOT NULL);
+CREATE INDEX timestamp_idx ON messages (timestamp ASC);
+"""
+
+
+def db3(bag: Bag, *paths: Path, packed: bool = False) -> None:
+    """Write a bag as rosbag2 does, in as many parts as there are paths."""
+    mcap = McapFile(bag.write(paths[0].with_suffix(".tmp")))
+    messages = list(mcap.messages())
+    share = -(-len(messages) // len(paths))
+    for k, path in enumerate(paths):
+        _write_part(path, mcap, messages[k * share : (k + 1) * share], packed, first_id=5 - k)
+    paths[0].with_suffix(".tmp").unlink()
+
+
+def _write_part(path: Path, mcap: McapFile, messages: list[RawMessage], packed: bool, first_id: int) -> None:
+    with closing(sqlite3.connect(path)) as file:
+        file.executescript(_TABLES)
+        for channel, described in mcap.channels.items():
+            schema = mcap.schema_of(channel)
+            assert schema is not None
+            row = (channel + first_id, described.topic, schema.name, "cdr", "")
+            file.execute("INSERT INTO topics VALUES(?,?,?,?,?)", row)
+        for m in messages:
+            data = zstandard.compress(m.data) if packed else m.data
+            values = (m.channel + first_id, m.log_ns, data)
+            file.execute("INSERT INTO messages(topic_id, timestamp, data) VALUES(?,?,?)", values)
+        file.commit()
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_a_sqlite_bag_is_read_as_the_same_bag_in_mcap(tmp_path: Path, packed: bool) -> None:
+    file = tmp_path / "flight #1?_0.db3"
+    db3(stereo_bag(), file, packed=packed)
+    check_stereo(open_source(str(file)))
+    check_stereo(open_source(f"mcap:{file}"))
+    assert sorted(path.name for path in tmp_path.iterdir()) == [file.name], "nothing is written beside a bag"
+
+
+def test_the_parts_of_a_split_bag_follow_each_other(tmp_path: Path) -> None:
+    (tmp_path / "metadata.yaml").write_text("rosbag2_bagfile_information:\n")
+    db3(stereo_bag(20), tmp_path / "b_0.db3", tmp_path / "b_1.db3", tmp_path / "b_2.db3")
+    check_stereo(open_source(str(tmp_path)), 20)
+
+
+def test_messages_packed_one_by_one_in_mcap(tmp_path: Path) -> None:
+    plain = McapFile(stereo_bag().write(tmp_path / "plain.tmp"))
+    with (tmp_path / "a.mcap").open("wb") as stream:
+        writer = Writer(stream)
+        writer.start("ros2", "test")
+        numbers = {}
+        for number, channel in plain.channels.items():
+            schema = plain.schema_of(number)
+            assert schema is not None
+            known = writer.register_schema(schema.name, schema.encoding, schema.data)
+            numbers[number] = writer.register_channel(channel.topic, "cdr", known)
+        for m in plain.messages():
+            writer.add_message(numbers[m.channel], m.log_ns, zstandard.compress(m.data), m.log_ns)
+        writer.finish()
+    check_stereo(open_source(str(tmp_path / "a.mcap")))
+
+
+def test_every_message_of_ros_that_is_used_has_a_definition() -> None:
+    for name in KINDS:
+        assert (definition_of(name) is not None) == ("/msg/" in name)
+
+
+def test_what_cannot_be_read_says_what_helps(tmp_path: Path) -> None:
+    ros1 = tmp_path / "old" / "flight.bag"
+    ros1.parent.mkdir()
+    ros1.write_bytes(b"#ROSBAG V2.0\n" + bytes(50))
+    for path in (ros1, ros1.parent):
+        with pytest.raises(SourceError, match=r"ROS 1.*rosbags-convert --src flight\.bag"):
+            open_source(str(path))
+    whole = tmp_path / "packed" / "flight_0.db3.zstd"
+    whole.parent.mkdir()
+    whole.write_bytes(zstandard.compress(b"SQLite format 3\0"))
+    for path in (whole, whole.parent):
+        with pytest.raises(SourceError, match=r"zstd -d flight_0\.db3\.zstd"):
+            open_source(str(path))
+
+
+def test_a_database_that_is_no_bag_is_refused(tmp_path: Path) -> None:
+    with closing(sqlite3.connect(tmp_path / "other.db3")) as file:
+        file.execute("CREATE TABLE songs(id INTEGER)")
+    with pytest.raises(SourceError, match="tables topics and messages"):
+        open_source(str(tmp_path / "other.db3"))
+
+
+def test_a_damaged_bag_raises_source_errors_only(tmp_path: Path) -> None:
+    good = tmp_path / "good.db3"
+    db3(stereo_bag(), good)
+    data = good.read_bytes()
+    for k, at in enumerate(range(100, len(data), len(data) // 12)):
+        for bad in (data[:at], data[:at] + b"\xff" * 40 + data[at + 40 :]):
+            path = tmp_path / f"bad{k}.db3"
+            path.write_bytes(bad)
+            with suppress(SourceError):
+                read(open_source(str(path)))
