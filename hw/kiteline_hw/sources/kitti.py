@@ -2,23 +2,21 @@
 
 calib.txt has projection matrices as rows of 12 numbers, named (`P0:` to `P3:`) or bare (left, right). A projection is
 K [I | t]; the baseline is the difference of the two t along x. The components of t along y and z (millimetres between
-the colour cameras) are ignored: the images were rectified so that their rows agree.
+the colour cameras) are ignored: the images were rectified so that their rows agree. Raw drives: see kitti_raw.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_core.frame import Trajectory
-from kiteline_core.geometry.cameras import CameraModel, CameraRig
-from kiteline_hw.calibration.checks import checked_baseline, checked_camera
-from kiteline_hw.ports import SourceError, SourceReport
-from kiteline_hw.sensors.frames import EncodedFrame
-from kiteline_hw.sensors.images import ImageFile
+from kiteline_core.geometry.cameras import CameraRig
+from kiteline_hw.calibration.checks import checked_baseline
+from kiteline_hw.ports import SourceError
+from kiteline_hw.sources.kitti_raw import camera_of, is_raw, offset_x_m, open_raw, pairs_by_name
 from kiteline_hw.sources.recording import Recording, image_size, list_images, sorted_trajectory
 from kiteline_hw.sources.text_files import read_rows, row_values, seconds_to_ns
 
@@ -29,9 +27,11 @@ PAIRS = (("image_0", "image_1", "P0", "P1"), ("image_2", "image_3", "P2", "P3"),
 
 
 def open_source(folder_name: str, mono: bool, imu: bool) -> Recording:
-    """Open a KITTI odometry sequence, which has no IMU. Raises SourceError."""
+    """Open a KITTI odometry sequence or a raw drive, which have no IMU. Raises SourceError."""
     del imu
     folder = Path(folder_name)
+    if is_raw(folder):
+        return open_raw(folder, mono)
     pair = next((p for p in PAIRS if list_images(folder / p[0])), None)
     if pair is None:
         raise SourceError(
@@ -44,40 +44,22 @@ def open_source(folder_name: str, mono: bool, imu: bool) -> Recording:
     p_left, p_right = _read_projections(calib, pair[2], pair[3])
     size = image_size(lefts)
     right = T_c_r = None
-    left = _camera(p_left, size, calib)
+    left = camera_of(p_left, size, calib)
     if rights:
         if p_right is None:
             raise SourceError(f"{calib}: one row, but two image folders: expected a row for each camera")
-        right = _camera(p_right, size, calib)
+        right = camera_of(p_right, size, calib)
         T_c_r = np.eye(4)
-        T_c_r[0, 3] = _offset_x_m(p_left) - _offset_x_m(p_right)
+        T_c_r[0, 3] = offset_x_m(p_left) - offset_x_m(p_right)
         checked_baseline(T_c_r, f"{calib}: {pair[2]} and {pair[3]}")
         if T_c_r[0, 3] < 0:
             raise SourceError(f"{calib}: baseline {T_c_r[0, 3]:g} m: left and right row are swapped")
     rig = CameraRig(left, right, np.eye(4), T_c_r, has_body=False)
     times = _read_times(folder, lefts)
     return Recording(
-        f"kitti:{folder}", rig, len(lefts), lambda report: _read_frames(times, lefts, rights, report),
+        f"kitti:{folder}", rig, len(lefts), lambda report: pairs_by_name(times, lefts, rights, report),
         ground_truth=_read_ground_truth(folder, lefts, times),
     )  # fmt: skip
-
-
-def _read_frames(
-    times: list[int], lefts: list[Path], rights: list[Path], report: SourceReport
-) -> Iterator[EncodedFrame]:
-    by_stem = {path.stem: path for path in rights}
-    for t, left in zip(times, lefts, strict=True):
-        if not rights:
-            yield EncodedFrame(t, ImageFile(left))
-        elif left.stem in by_stem:
-            yield EncodedFrame(t, ImageFile(left), ImageFile(by_stem[left.stem]))
-        else:
-            report.skip("missing right image", f"{left.name} has no partner")
-            yield EncodedFrame(t, ImageFile(left))
-    stems = {path.stem for path in lefts}
-    for path in rights:
-        if path.stem not in stems:
-            report.skip("missing left image", f"{path.name} has no partner")
 
 
 def _read_projections(path: Path, left: str, right: str) -> tuple[F64, F64 | None]:
@@ -103,16 +85,6 @@ def _read_projections(path: Path, left: str, right: str) -> tuple[F64, F64 | Non
     if len(bare) == 4 and left == "P2":
         return bare[2], bare[3]
     return bare[0], bare[1] if len(bare) > 1 else None
-
-
-def _offset_x_m(p: F64) -> float:
-    # p = K [I | t]: t_x = (p03 - cx * t_z) / fx; a camera to the right of the reference has a negative t_x.
-    return float((p[0, 3] - p[0, 2] * p[2, 3]) / p[0, 0])
-
-
-def _camera(p: F64, size: tuple[int, int], calib: Path) -> CameraModel:
-    camera = CameraModel(size[1], size[0], float(p[0, 0]), float(p[1, 1]), float(p[0, 2]), float(p[1, 2]))
-    return checked_camera(camera, str(calib))
 
 
 def _row_indices(images: list[Path], row_count: int) -> list[int]:

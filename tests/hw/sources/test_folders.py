@@ -297,6 +297,55 @@ def test_kitti_layouts(tmp_path: Path, left: str, right: str | None, calib: str,
         np.testing.assert_array_equal(source.rig.T_c_r[1:, 3], [0, 0, 1])
 
 
+RAW = "calib_time: 09-Jan-2012 13:57:47\n" + "\n".join(
+    f"S_0{i}: 80 60\nS_rect_0{i}: 64 48\nP_rect_0{i}: " + ROW.format(x=x, y=0, z=0)
+    for i, x in enumerate([0, -350, 35, -315])
+)
+
+
+def kitti_raw(day: Path, sides: tuple[str, ...], size: tuple[int, int] = (48, 64)) -> Path:
+    drive = day / "2011_09_26_drive_0001_sync"
+    for side in sides:
+        for i in range(3):
+            put(drive / f"image_{side}" / "data" / f"{i:010d}.png", picture(i, size))
+        times = [f"2011-09-26 13:02:25.{594360375 + 103_000_000 * i}" for i in range(3)]
+        (drive / f"image_{side}" / "timestamps.txt").write_text("\n".join(times) + "\n")
+    (day / "calib_cam_to_cam.txt").write_text(RAW)
+    return drive
+
+
+@pytest.mark.parametrize(("sides", "pair"), [(("00", "01", "02", "03"), True), (("02", "03"), True), (("02",), False)])
+def test_raw_drives_of_kitti(tmp_path: Path, sides: tuple[str, ...], pair: bool) -> None:
+    source = open_source(str(kitti_raw(tmp_path, sides)))
+    frames, _ = read(source)
+    assert len(frames) == 3 and (source.rig.right is not None) == pair
+    assert (frames[0].right is not None) == pair
+    assert frames[0].t_ns == 1_317_042_145_594_360_375 and frames[1].t_ns - frames[0].t_ns == 103_000_000
+    assert source.rig.left.fx == 700.0
+    if source.rig.T_c_r is not None:
+        assert source.rig.T_c_r[0, 3] == pytest.approx(0.5)
+
+
+def test_raw_drives_of_kitti_that_cannot_be_read(tmp_path: Path) -> None:
+    with pytest.raises(SourceError, match="_extract"):
+        open_source(str(kitti_raw(tmp_path, ("00", "01"), (60, 80))))
+    (tmp_path / "calib_cam_to_cam.txt").unlink()
+    with pytest.raises(SourceError, match=r"calibration of the same day"):
+        open_source(str(tmp_path / "2011_09_26_drive_0001_sync"))
+
+
+def test_layouts_that_are_not_read_say_what_helps(tmp_path: Path) -> None:
+    fpv, seasons = tmp_path / "indoor_forward_3", tmp_path / "recording"
+    fpv.mkdir()
+    for name in ("left_images.txt", "right_images.txt", "imu.txt"):
+        (fpv / name).write_text("# id timestamp image_name\n")
+    (seasons / "undistorted_images" / "cam0").mkdir(parents=True)
+    with pytest.raises(SourceError, match=r"UZH-FPV.*rosbags-convert"):
+        open_source(str(fpv))
+    with pytest.raises(SourceError, match=r"4Seasons.*undistorted_images/cam0"):
+        open_source(str(seasons))
+
+
 def test_kitti_missing_right_images_and_numbered_rows(tmp_path: Path) -> None:
     root = kitti(tmp_path, "image_0", "image_1", NAMED, n=5)
     (root / "image_1/000002.png").unlink()
