@@ -45,6 +45,11 @@ def test_an_open_endpoint_for_maps_takes_connections_of_the_paired_only(
     monkeypatch.setattr(questions, "QueryServer", Server)
     with contextlib.ExitStack() as stack:
         questions.Questions(
-            BaseOptions("", maps=endpoint), open_base_end("", LinkOptions()), stack, lambda: None, {"maps": "secret"}
-        )
+            BaseOptions("", maps=endpoint),
+            open_base_end("", LinkOptions()),
+            stack,
+            dict,
+            lambda: None,
+            {"maps": "secret"},
+        )  # fmt: skip
     assert opened[0]["logins"] == ({"maps": "secret"} if guarded else None)

@@ -309,6 +309,11 @@ def test_a_base_imports_logs_and_manages_maps(
     assert (told["id"], told["placed"]) == (name, True)
     assert told["keyframes"] == heads(tmp_path / "store" / FILE)
     assert told["points"] > 50
+    capsys.readouterr()
+    assert kiteline(["status", "--base", endpoint, "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["store"] == {"folder": str(tmp_path / "store"), "up_to_date": True}
+    assert report["agents"][0]["counts"][0] == {"label": "Keyframes", "value": told["keyframes"], "unit": ""}
     assert ask("name", name, "wall")[0] == 0
     status, _, errors = ask("split", "wall")
     assert status == 1

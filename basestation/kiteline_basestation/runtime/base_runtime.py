@@ -141,6 +141,26 @@ class BaseRuntime:
             self._notices.say("budget", f"log: the oldest logs are deleted: {limit}")
         return self._notices.take()
 
+    def state(self) -> dict[str, Any]:
+        """The process as JSON types: its link, memory and store, and what is wrong now, a line each."""
+        options, keeper = self.options, self.keeper
+        troubles = missing_extras()
+        if keeper is not None and keeper.fault is not None:
+            troubles.append(f"store {options.store}: not written: {keeper.fault}")
+        if options.log_name and self._log is None:
+            troubles.append("log: there is none of this start")
+        elif self._log is not None and self._log.why:
+            troubles.append(f"log: messages are lost: {self._log.why}")
+        if failed := self.station.mapper.jobs_failed:
+            troubles.append(f"{failed} job{'s' * (failed != 1)} failed since the start")
+        return {
+            "link": options.link,
+            "session": options.session,
+            "memory_mib": round(self.rss_mib, 1),
+            "store": None if keeper is None else {"folder": options.store, "up_to_date": keeper.idle},
+            "troubles": troubles,
+        }
+
     def restore_maps(self, now_ns: int) -> Restored | None:
         """Load the map of the store and the imported ones; None if there are none.
 

@@ -16,6 +16,7 @@ from kiteline_basestation.runtime.terminal import TerminalReporter
 from kiteline_basestation.runtime.warm import WARMING
 from kiteline_basestation.runtime.worker import Workers
 from kiteline_basestation.station import Station
+from kiteline_basestation.web.status_report import StatusReport
 from kiteline_codec.channel import CodedChannel
 from kiteline_codec.transport.framing import StreamFramer
 from kiteline_codec.transport.seal import Sealer
@@ -69,7 +70,10 @@ def fly_live(options: BaseOptions, parent: process.Parent | None, stop: process.
         except StoppedError:
             return True
         report_restored(restored, parent)
-        questions = Questions(options, link, stack, lambda: seals.maps_key, logins)
+        report = StatusReport(base.station, clock.now_ns())
+        questions = Questions(
+            options, link, stack, lambda: {**report.at(clock.now_ns()), **base.state()}, lambda: seals.maps_key, logins
+        )
         if parent is not None:
             parent.send_event("ready")
         terminal = TerminalReporter(base.station) if parent is None and not options.quiet else None

@@ -7,6 +7,7 @@ import json
 import secrets
 import time
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 from kiteline_basestation.management import READING, Answer, Command
 from kiteline_basestation.runtime.options import BaseOptions
@@ -23,18 +24,25 @@ _MEND = (
 )
 
 
+_STATUS = "status"  # the verb that is answered here: it is no input of the station
+_READING = READING | {_STATUS}
+
+
 class Questions:
-    """Answers `kiteline maps` on --maps, else on the agents' link if that is Zenoh. Without keys anyone may ask; with
-    them a change needs a signature, and reading does too, except on a --maps endpoint of this machine.
+    """Answers `kiteline maps` and `kiteline status` on --maps, else on the agents' link if that is Zenoh.
+
+    Without keys anyone may ask; with them a change needs a signature, and reading does too, except on a --maps endpoint
+    of this machine.
     """
 
     def __init__(
-        self, options: BaseOptions, hub: LinkHub, stack: contextlib.ExitStack, maps_key: Callable[[], bytes | None],
-        logins: Mapping[str, str] | None = None,
+        self, options: BaseOptions, hub: LinkHub, stack: contextlib.ExitStack, status: Callable[[], dict[str, Any]],
+        maps_key: Callable[[], bytes | None], logins: Mapping[str, str] | None = None,
     ) -> None:  # fmt: skip
-        """maps_key: that of the right to change maps, now. logins: users and passwords without which nobody connects.
-        Raises LinkError.
+        """status: the answer to `kiteline status` now. maps_key: that of the right to change maps, now. logins: users
+        and passwords without which nobody connects. Raises LinkError.
         """
+        self._status = status
         self._server: QueryServer | None = None
         self._reading_free = bool(options.maps) and is_loopback(f"zenoh:{options.maps.removeprefix('zenoh:')}")
         if options.maps:
@@ -53,10 +61,15 @@ class Questions:
         out = []
         for asked in self._server.questions():
             try:
-                out.append(Command(asked.number, asked.verb, self._opened(asked.verb, asked.text)))
+                text = self._opened(asked.verb, asked.text)
             except WireError as error:
                 start = {"start": error.start} if isinstance(error, OtherStartError) else {}
                 self._server.answer(asked.number, False, json.dumps({"error": str(error), **start}))
+                continue
+            if asked.verb == _STATUS:
+                self._server.answer(asked.number, True, json.dumps(self._status()))
+            else:
+                out.append(Command(asked.number, asked.verb, text))
         return out
 
     def answer(self, answers: Sequence[Answer]) -> None:
@@ -71,6 +84,6 @@ class Questions:
         question = self._guard.open(verb, text, int(time.time()))
         if question is not None:
             return question
-        if verb in READING and self._reading_free:
+        if verb in _READING and self._reading_free:
             return text
-        raise WireError(_MEND.format(what="questions" if verb in READING else "changes"))
+        raise WireError(_MEND.format(what="questions" if verb in _READING else "changes"))

@@ -19,7 +19,7 @@ from kiteline_hw.links.zenoh_queries import ask
 from kiteline_hw.ports import LinkError
 from kiteline_hw.system.key_store import MAPS, default_path, login_of, read_file
 
-_DEFAULT = "tcp/127.0.0.1:7447"
+DEFAULT_BASE = "tcp/127.0.0.1:7447"
 
 
 def parser() -> argparse.ArgumentParser:
@@ -29,9 +29,9 @@ def parser() -> argparse.ArgumentParser:
         description="Manage the maps of a running base. MAP is an id (AGENT.BOOT.NUMBER) or a name.",
         epilog="Other programs send the same queries over Zenoh: docs/how-to/manage-maps.md.",
     )
-    _add_options(p, endpoint=_DEFAULT, key=None, as_json=False)
+    add_options(p, endpoint=DEFAULT_BASE, key=None, as_json=False)
     anywhere = argparse.ArgumentParser(add_help=False)  # the same after the verb, where they override those before it
-    _add_options(anywhere, endpoint=argparse.SUPPRESS, key=argparse.SUPPRESS, as_json=argparse.SUPPRESS)
+    add_options(anywhere, endpoint=argparse.SUPPRESS, key=argparse.SUPPRESS, as_json=argparse.SUPPRESS)
     verbs = p.add_subparsers(dest="verb", required=True, metavar="VERB")
     verbs.add_parser("list", help="all maps", parents=[anywhere])
     one = {
@@ -61,9 +61,11 @@ def parser() -> argparse.ArgumentParser:
     return p
 
 
-def _add_options(p: argparse.ArgumentParser, endpoint: str, key: Path | str | None, as_json: bool | str) -> None:
+def add_options(p: argparse.ArgumentParser, endpoint: str, key: Path | str | None, as_json: bool | str) -> None:
     """Add the options of all questions, with these defaults."""
-    p.add_argument("--base", metavar="ENDPOINT", default=endpoint, help=f"where the base listens (default: {_DEFAULT})")
+    p.add_argument(
+        "--base", metavar="ENDPOINT", default=endpoint, help=f"where the base listens (default: {DEFAULT_BASE})"
+    )
     p.add_argument("--key", metavar="FILE", type=Path, default=key,
                    help=f"keys with the right to change maps (default: {default_path()}, if there is one)")  # fmt: skip
     p.add_argument("--json", action="store_true", default=as_json, help="print the reply as JSON")
@@ -132,6 +134,17 @@ def asked(endpoint: str, verb: str, question: str, key: bytes | None) -> tuple[b
     return ask_signed(start) if isinstance(start, str) else (ok, text)
 
 
+def ask_base(base: str, key_file: Path | None, verb: str, question: str) -> tuple[bool, str, dict[str, Any]]:
+    """Ask the base at an endpoint, signed if a file of keys has the right. Whether it succeeded, the answer as text and
+    as JSON types. key_file: None: the user's, if there is one. Raises LinkError.
+    """
+    path = key_file or default_path()
+    key = read_file(path).maps if key_file is not None or path.exists() else None
+    endpoint = base.removeprefix("zenoh:")
+    ok, text = asked(endpoint, verb, question, key)
+    return ok, text, _read(endpoint, text)
+
+
 def _read(endpoint: str, text: str) -> dict[str, Any]:
     """An answer as a base gives it. Raises LinkError for anything else."""
     try:
@@ -150,15 +163,11 @@ def main(argv: list[str]) -> int:
     a = parser().parse_args(argv)
     if hasattr(a, "store"):
         return _of_store(a)
-    path: Path = a.key or default_path()
-    key = read_file(path).maps if a.key is not None or path.exists() else None
-    endpoint = a.base.removeprefix("zenoh:")
-    ok, text = asked(endpoint, a.verb, json.dumps(query(a)), key)
-    answer = _read(endpoint, text)
+    ok, text, answer = ask_base(a.base, a.key, a.verb, json.dumps(query(a)))
     try:
         shown = table(answer) if ok else f"kiteline maps: {answer['error']}"
     except (KeyError, TypeError, ValueError, AttributeError):
-        raise LinkError(f"{endpoint} answers {text[:60]!r}, which is no answer of a base to {a.verb}") from None
+        raise LinkError(f"{a.base} answers {text[:60]!r}, which is no answer of a base to {a.verb}") from None
     if a.json:
         print(text)
     else:

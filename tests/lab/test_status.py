@@ -1,0 +1,83 @@
+"""`kiteline status`: a base's answer as lines of text, and its exit status."""
+
+from __future__ import annotations
+
+import json
+from copy import deepcopy
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from kiteline_basestation.grid.grid_view import GridView
+from kiteline_basestation.web import messages
+from kiteline_basestation.web.snapshot import AgentStatus, PageSnapshot
+from kiteline_core.ids import AgentId
+from kiteline_hw.ports import LinkError
+from kiteline_lab.tools import maps, status
+
+S = 1_000_000_000
+
+
+def report(**changes: Any) -> dict[str, Any]:
+    """What a base with two agents answers, after 7500 s."""
+    agents = (
+        AgentStatus(AgentId(0), 7499 * S, 80, np.eye(4), np.zeros((3, 3)), 3, 40, 1, 120_000, 5000),
+        AgentStatus(AgentId(7), 7300 * S, 90, None, np.zeros((0, 3)), 2, 30, 1, 1000, 500),
+    )
+    page = PageSnapshot(7500 * S, 0, agents, np.zeros((0, 3)), np.zeros(0, np.uint8), GridView(0.05), 7, {"loops": 2})
+    base = {"link": "zenoh:tcp/0.0.0.0:7447", "session": 5, "memory_mib": 267.4, "troubles": []}
+    return {**messages.status(page), **base, "store": {"folder": "maps", "up_to_date": True}, **changes}
+
+
+def test_lines_tell_agents_map_and_store() -> None:
+    base, totals, head, first, second = status.lines(report())
+    assert base == "base on zenoh:tcp/0.0.0.0:7447, session 5, up 2 h 05 min; store maps"
+    assert totals.startswith("keyframes 5, landmarks 70, loops 2, merges 0, mapped 0.0 m²") and "267 MiB" in totals
+    assert head.split()[:3] == ["agent", "link", "quality"]
+    assert first.split() == ["0", "live", "80", "0.00", "0.00", "0.00", "3", "40", "1", "120", "5", "-"]
+    assert second.split()[:7] == ["7", "lost,", "3", "min", "-", "not", "placed"]  # what was long ago says nothing
+
+
+def test_what_is_wrong_has_a_line_each() -> None:
+    told = status.lines(report(troubles=["store maps: not written: disk full"], store=None, agents=[]))
+    assert told[0].endswith("the map is not saved")
+    assert told[2:] == ["no agent yet", "wrong: store maps: not written: disk full"]
+    assert status.lines(report(store={"folder": "maps", "up_to_date": False}))[0].endswith("store maps not up to date")
+
+
+def test_rates_are_of_the_time_between_two_reports_of_one_start() -> None:
+    before, now = report(), report(up_s=7502.0)
+    now["agents"] = deepcopy(before["agents"])
+    now["agents"][0]["bytes_up"] += 16_000
+    assert status.lines(now, before)[3].endswith("8.0, 0.0")
+    assert status.lines(now, {**before, "session": 4})[3].endswith("-")
+    assert status.lines(now, {**before, "agents": []})[3].endswith("-")
+
+
+@pytest.mark.parametrize(
+    ("answer", "expected"),
+    [((True, json.dumps(report())), 0), ((True, json.dumps(report(troubles=["log: there is none"]))), 1),
+     ((False, '{"error": "only with the right to change maps"}'), 1)],
+)  # fmt: skip
+@pytest.mark.parametrize("more", [[], ["--json"]])
+def test_the_exit_status_says_whether_all_is_well(
+    answer: tuple[bool, str], expected: int, more: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(maps, "ask", lambda *_, **__: answer)
+    monkeypatch.setattr(maps, "default_path", lambda: Path("no keys"))
+    assert status.main(more) == expected
+
+
+@pytest.mark.parametrize("answer", [(True, "{}"), (True, '{"store": 3}'), (False, "{}"), (True, "[]")])
+def test_another_program_is_told_in_a_line(answer: tuple[bool, str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(maps, "ask", lambda *_, **__: answer)
+    monkeypatch.setattr(maps, "default_path", lambda: Path("no keys"))
+    with pytest.raises(LinkError, match="answers"):
+        status.main([])
+
+
+def test_a_period_that_is_no_time_is_refused() -> None:
+    with pytest.raises(SystemExit):
+        status.main(["--watch", "0"])
