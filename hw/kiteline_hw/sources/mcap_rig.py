@@ -23,6 +23,8 @@ from kiteline_hw.sources.mcap_messages import CameraCalibration, Transform
 F64 = NDArray[np.float64]
 
 _WORLD_FRAMES = ("world", "map", "odom", "earth")
+_ONE_KIND = 1.1  # ratio of focal lengths: two lenses of one kind differ by less
+_AS_MANY = 0.9  # share of images: cameras of one rate lose some
 _ALIGNED = 0.8  # cosine between optical axes above which two cameras can be a stereo pair
 
 
@@ -250,8 +252,12 @@ def _extrinsics(left: _CameraTopic, right: _CameraTopic, tree: TransformTree) ->
 
 
 def _stereo_pair(cameras: list[_CameraTopic], tree: TransformTree) -> tuple[_CameraTopic, _CameraTopic, F64] | None:
-    """Left and right camera and T_l_r of the pair with the most images, or None."""
-    best: tuple[_CameraTopic, _CameraTopic, F64] | None = None
+    """Left and right camera and T_l_r of the best pair, or None.
+
+    Two cameras of one kind, then the pair with the most images, then the one with the longest baseline: a depth camera
+    has a colour camera beside its infrared pair.
+    """
+    pairs: list[tuple[_CameraTopic, _CameraTopic, F64]] = []
     for left in cameras:
         for right in cameras:
             if left is right or (left.model.width, left.model.height) != (right.model.width, right.model.height):
@@ -259,11 +265,21 @@ def _stereo_pair(cameras: list[_CameraTopic], tree: TransformTree) -> tuple[_Cam
             t = _extrinsics(left, right, tree)
             if t is None or t[2, 2] < _ALIGNED or t[0, 3] <= 1e-4 or t[0, 3] < np.abs(t[1:3, 3]).max():
                 continue
-            if best is None or min(left.images.count, right.images.count) > min(
-                best[0].images.count, best[1].images.count
-            ):
-                best = (left, right, t)
-    return best
+            pairs.append((left, right, t))
+    if not pairs:
+        return None
+    most = max(_images(pair) for pair in pairs)
+
+    def rank(pair: tuple[_CameraTopic, _CameraTopic, F64]) -> tuple[bool, bool, float]:
+        left, right, t = pair
+        ratio = left.model.fx / right.model.fx
+        return 1 / _ONE_KIND < ratio < _ONE_KIND, _images(pair) >= _AS_MANY * most, float(t[0, 3])
+
+    return max(pairs, key=rank)
+
+
+def _images(pair: tuple[_CameraTopic, _CameraTopic, F64]) -> int:
+    return min(pair[0].images.count, pair[1].images.count)
 
 
 def _with_depth(cameras: list[_CameraTopic], depths: list[ImageTopic]) -> tuple[_CameraTopic, ImageTopic] | None:

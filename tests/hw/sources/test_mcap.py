@@ -323,6 +323,26 @@ def test_lens_models(tmp_path: Path, model: str, d: tuple[float, ...], lens: Len
     assert rig.left.lens is lens and rig.left.distortion == (d if lens is not Lens.NONE else ())
 
 
+@pytest.mark.parametrize("colour_fx", [60.0, 90.0])
+def test_a_colour_camera_beside_an_infrared_pair_is_no_part_of_it(tmp_path: Path, colour_fx: float) -> None:
+    """As in the bags of RealSense cameras: its baseline to either of them is another, and shorter to the left one."""
+    bag = stereo_bag()
+    T = np.eye(4)
+    T[0, 3] = -0.015
+    bag.tf(START_NS, "left_optical", "colour_optical", T)
+    bag.info(START_NS, "colour")
+    bag.messages[-1][3]["k"] = [colour_fx, 0, 32, 0, colour_fx, 24, 0, 0, 1]
+    for i in range(6):
+        bag.image(START_NS + i * STEP_NS, "colour", 200 + i)
+    bag.messages = sorted(bag.messages, key=lambda m: m[0])
+    source = open_source(str(bag.write(tmp_path / "a.mcap")))
+    assert source.rig.T_c_r is not None
+    if colour_fx == 90.0:
+        check_stereo(source)
+    else:  # three cameras of one kind: the longest baseline
+        assert source.rig.T_c_r[0, 3] == pytest.approx(T_L_R[0, 3] + 0.015, abs=1e-3)
+
+
 def test_calibration_without_baseline_and_other_errors(tmp_path: Path) -> None:
     path = stereo_bag(tf=False).write(tmp_path / "a.mcap")
     with pytest.raises(
