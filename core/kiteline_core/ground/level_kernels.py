@@ -1,4 +1,4 @@
-"""Kernels that turn disparities into points of the levelled camera frame, and count them by column and disparity."""
+"""Kernels that correct disparities, turn them into points of the levelled camera frame, and count these by column."""
 
 from __future__ import annotations
 
@@ -9,6 +9,11 @@ from kiteline_core.jit import helper, njit
 BIN_PX = 0.25  # px of levelled disparity to a bin
 _MATCHED = 0.2  # of an image column's pixels below the horizon that have a disparity: else both eyes did not see it
 NO_COLUMN = -1
+_HALF_PX = 4  # px to each side of a pixel in its row that are compared
+_NEARER_PX = 1.5  # px by which another disparity is larger, at least: less is the error of a slanted surface
+_LEAST_ERROR = 4.0  # grey levels: mean difference from which a disparity is in doubt
+_BETTER = 0.5  # of that difference that another disparity leaves, at most
+_SUPPORT = 5  # other pixels within one row and _HALF_PX columns that have the new disparity to a pixel
 
 
 @njit
@@ -21,6 +26,63 @@ def unlock(raw, first, table, out):  # type: ignore[no-untyped-def]
         for u in range(out.shape[1]):
             at = np.int64(raw[v, first + u]) + 8
             out[v, u] = np.float32(at >> 4) + table[at & 15] if at > 8 else np.float32(0.0)
+
+
+@njit
+def correct_thin_surfaces(left, right, most_px, disparity, errors, doubted, better):  # type: ignore[no-untyped-def]
+    """Replace disparities (h,w) in px of surfaces that are thinner than a matched block by those that the rows show.
+
+    Semi-global matching gives such a surface the disparity of what lies behind. A disparity is in doubt where a row of
+    2 _HALF_PX + 1 pixels does not fit, and a larger one, up to most_px, fits far better: it takes that one, or becomes
+    unknown (0) if too few pixels around have it.
+    left, right: (h,w) uint8. errors: (w,) float32, doubted: (k,) int32, better: (k,) float32, for the kernel's own use.
+    At most k pixels are changed. Returns how many.
+    """
+    h, w = left.shape
+    wide, n = 2 * _HALF_PX + 1, 0
+    for v in range(h):
+        for u in range(w):
+            d = disparity[v, u]
+            errors[u] = np.float32(0.0)
+            if d > 0.0:
+                at = np.float32(u) - d
+                i = int(np.floor(at))
+                if i >= 0 and i + 1 < w:
+                    part = at - np.float32(i)
+                    a, b = np.float32(right[v, i]), np.float32(right[v, i + 1])
+                    errors[u] = abs(np.float32(left[v, u]) - (a + part * (b - a)))
+        for u in range(_HALF_PX, w - _HALF_PX):
+            d = disparity[v, u]
+            error = np.float32(0.0)
+            for k in range(u - _HALF_PX, u + _HALF_PX + 1):
+                error += errors[k]
+            if d <= 0.0 or error <= _LEAST_ERROR * wide:
+                continue
+            least, best = np.float64(_BETTER * error), -1
+            for q in range(int(d + _NEARER_PX) + 1, min(most_px, u - _HALF_PX + 1)):
+                other = np.int64(0)
+                for k in range(u - _HALF_PX, u + _HALF_PX + 1):
+                    other += abs(np.int64(left[v, k]) - np.int64(right[v, k - q]))
+                    if other >= least:
+                        break
+                if other < least:
+                    least, best = np.float64(other), q
+            if best >= 0 and n < len(doubted):
+                doubted[n], better[n] = v * w + u, best
+                n += 1
+    for k in range(n):
+        disparity[doubted[k] // w, doubted[k] % w] = better[k]
+    for k in range(n):
+        v, u, support = doubted[k] // w, doubted[k] % w, -1
+        for y in range(max(v - 1, 0), min(v + 2, h)):
+            for x in range(max(u - _HALF_PX, 0), min(u + _HALF_PX + 1, w)):
+                support += abs(disparity[y, x] - better[k]) <= 1.0
+        if support < _SUPPORT:
+            doubted[k] = -1 - doubted[k]
+    for k in range(n):
+        if doubted[k] < 0:
+            disparity[(-1 - doubted[k]) // w, (-1 - doubted[k]) % w] = 0.0
+    return n
 
 
 @helper
