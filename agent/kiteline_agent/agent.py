@@ -14,6 +14,7 @@ from kiteline_agent.config import AgentConfig
 from kiteline_agent.exchange.corrections import Corrections
 from kiteline_agent.governor.cost_model import Work
 from kiteline_agent.governor.governor import FULL, Extra, Governor, governed
+from kiteline_agent.image_cells import with_cells_for
 from kiteline_agent.initialisation.inertial_start import InertialStart
 from kiteline_agent.initialisation.two_view_start import TwoViewStart
 from kiteline_agent.keyframes.depth_from_motion import DepthFromMotion
@@ -67,6 +68,8 @@ class Agent:
     ) -> None:
         """vocabulary: of the place index; without it only the reference keyframe is tried in relocalisation."""
         self._channel = channel
+        if rig.right is None:
+            config = with_cells_for(config, rig.left.width, rig.left.height)
         self._full_config = self._config = config  # the latter at the governor's effort
         self._rectifier = Rectifier(rig)
         camera = self._rectifier.camera
