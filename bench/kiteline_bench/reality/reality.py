@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from kiteline_bench.agent import rigs
 from kiteline_bench.reality import (
     base,
     cpu,
@@ -28,6 +29,7 @@ PARTS = {
     "starts": ("Reality: random monocular starts, forward and backward", starts.run),
     "nees": ("Reality: consistent poses of worn rigs", nees.run),
     "people": ("Reality: people who walk through", people.run),
+    "rigs": ("Reality: rigs of many kinds", rigs.run),
     "difficult": ("Reality: difficult images", difficult.run),
     "places": ("Reality: places on real images", places.run),
     "cpu": ("Reality: CPU over a yardstick", cpu.run),
