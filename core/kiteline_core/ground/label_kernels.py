@@ -13,6 +13,7 @@ _BEHIND_PX = 2.0  # px behind a few pixels in which a real surface explains them
 _LOWER_M = 0.5  # below the ground where there may be ditches and lawns beside a road
 _LEAST_ENERGY = 300.0  # grey levels^2 of a surface's gradients: 0.06 px for an error of one level
 _MOST_STEP_PX = 0.4  # px of a refinement: more is another surface
+_OVER_M = 0.5  # above the bands, where what hangs into them goes on; ceilings are higher
 _OUTLIERS = 0.15  # share of a surface's pixels that are outliers
 _FALL_M = 0.12  # below the ground, at least, of a pixel that shows that it falls: a step
 _FALL_SIGMAS = 3.0  # the same in standard deviations of its height
@@ -37,14 +38,14 @@ def mark_texture(image, least, reach, out):  # type: ignore[no-untyped-def]
 @njit
 def label_points(  # type: ignore[no-untyped-def]
     x, z, column, textured, ground, seen, bf, sigma_px, ground_m, sigmas, most_m, bands, slab_m, labels, grounds,
-    obstacles, falls, astray, heights, sums, in_band, slab, slab_sums,
+    obstacles, above, falls, astray, heights, sums, in_band, slab, slab_sums,
 ):  # fmt: skip
     """Label pixels (h,w), and count them by column and bin (n, bins): ground, obstacles, their band, falls, slab.
 
     ground: (bins+1,) slope -z/x of the ground at the borders of bins; seen: (bins,) whether it was seen there.
     most_m: heights beyond are not ground, however uncertain. bands: (b,) heights. sums: of disparities of obstacles.
     falls: pixels below the ground, where their rays pass through it; astray: those beyond it by _ASTRAY_BINS, however
-    little lower. heights: sums of z of ground in m.
+    little lower. heights: sums of z of ground in m. above: pixels above the bands, up to _OVER_M.
     in_band: (n, bins, b-1). slab, slab_sums: within slab_m of the camera's height. Labels and counts are zero before.
     Returns how many pixels lie on the ground that was seen, and how many below it.
     """
@@ -87,6 +88,8 @@ def label_points(  # type: ignore[no-untyped-def]
                     obstacles[c, j] += 1
                     sums[c, j] += d
                     in_band[c, j, b] += 1
+                elif 0.0 <= height - bands[last] < _OVER_M:
+                    above[c, j] += 1
             elif height < -limit:
                 if height < -max(_FALL_M, _FALL_SIGMAS * sigma):
                     falls[c, at] += 1
@@ -96,25 +99,29 @@ def label_points(  # type: ignore[no-untyped-def]
 
 
 @njit
-def _surface(counts, least, lowest):  # type: ignore[no-untyped-def]
-    """Bin of the nearest surface in counts (bins,) from bin `lowest` on; -1 if there is none."""
+def _surface(counts, more, least, lowest):  # type: ignore[no-untyped-def]
+    """Bin of the nearest surface in counts (bins,) from bin `lowest` on; -1 if there is none.
+
+    more: (bins,) pixels that do not count, but may tell a surface from outliers of what lies behind it.
+    """
     bins = len(counts)
     half, behind = int(_PX / BIN_PX), int(_BEHIND_PX / BIN_PX)
     j = bins - 1
     while j >= lowest:
-        n = 0
+        n, whole = 0, 0
         for i in range(max(j - half, 0), min(j + half + 1, bins)):
             n += counts[i]
+            whole += counts[i] + more[i]
         if n >= least:
-            best, most = j, n
+            most, most_whole = n, whole
             for k in range(j - 1, max(j - behind, lowest) - 1, -1):
-                m = 0
+                m, m_whole = 0, 0
                 for i in range(max(k - half, 0), min(k + half + 1, bins)):
                     m += counts[i]
-                if m > most:
-                    best, most = k, m
-            if n >= _OUTLIERS * most:  # no outliers of what lies behind: the summit next to it
-                best, most = j, n
+                    m_whole += counts[i] + more[i]
+                most, most_whole = max(most, m), max(most_whole, m_whole)
+            if n >= _OUTLIERS * most or whole >= _OUTLIERS * most_whole:
+                best, most = j, n  # no outliers of what lies behind: the summit next to it
                 for k in range(j - 1, max(j - 2 * half - 1, lowest) - 1, -1):
                     m = 0
                     for i in range(max(k - half, 0), min(k + half + 1, bins)):
@@ -139,7 +146,7 @@ def _mean(counts, sums, at):  # type: ignore[no-untyped-def]
 
 
 @njit
-def find_surfaces(obstacles, sums, in_band, slab, slab_sums, least, lowest, surface, bands):  # type: ignore[no-untyped-def]
+def find_surfaces(obstacles, above, sums, in_band, slab, slab_sums, least, lowest, surface, bands):  # type: ignore[no-untyped-def]
     """Levelled disparities (n,2) of the nearest obstacle and of what stands at the camera's height; 0 for none.
 
     Counts are over (n, bins). lowest: least bin in which obstacles count. bands: (n,) mask of the obstacle's.
@@ -148,7 +155,7 @@ def find_surfaces(obstacles, sums, in_band, slab, slab_sums, least, lowest, surf
     half = int(_PX / BIN_PX)
     for c in range(n):
         surface[c, 0], surface[c, 1], bands[c] = 0.0, 0.0, 0
-        at = _surface(obstacles[c], least, lowest)
+        at = _surface(obstacles[c], above[c], least, lowest)
         if at >= 0:
             surface[c, 0] = _mean(obstacles[c], sums[c], at)
             most, mask = 0, 0
@@ -161,7 +168,7 @@ def find_surfaces(obstacles, sums, in_band, slab, slab_sums, least, lowest, surf
                 if m > most:
                     most, top = m, b
             bands[c] = mask | 1 << top
-        hit = _surface(slab[c], least, 0)
+        hit = _surface(slab[c], slab[c], least, 0)
         if hit >= 0:
             surface[c, 1] = _mean(slab[c], slab_sums[c], hit)
 

@@ -119,7 +119,7 @@ class GroundSegmenter:
         self._column, self._known = np.empty((h, w), np.int16), np.empty((n, 2), np.int32)
         self.labels = np.zeros((h, w), np.uint8)
         self._textured = np.ones((h, w), np.bool_)
-        self._counts, self._sums = np.empty((6, n, bins), np.int32), np.empty((n, bins))
+        self._counts, self._sums = np.empty((7, n, bins), np.int32), np.empty((n, bins))
         self._ground_heights = np.empty((n, bins))
         self._slab_sums = np.empty((n, bins))
         self._surface, self._surface_sums = np.empty((n, 2)), np.empty((n, 2, 5))
@@ -310,7 +310,7 @@ class GroundSegmenter:
             height_m = ground.height_m
         elif expected is not None:
             slope, height_m = borders * (expected.height_m / self.bf), expected.height_m
-        grounds, obstacles, falls, astray, slab = self._counts[1:]
+        grounds, obstacles, above, falls, astray, slab = self._counts[1:]
         self.labels.fill(label_kernels.UNKNOWN)
         summed = self._sums, self._ground_heights, self._in_band, self._slab_sums, self._surface_sums
         for counts in (self._counts[1:], *summed):
@@ -318,14 +318,23 @@ class GroundSegmenter:
         on, under = label_kernels.label_points(
             self.x, self.z, self._column, self._textured, slope, seen, self.bf, self.sigma_px, config.ground_m,
             config.ground_sigmas, config.ground_most_m, self._bands, config.slab_m, self.labels, grounds, obstacles,
-            falls, astray, self._ground_heights, self._sums, self._in_band, slab, self._slab_sums,
+            above, falls, astray, self._ground_heights, self._sums, self._in_band, slab, self._slab_sums,
         )  # fmt: skip
         if ground is not None and under > _UNDER * on:
             return self._scan(None, view, expected)[0], True
         lowest = round(self._lowest_px / level_kernels.BIN_PX)
         surface, bands = self._surface, np.empty(n, np.uint8)
         label_kernels.find_surfaces(
-            obstacles, self._sums, self._in_band, slab, self._slab_sums, config.column_pixels, lowest, surface, bands
+            obstacles,
+            above,
+            self._sums,
+            self._in_band,
+            slab,
+            self._slab_sums,
+            config.column_pixels,
+            lowest,
+            surface,
+            bands,
         )
         if view.pair is not None:
             label_kernels.refine_surfaces(

@@ -301,6 +301,19 @@ def test_surfaces_are_refined_by_their_images() -> None:
     assert errors[1] < 0.015
 
 
+def test_what_hangs_into_the_highest_band_is_no_outlier_of_the_wall_behind() -> None:
+    """A few of its pixels count; those above the bands tell that it is a surface."""
+    hanging = wall(4.3, low_m=1.88 - HEIGHT_M, left_m=0.8, right_m=0.8)
+    segmenter, disparity = view(up(0.0, -5.0), level_ground, wall(5.3), hanging, noise_px=0.05)
+    expected = ExpectedGround(HEIGHT_M, 0.1)
+    scan = segmenter.segment(disparity, None, up(0.0, -5.0), expected=expected).scan
+    before = np.abs(scan.azimuths_rad) < 0.13
+    assert (np.abs(scan.obstacle_m[before] * np.cos(scan.azimuths_rad[before]) - 4.3) < 0.15).all()
+    assert (scan.bands[before] == 4).all()
+    beside = np.abs(np.abs(scan.azimuths_rad) - 0.35) < 0.08
+    assert (np.abs(scan.obstacle_m[beside] * np.cos(scan.azimuths_rad[beside]) - 5.3) < 0.15).all()
+
+
 def test_labels_outside_of_the_image_are_unknown() -> None:
     segmenter, disparity = view(up(0.0, 0.0), level_ground)
     segmenter.segment(disparity, None, up(0.0, 0.0), expected=ExpectedGround(HEIGHT_M, 0.1))
