@@ -13,9 +13,7 @@ from typing import Any
 import llvmlite.binding as llvm
 import llvmlite.binding.ffi
 import numba
-from llvmlite.ir import IRBuilder
-from llvmlite.ir.instructions import InsertValue
-from numba.core import caching, cgutils, ir, typed_passes, types, untyped_passes
+from numba.core import caching, ir, typed_passes, types, untyped_passes
 from numba.core.codegen import JITCodeLibrary, JITCPUCodegen
 from numba.core.compiler import CompilerBase
 from numba.core.compiler_machinery import PassManager
@@ -102,11 +100,6 @@ _fix_index = arrayobj.fix_integer_index
 _enable_caching = Dispatcher.enable_caching
 _save_overload = caching.Cache.save_overload
 _arguments = Lower.extract_function_arguments
-_delete_variable = Lower.delvar
-_extract_value = IRBuilder.extract_value
-_make_array = arrayobj.make_array
-_make_view = arrayobj.make_view
-_basic_indexing = arrayobj.basic_indexing
 _lowering = [False]  # whether the code that is being generated is a kernel's, innermost last
 
 
@@ -168,114 +161,6 @@ def plain_index(context: Any, builder: Any, kind: Any, index: Any, size: Any) ->
     if not _lowering[-1]:
         return _fix_index(context, builder, kind, index, size)  # type: ignore[no-untyped-call]
     return context.cast(builder, index, kind, types.intp if kind.signed else types.uintp)
-
-
-def delete_variable(self: Any, name: str) -> None:
-    """End a variable: numba reads it for the last time and clears it, which a number does not need."""
-    kind = self.typeof(name)
-    if not (_lowering[-1] and _holds_numbers(kind)):
-        _delete_variable(self, name)  # type: ignore[no-untyped-call]
-    elif name not in self._blk_local_varmap or self._disable_sroa_like_opt:
-        self._singly_assigned_vars.discard(name)
-        self._alloca_var(name, kind)
-
-
-def extract_value(self: Any, aggregate: Any, index: Any, name: str = "", **more: Any) -> Any:
-    """Take a part of a tuple or structure: what was put there, if that is known; numba packs and unpacks each index."""
-    wanted = index if isinstance(index, (list, tuple)) else [index]
-    if _lowering[-1]:
-        inner = aggregate
-        while type(inner) is InsertValue:
-            if list(inner.indices) == list(wanted):
-                return inner.operands[1]
-            if inner.indices[0] == wanted[0]:
-                break  # a part of the wanted one, or one that it is a part of
-            inner = inner.operands[0]
-    return _extract_value(self, aggregate, index, name, **more)
-
-
-class HeldArray:
-    """An array of which the code that is being generated holds the value. Its fields are read from that.
-
-    numba puts the value into cleared memory, and reads fields and lengths from there one by one, at each access of an
-    element: a third of the code that LLVM is given, and takes out again.
-    """
-
-    def __init__(self, kind: Any, context: Any, builder: Any, value: Any) -> None:
-        self._held = kind, context, builder, value
-        self._in_memory: Any = None  # the same as numba has it, for what needs its address or writes to it
-
-    def __getattr__(self, name: str) -> Any:
-        kind, context, builder, value = self._held
-        if self._in_memory is None and not name.startswith("_"):
-            field = context.data_model_manager[kind].get_field_position(name)
-            return builder.extract_value(value, field)
-        return getattr(self._stored(), name)
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        if name.startswith("_"):
-            object.__setattr__(self, name, value)
-        else:
-            setattr(self._stored(), name, value)
-
-    def _getvalue(self) -> Any:
-        return self._held[3] if self._in_memory is None else self._in_memory._getvalue()
-
-    def _stored(self) -> Any:
-        if self._in_memory is None:
-            kind, context, builder, value = self._held
-            self._in_memory = _make_array(kind)(context, builder, value)  # type: ignore[no-untyped-call]
-        return self._in_memory
-
-
-def make_array(kind: Any) -> Any:
-    """Return what makes an array of a kind from its value, or an empty one in memory."""
-    if not _lowering[-1] or type(kind) is not types.Array:
-        return _make_array(kind)  # type: ignore[no-untyped-call]
-
-    def make(context: Any, builder: Any, value: Any = None, ref: Any = None) -> Any:
-        if value is None:
-            return _make_array(kind)(context, builder, ref=ref)  # type: ignore[no-untyped-call]
-        return HeldArray(kind, context, builder, value)
-
-    return make
-
-
-def make_view(
-    context: Any, builder: Any, kind: Any, array: Any, view_kind: Any, data: Any, shapes: Any, strides: Any
-) -> Any:
-    """Make a view of an array as a value, not in memory. shapes, strides: lists of its lengths."""
-    if not _lowering[-1] or type(view_kind) is not types.Array:
-        return _make_view(context, builder, kind, array, view_kind, data, shapes, strides)  # type: ignore[no-untyped-call]
-    number = context.get_value_type(types.intp)
-    items = number(1)
-    for length in shapes:
-        items = builder.mul(items, length, flags=["nsw"])
-    pack: Any = cgutils.pack_array
-    fields = {
-        "meminfo": array.meminfo, "parent": array.parent, "nitems": items, "itemsize": array.itemsize, "data": data,
-        "shape": pack(builder, shapes, number), "strides": pack(builder, strides, number),
-    }  # fmt: skip
-    value = context.get_value_type(view_kind)(None)
-    for name, field in fields.items():
-        value = builder.insert_value(value, field, context.data_model_manager[view_kind].get_field_position(name))
-    return HeldArray(view_kind, context, builder, value)
-
-
-def basic_indexing(
-    context: Any, builder: Any, kind: Any, array: Any, index_kinds: Any, indices: Any, boundscheck: Any = None
-) -> Any:
-    """Find what indices denote: a pointer, lengths and strides. Of one element only what its place needs is read."""
-    whole = len(indices) == kind.ndim and all(isinstance(one, types.Integer) for one in index_kinds)
-    if not (_lowering[-1] and whole and kind.layout == "C") or boundscheck:
-        return _basic_indexing(context, builder, kind, array, index_kinds, indices, boundscheck)  # type: ignore[no-untyped-call]
-    places = [plain_index(context, builder, *one, None) for one in zip(index_kinds, indices, strict=True)]
-    at = places[0]
-    if len(places) > 1:
-        shape = array.shape
-        for axis, place in enumerate(places[1:], 1):
-            at = builder.add(builder.mul(at, builder.extract_value(shape, axis)), place)
-    return builder.gep(array.data, [at]), [], []
 
 
 def set_env(self: Any, env_name: str, env: Any) -> None:
@@ -394,11 +279,6 @@ def install() -> dict[str, Any]:
         (JITCPUCodegen, "_library_class", KernelLibrary),
         (JITCPUCodegen, "set_env", set_env),
         (arrayobj, "fix_integer_index", plain_index),
-        (Lower, "delvar", delete_variable),
-        (IRBuilder, "extract_value", extract_value),
-        (arrayobj, "basic_indexing", basic_indexing),
-        (arrayobj, "make_array", make_array),
-        (arrayobj, "make_view", make_view),
         (Lower, "extract_function_arguments", borrowed_arguments),
         (ir.Inst, "_rec_list_vars", variables_in),
         (caching.IndexDataCacheFile, "save", save),
