@@ -1,11 +1,15 @@
-"""`ros2:TOPIC[,TOPIC]`: live topics of ROS 2, Image or CompressedImage, and an Imu beside them (`?imu=TOPIC`)."""
+"""`ros2:TOPIC[,TOPIC]`: live topics of ROS 2, Image or CompressedImage, and an Imu beside them (`?imu=TOPIC`).
+
+`?imu=GYRO,ACCEL` joins two topics that hold a half each.
+"""
 
 from __future__ import annotations
 
 import queue
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration, Trajectory
@@ -20,12 +24,14 @@ from kiteline_hw.cameras.ros_node import RosNode
 from kiteline_hw.ports import SourceError, SourceReport
 from kiteline_hw.sensors.imu_buffer import ImuStream
 from kiteline_hw.sensors.raw_pixels import BadImage
+from kiteline_hw.sensors.split_imu import ImuJoiner
 from kiteline_hw.sources.mcap_messages import BadMessage, read_image, read_imu, read_stamp
 from kiteline_hw.sources.open import open_source as open_recording
 
 _WAITING = 4  # messages that wait for the thread that decodes; the oldest are dropped
 _MAX_SAMPLES = 8192  # buffered between two frames; 40 s at 200 Hz
 _IMU = "imu="
+_WAIT_NS = 1_000_000_000  # ns that a rate waits for the acceleration after it, which another topic brings
 _AT_ONCE_NS = 20_000  # ns between two readings of a clock without a pause between them
 _READINGS = 5  # of both clocks, at most
 
@@ -108,8 +114,12 @@ class RosSource:
         self._stream = ImuStream(frames.report)
         self._lock = threading.Lock()
         self._frame: Frame | None = None
-        if imu_topic:
-            node.subscribe(node.types.Imu, imu_topic, self._take_imu)
+        self._joiner = ImuJoiner(frames.report, wait_ns=_WAIT_NS)
+        gyro, comma, accel = imu_topic.partition(",")
+        if gyro:
+            node.subscribe(node.types.Imu, gyro, partial(self._take_imu, self._add_gyro if comma else self._add))
+        if accel:
+            node.subscribe(node.types.Imu, accel, partial(self._take_imu, self._add_accel))
 
     @property
     def rig(self) -> CameraRig:
@@ -129,7 +139,7 @@ class RosSource:
         """Right stamp minus left stamp over the last pairs: median, and the largest deviation from it."""
         return self._frames.skew_ns
 
-    def _take_imu(self, message: Any) -> None:
+    def _take_imu(self, add: Callable[[int, tuple[float, ...]], None], message: Any) -> None:
         try:
             rows = read_imu(message, 0)
         except BadMessage as error:
@@ -137,8 +147,21 @@ class RosSource:
             return
         t_ns = monotonic_ns(message)
         with self._lock:
-            if t_ns is not None and len(self._stream) < _MAX_SAMPLES:
-                self._stream.add(t_ns, rows[0][1])
+            if t_ns is not None:
+                add(t_ns, rows[0][1])
+
+    def _add(self, t_ns: int, row: tuple[float, ...]) -> None:
+        if not any(row[3:]):
+            self.report.skip("imu sample without acceleration", "a topic of rates alone needs imu=GYRO,ACCEL")
+        elif len(self._stream) < _MAX_SAMPLES:
+            self._stream.add(t_ns, row)
+
+    def _add_gyro(self, t_ns: int, row: tuple[float, ...]) -> None:
+        self._joiner.add_gyro(t_ns, row[:3])
+
+    def _add_accel(self, t_ns: int, row: tuple[float, ...]) -> None:
+        for sample in self._joiner.add_accel(t_ns, row[3:]):
+            self._add(*sample)
 
     def poll(self, until_ns: int) -> Frame | ImuBatch | None:
         """The samples up to the next frame, then the frame; None if none came in time. Late samples come with a later
@@ -200,7 +223,9 @@ def open_source(argument: str, mono: bool, imu: bool, told: ToldCalibration | No
 
 
 def _parse(argument: str) -> tuple[str, str, LiveOptions]:
-    """Topic of the IMU, topics of the images, and the options of every live camera."""
+    """Topic of the IMU (of gyroscope and accelerometer, with a comma between), topics of the images, and the options of
+    every live camera.
+    """
     topics, mark, query = argument.partition("?")
     items = query.split("&")
     imu = next((item.removeprefix(_IMU) for item in items if item.startswith(_IMU)), "")

@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -35,13 +34,16 @@ from kiteline_hw.sensors.images import ImageRef, decode_grey
 from kiteline_hw.sensors.imu_buffer import ImuStream, NoImu
 from kiteline_hw.sensors.odometry_buffer import OdometerStream, insert_before_frames
 from kiteline_hw.sensors.raw_pixels import BadImage, RawPixels
+from kiteline_hw.sensors.split_imu import ImuJoiner, join_imu
 from kiteline_hw.sources.bags.bag_files import open_bag, unpacked
+from kiteline_hw.sources.bags.imu_topics import ImuChoice, ImuTopic, accelerations_in_g, choose_imu, what_is_measured
 from kiteline_hw.sources.bags.sqlite_bag import SqliteBag
 from kiteline_hw.sources.mcap_messages import (
     KINDS,
     BadMessage,
     CameraCalibration,
     ChannelKind,
+    ImuRow,
     MessageDecoder,
     Transform,
     is_depth,
@@ -62,7 +64,6 @@ _REORDER_NS = 200_000_000  # ns that a message is held back for older ones recor
 _MAX_REORDER_NS = 1_000_000_000  # ns that it is held back for a channel that lags or went silent
 _TRUTH_WORDS = ("truth", "ground", "gt", "vicon", "mocap", "optitrack", "leica")
 _NO_ODOMETER_WORDS = ("vio", "visual", "vins", "slam", "kiteline", "lidar", "icp", "gps", "gnss")
-_GRAVITY_MESSAGES = 200  # messages from which the unit of acceleration is found: about a second
 STANDARD_GRAVITY = 9.80665  # m/s^2
 _MAX_DYNAMIC_TRANSFORMS = 2000  # messages of moving transforms that are read besides the static ones
 
@@ -81,6 +82,7 @@ class McapSource:
         self._file = file
         self._decoder = MessageDecoder()
         self._accel_in_g = False
+        self._split_imu: ImuChoice | None = None
         self._notes: tuple[str, ...] = ()
         self._odometer_channel: int | None = None
         self._T_b_d: NDArray[np.float64] | None = None  # the odometer's frame in the body; None: they are the same
@@ -154,8 +156,10 @@ class McapSource:
         self._is_log = True
 
     def _open_bag(self, mono: bool, told: ToldCalibration | None) -> None:
-        images, calibrations, imu_channel, imu_frame = self._discover()
+        images, calibrations, imus = self._discover()
         tree = TransformTree(self._transforms())
+        inertial, imu_notes = choose_imu(imus, tree, {i.frame_id for i in images})
+        imu_frame = inertial.gyro.frame_id if inertial is not None else None
         if told is None:
             found = select_rig(self.name, images, calibrations, tree, imu_frame, mono=mono)
         else:
@@ -163,14 +167,18 @@ class McapSource:
         self._truth_topic = None
         self._is_log = False
         self.rig, self._notes = found.rig, found.notes
+        if inertial is None or found.imu_usable:
+            self._notes += imu_notes
         self._left = found.left.channel
         self._right = found.right.channel if found.right is not None else None
         self._depth = found.depth.channel if found.depth is not None else None
-        self._imu_channel = imu_channel if found.imu_usable else None
+        self._imu_channel = None
         self.imu = None
-        if self._imu_channel is not None:
+        if inertial is not None and found.imu_usable:
+            self._imu_channel = inertial.gyro.channel
+            self._split_imu = inertial if inertial.split else None
             self.imu = ImuCalibration(rate_hz=self._rate_hz(self._imu_channel) or ImuCalibration().rate_hz)
-            self._accel_in_g = self._accelerations_in_g(self._imu_channel)
+            self._accel_in_g = accelerations_in_g(self._imu_rows(inertial.accel.channel))
             if self._accel_in_g:
                 self._notes += ("accelerations were in g and are turned to m/s^2",)
         self._choose_odometer(tree, found)
@@ -208,11 +216,11 @@ class McapSource:
             frames = f"its frame {child!r} and the camera's {found.left.frame_id!r}"
             self._notes += (f"odometry of {topic} left out: no static transform between {frames}",)
 
-    def _discover(self) -> tuple[list[ImageTopic], list[tuple[str, CameraCalibration]], int | None, str | None]:
-        """Image topics, calibrations by topic, and channel and frame of the IMU with the most messages."""
+    def _discover(self) -> tuple[list[ImageTopic], list[tuple[str, CameraCalibration]], list[ImuTopic]]:
+        """Image topics, calibrations by topic, and inertial topics."""
         images: list[ImageTopic] = []
         calibrations: list[tuple[str, CameraCalibration]] = []
-        imus: list[tuple[int, int, str]] = []
+        imus: list[ImuTopic] = []
         faults: list[str] = []
         for channel, kind in self._channels():
             topic = self._file.channels[channel].topic
@@ -229,15 +237,21 @@ class McapSource:
                 elif kind is ChannelKind.CALIBRATION:
                     calibrations.append((topic, read_calibration(message)))
                 elif kind is ChannelKind.IMU:
-                    row = read_imu(message, raw.log_ns)[0][1]
-                    if any(row[:3]) and any(row[3:]):  # some drivers have separate topics for gyro and accelerometer
-                        imus.append((self._file.counts.get(channel, 0), channel, read_frame_id(message)))
+                    inertial = ImuTopic(channel, topic, read_frame_id(message), self._file.counts.get(channel, 0))
+                    imus.append(what_is_measured(inertial, self._imu_rows(channel)))
             except BadMessage as error:
                 faults.append(str(error))
+                if kind is ChannelKind.IMU:
+                    imus.append(ImuTopic(channel, topic, "", 0, fault=str(error)))
         if faults and not images:
             raise SourceError(f"{self.name}: {faults[0]}")
-        best = max(imus, default=None)
-        return images, calibrations, best[1] if best else None, best[2] if best else None
+        return images, calibrations, imus
+
+    def _imu_rows(self, channel: int) -> Iterator[list[ImuRow]]:
+        """The samples of each message, from the front of the file."""
+        for raw in self._file.messages((channel,), ordered=False):
+            with suppress(BadMessage):
+                yield read_imu(self._decode(raw), raw.log_ns)
 
     def _image_size(self, channel: int) -> tuple[int, int]:
         raw = self._file.first(channel)
@@ -247,14 +261,6 @@ class McapSource:
         except (BadImage, BadMessage) as error:
             raise SourceError(f"{self.name}: {error}") from error
         return pixels.shape[0], pixels.shape[1]
-
-    def _accelerations_in_g(self, channel: int) -> bool:
-        """True if gravity measures near 1: some drivers send g although ROS demands m/s^2."""
-        norms = []
-        for raw in islice(self._file.messages((channel,), ordered=False), _GRAVITY_MESSAGES):
-            with suppress(BadMessage):
-                norms += [float(np.linalg.norm(row[3:])) for _, row in read_imu(self._decode(raw), raw.log_ns)]
-        return bool(norms) and 0.5 < float(np.median(norms)) < 2.0
 
     def _transforms(self) -> list[Transform]:
         channels = [c for c, kind in self._channels() if kind is ChannelKind.TRANSFORM]
@@ -314,7 +320,11 @@ class McapSource:
         both = self._right is not None and self._depth is not None
 
         def images() -> Iterator[tuple[int, int, ImageRef]]:
-            for t_ns, channel, item in self._in_order(imu is not None):
+            items = self._in_order(imu is not None)
+            if imu is not None and self._split_imu is not None:
+                gyro, accel = self._split_imu.gyro.channel, self._split_imu.accel.channel
+                items = join_imu(items, gyro, accel, ImuJoiner(self.report, self._split_imu.R_g_a))
+            for t_ns, channel, item in items:
                 if channel == self._imu_channel:
                     assert imu is not None
                     imu.add(t_ns, (*item[:3], *(a * STANDARD_GRAVITY for a in item[3:])) if self._accel_in_g else item)
@@ -346,8 +356,10 @@ class McapSource:
     def _in_order(self, with_imu: bool) -> Iterator[tuple[int, int, Any]]:
         """Images and samples (t_ns, channel, item) in order of their stamps, not of their recording."""
         wanted = [c for c in (self._left, self._right, self._depth) if c is not None]
-        if with_imu and self._imu_channel is not None:
-            wanted.append(self._imu_channel)
+        inertial = [self._imu_channel] if with_imu and self._imu_channel is not None else []
+        if with_imu and self._split_imu is not None:
+            inertial.append(self._split_imu.accel.channel)
+        wanted += inertial
         if self._odometer_channel is not None:
             wanted.append(self._odometer_channel)
         newest = dict.fromkeys(wanted, 0)
@@ -356,7 +368,7 @@ class McapSource:
         for raw in self._file.messages(wanted):
             try:
                 message = self._decode(raw)
-                if raw.channel == self._imu_channel:
+                if raw.channel in inertial:
                     items: list[tuple[int, Any]] = list(read_imu(message, raw.log_ns))
                 elif raw.channel == self._odometer_channel:
                     batch = read_velocities(message, raw.log_ns)
@@ -369,7 +381,7 @@ class McapSource:
                 continue
             for t_ns, item in items:
                 # With equal stamps: samples first, then depth, then left and right images.
-                sampled = raw.channel in (self._imu_channel, self._odometer_channel)
+                sampled = raw.channel in inertial or raw.channel == self._odometer_channel
                 rank = 0 if sampled else 1 if raw.channel == self._depth else 2
                 heapq.heappush(heap, (t_ns, rank, order, raw.channel, item))
                 order += 1

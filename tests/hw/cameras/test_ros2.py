@@ -199,6 +199,40 @@ def test_inertial_samples_come_before_their_frame(graph: Graph, calibrated: str)
     source.close()
 
 
+def inertial(graph: Graph, topic: str, t_ns: int, rate: float, force: float) -> None:
+    graph.publish(Imu, topic, header=header(t_ns), angular_velocity=SimpleNamespace(x=rate, y=0.0, z=0.0),
+                  linear_acceleration=SimpleNamespace(x=0.0, y=0.0, z=force))  # fmt: skip
+
+
+def test_rates_and_accelerations_of_two_topics_are_joined(graph: Graph, calibrated: str) -> None:
+    source = open_source("ros2:/image?imu=/gyro/sample,/accel/sample", calibration=calibrated)
+    assert isinstance(source, RosSource)
+    begun(source, graph, 3)
+    t_ns = time.time_ns() - 100_000_000
+    inertial(graph, "/accel/sample", t_ns, 0.0, 8.0)
+    for k in range(4):
+        inertial(graph, "/gyro/sample", t_ns + 5_000_000 * k, 0.1 * k, 0.0)
+    inertial(graph, "/accel/sample", t_ns + 20_000_000, 0.0, 12.0)
+    image(graph, "/image", t_ns + 22_000_000, 40)
+    samples = polled(source)
+    assert isinstance(samples, ImuBatch)
+    np.testing.assert_allclose(samples.gyro[:, 0], [0.0, 0.1, 0.2, 0.3])
+    np.testing.assert_allclose(samples.accel[:, 2], [8.0, 9.0, 10.0, 11.0], atol=0.1)
+    source.close()
+
+
+def test_samples_of_a_topic_of_rates_alone_are_left_out(graph: Graph, calibrated: str) -> None:
+    source = open_source("ros2:/image?imu=/gyro/sample", calibration=calibrated)
+    assert isinstance(source, RosSource)
+    begun(source, graph, 2)
+    t_ns = time.time_ns() - 100_000_000
+    inertial(graph, "/gyro/sample", t_ns, 0.1, 0.0)
+    image(graph, "/image", t_ns + 1_000_000, 40)
+    assert isinstance(polled(source), Frame)
+    assert source.report.skipped == {"imu sample without acceleration": 1}
+    source.close()
+
+
 def test_a_pause_between_readings_of_the_clocks_does_not_move_a_stamp(monkeypatch: pytest.MonkeyPatch) -> None:
     for paused in range(4):
         now_ns, readings = [5 * S], [0]
