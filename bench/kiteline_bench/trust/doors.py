@@ -83,7 +83,7 @@ def doors(folder: Path) -> list[Door]:
         Door("store's rows", by_file(f"rows/{FILE}", read), tuple(_odd_rows(folder / "odd", store))),
         Door("log", by_file("fuzzed.mcap", _read_log), (log,)),
         Door("log as a source", by_file("source.mcap", _open_log), (log,)),
-        Door("ROS 2 bag", by_file("bag.db3", _open_log), (_sqlite_bag(),)),
+        Door("ROS 2 bag", by_file("bag.db3", _open_log), (_sqlite_bag(), _computed_bag())),
         Door("log to import", by_file("import.mcap", lambda path: import_map(path, _no_station)), (log,)),
         Door("rig", lambda data, draw: rig_from_json(_json(data)), (rig,)),
         Door("image", lambda data, draw: decode_grey(EncodedImage(data, "png")), tuple(images.values())),
@@ -196,6 +196,18 @@ def _sqlite_bag() -> bytes:
             "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB);"
             "INSERT INTO topics VALUES(1, '/image', 'sensor_msgs/msg/CompressedImage', 'cdr');"
             "INSERT INTO messages VALUES(1, 1, 5, x'00010000000000000000000001000000000000000000000000000000');"
+        )
+        return bag.serialize()
+
+
+def _computed_bag() -> bytes:
+    """The same with messages that are computed without end."""
+    with contextlib.closing(sqlite3.connect(":memory:")) as bag:
+        bag.deserialize(_sqlite_bag())
+        bag.executescript(
+            "ALTER TABLE messages RENAME TO stored;"
+            "CREATE VIEW messages AS WITH RECURSIVE n(id) AS (SELECT 1 UNION ALL SELECT id + 1 FROM n)"
+            " SELECT id, 1 AS topic_id, id AS timestamp, x'00' AS data FROM n;"
         )
         return bag.serialize()
 

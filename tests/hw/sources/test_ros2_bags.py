@@ -111,6 +111,36 @@ def test_a_database_that_is_no_bag_is_refused(tmp_path: Path) -> None:
         open_source(str(tmp_path / "other.db3"))
 
 
+COUNTED = "WITH RECURSIVE n(id) AS (SELECT 1 UNION ALL SELECT id + 1 FROM n LIMIT 3)"  # without the limit: no end
+
+
+@pytest.mark.parametrize(
+    "computed",
+    [
+        (
+            f"ALTER TABLE messages RENAME TO stored; CREATE VIEW messages AS {COUNTED} "
+            "SELECT id, 1 AS topic_id, id AS timestamp, x'00' AS data FROM n"
+        ),
+        (
+            f"ALTER TABLE topics RENAME TO stored; CREATE VIEW topics AS {COUNTED} "
+            "SELECT id, '/a' AS name, 'b' AS type, 'cdr' AS serialization_format FROM n"
+        ),
+        (
+            f"ALTER TABLE messages RENAME TO stored; CREATE VIEW Messages AS {COUNTED} "
+            "SELECT id, 1 AS topic_id, id AS timestamp, x'00' AS data FROM n"
+        ),
+        "ALTER TABLE messages ADD COLUMN more BLOB AS (zeroblob(900000000))",
+    ],
+)
+def test_a_bag_whose_tables_are_computed_is_refused(tmp_path: Path, computed: str) -> None:
+    file = tmp_path / "a.db3"
+    db3(stereo_bag(), file)
+    with closing(sqlite3.connect(file)) as bag:
+        bag.executescript(computed)
+    with pytest.raises(SourceError, match="tables topics and messages"):
+        open_source(str(file))
+
+
 def test_a_damaged_bag_raises_source_errors_only(tmp_path: Path) -> None:
     good = tmp_path / "good.db3"
     db3(stereo_bag(), good)

@@ -6,6 +6,7 @@ those of the messages that are used are in `ros2_definitions`.
 
 from __future__ import annotations
 
+import re
 import sqlite3
 from collections.abc import Collection, Iterator
 from contextlib import closing
@@ -71,6 +72,7 @@ class SqliteBag:
         numbers: dict[int, int] = {}
         try:
             with closing(_connect(path)) as bag:
+                _check_tables(bag)
                 topics = bag.execute("SELECT id, name, type, serialization_format FROM topics ORDER BY id").fetchall()
                 for topic, name, kind, encoding in topics:
                     numbers[int(topic)] = self._channel(str(name), str(kind), str(encoding))
@@ -101,8 +103,22 @@ class SqliteBag:
         return number
 
 
+def _check_tables(bag: sqlite3.Connection) -> None:
+    """Raise ValueError unless what is read are tables whose values are stored: views may be computed without end."""
+    for name in ("topics", "messages"):
+        found = bag.execute("SELECT type, sql FROM sqlite_master WHERE name = ?", (name,)).fetchone()
+        if found is None:
+            raise ValueError(f"no table {name}")
+        kind, sql = found
+        plain = kind == "table" and re.match(r"CREATE\s+TABLE\b", str(sql), re.IGNORECASE)
+        if not plain or bag.execute(f"SELECT 1 FROM pragma_table_xinfo('{name}') WHERE hidden").fetchone():
+            raise ValueError(f"{name} is no plain table but computed")
+
+
 def _connect(path: Path) -> sqlite3.Connection:
     """The file, opened to read only; `as_uri` escapes what a file name may hold."""
     # SQLite wants to write beside a file with a journal, which a folder that is read only forbids.
     journal = path.with_name(f"{path.name}-wal").exists()
-    return sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro{'' if journal else '&immutable=1'}", uri=True)
+    bag = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro{'' if journal else '&immutable=1'}", uri=True)
+    bag.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MOST_CHUNK_BYTES)  # of a value; a record may name a gigabyte
+    return bag
