@@ -30,7 +30,8 @@ _TO_GREY = {
     "yuv422_yuy2": (2, cv2.COLOR_YUV2GRAY_YUY2),
 }
 _GREY = ("mono8", "8uc1")
-_GREY16 = ("mono16",)
+_GREY16 = {"mono16": None, "mono10": 10, "mono12": 12, "mono14": 14}  # in words of 16 bits; bits where the name says
+SENSOR_BITS = (10, 12, 14, 16)  # of cameras whose pixels are in words of 16
 DEPTH_ENCODINGS = ("16uc1", "32fc1")  # ROS REP 118: millimetres; metres
 
 
@@ -40,7 +41,10 @@ class BadImage(Exception):
 
 @dataclass(frozen=True, slots=True)
 class RawPixels:
-    """Pixels in rows of `step` bytes. encoding: ROS's name of the pixel layout, such as mono8, bgr8, 16UC1."""
+    """Pixels in rows of `step` bytes. encoding: ROS's name of the pixel layout, such as mono8, bgr8, 16UC1.
+
+    bits: how many of the 16 of mono16 the camera fills, from the lowest on.
+    """
 
     width: int
     height: int
@@ -48,6 +52,7 @@ class RawPixels:
     step: int
     data: bytes
     big_endian: bool = False
+    bits: int = 16
 
     @property
     def is_depth(self) -> bool:
@@ -60,7 +65,8 @@ class RawPixels:
         if name in _GREY:
             return np.ascontiguousarray(self._rows(np.uint8, 1))
         if name in _GREY16:
-            return np.asarray(self._rows(np.uint16, 1) >> 8, np.uint8)
+            shift = (_GREY16[name] or self.bits) - 8
+            return np.asarray(np.minimum(self._rows(np.uint16, 1) >> shift, 255), np.uint8)
         if name not in _TO_GREY:
             known = ", ".join((*_GREY, *_GREY16, *_TO_GREY))
             raise BadImage(f"pixel encoding {self.encoding!r} is not known: expected one of {known}")
@@ -69,6 +75,10 @@ class RawPixels:
         if channels > 1:
             pixels = pixels.reshape(self.height, self.width, channels)
         return np.asarray(cv2.cvtColor(pixels, code), np.uint8)
+
+    def brightest(self) -> int | None:
+        """The largest value of mono16; None for other layouts. Raises BadImage."""
+        return int(self._rows(np.uint16, 1).max()) if self.encoding.lower() == "mono16" else None
 
     def metres(self) -> F32:
         """(h, w) float32, 0 unknown. Raises BadImage."""

@@ -5,12 +5,12 @@ from __future__ import annotations
 import heapq
 import json
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +36,7 @@ from kiteline_hw.sensors.odometry_buffer import OdometerStream, insert_before_fr
 from kiteline_hw.sensors.raw_pixels import BadImage, RawPixels
 from kiteline_hw.sensors.split_imu import ImuJoiner, join_imu
 from kiteline_hw.sources.bags.bag_files import open_bag, unpacked
+from kiteline_hw.sources.bags.grey_bits import bits_of_grey
 from kiteline_hw.sources.bags.imu_topics import ImuChoice, ImuTopic, accelerations_in_g, choose_imu, what_is_measured
 from kiteline_hw.sources.bags.sqlite_bag import SqliteBag
 from kiteline_hw.sources.mcap_messages import (
@@ -43,7 +44,6 @@ from kiteline_hw.sources.mcap_messages import (
     BadMessage,
     CameraCalibration,
     ChannelKind,
-    ImuRow,
     MessageDecoder,
     Transform,
     is_depth,
@@ -64,6 +64,7 @@ _REORDER_NS = 200_000_000  # ns that a message is held back for older ones recor
 _MAX_REORDER_NS = 1_000_000_000  # ns that it is held back for a channel that lags or went silent
 _TRUTH_WORDS = ("truth", "ground", "gt", "vicon", "mocap", "optitrack", "leica")
 _NO_ODOMETER_WORDS = ("vio", "visual", "vins", "slam", "kiteline", "lidar", "icp", "gps", "gnss")
+T = TypeVar("T")
 STANDARD_GRAVITY = 9.80665  # m/s^2
 _MAX_DYNAMIC_TRANSFORMS = 2000  # messages of moving transforms that are read besides the static ones
 
@@ -82,6 +83,7 @@ class McapSource:
         self._file = file
         self._decoder = MessageDecoder()
         self._accel_in_g = False
+        self._bits = 16  # that mono16 images use
         self._split_imu: ImuChoice | None = None
         self._notes: tuple[str, ...] = ()
         self._odometer_channel: int | None = None
@@ -108,11 +110,7 @@ class McapSource:
         channel = self._truth_channel()
         if channel is None:
             return None
-        poses = []
-        for raw in self._file.messages((channel,)):
-            with suppress(BadMessage):
-                message = self._decode(raw)
-                poses.append((read_stamp(message, raw.log_ns), read_pose(message)))
+        poses = list(self._each(channel, lambda message, log_ns: (read_stamp(message, log_ns), read_pose(message))))
         return sorted_trajectory(poses) if poses else None
 
     def close(self) -> None:
@@ -167,6 +165,9 @@ class McapSource:
         self._truth_topic = None
         self._is_log = False
         self.rig, self._notes = found.rig, found.notes
+        eyes = [image.channel for image in (found.left, found.right) if image is not None]
+        self._bits, notes = bits_of_grey(self._each(c, lambda message, _: read_image(message, {})) for c in eyes)
+        self._notes += notes
         if inertial is None or found.imu_usable:
             self._notes += imu_notes
         self._left = found.left.channel
@@ -178,7 +179,7 @@ class McapSource:
             self._imu_channel = inertial.gyro.channel
             self._split_imu = inertial if inertial.split else None
             self.imu = ImuCalibration(rate_hz=self._rate_hz(self._imu_channel) or ImuCalibration().rate_hz)
-            self._accel_in_g = accelerations_in_g(self._imu_rows(inertial.accel.channel))
+            self._accel_in_g = accelerations_in_g(self._each(inertial.accel.channel, read_imu))
             if self._accel_in_g:
                 self._notes += ("accelerations were in g and are turned to m/s^2",)
         self._choose_odometer(tree, found)
@@ -238,7 +239,7 @@ class McapSource:
                     calibrations.append((topic, read_calibration(message)))
                 elif kind is ChannelKind.IMU:
                     inertial = ImuTopic(channel, topic, read_frame_id(message), self._file.counts.get(channel, 0))
-                    imus.append(what_is_measured(inertial, self._imu_rows(channel)))
+                    imus.append(what_is_measured(inertial, self._each(channel, read_imu)))
             except BadMessage as error:
                 faults.append(str(error))
                 if kind is ChannelKind.IMU:
@@ -247,11 +248,11 @@ class McapSource:
             raise SourceError(f"{self.name}: {faults[0]}")
         return images, calibrations, imus
 
-    def _imu_rows(self, channel: int) -> Iterator[list[ImuRow]]:
-        """The samples of each message, from the front of the file."""
+    def _each(self, channel: int, read: Callable[[Any, int], T]) -> Iterator[T]:
+        """What `read` makes of each message that can be read and its log time, in the order of the file."""
         for raw in self._file.messages((channel,), ordered=False):
             with suppress(BadMessage):
-                yield read_imu(self._decode(raw), raw.log_ns)
+                yield read(self._decode(raw), raw.log_ns)
 
     def _image_size(self, channel: int) -> tuple[int, int]:
         raw = self._file.first(channel)
@@ -375,7 +376,7 @@ class McapSource:
                     items = [(int(batch.t_ns[-1]), batch)] if len(batch.t_ns) else []
                 else:
                     metadata = self._file.channels[raw.channel].metadata
-                    items = [(read_stamp(message, raw.log_ns), read_image(message, metadata))]
+                    items = [(read_stamp(message, raw.log_ns), read_image(message, metadata, self._bits))]
             except BadMessage as error:
                 self.report.skip("unreadable message", str(error))
                 continue

@@ -444,4 +444,32 @@ def test_pixel_encodings(tmp_path: Path, encoding: str, pixels: np.ndarray, grey
     np.testing.assert_allclose(frames[0].left[2:-2, 2:-2], grey, atol=1)
 
 
+@pytest.mark.parametrize(("brightest", "bits"), [(900, 10), (1023, 10), (3000, 12), (16383, 14), (16384, 16)])
+def test_mono16_is_scaled_by_the_bits_that_the_camera_fills(tmp_path: Path, brightest: int, bits: int) -> None:
+    """Fixed for the recording and for both eyes, by the brightest pixel of the first images; later ones are clipped."""
+    bag = Bag()
+    bag.info(START_NS, "left", tx=0.0)
+    bag.info(START_NS, "right", tx=-6.6)
+    for i in range(70):
+        for side in ("left", "right"):
+            image = np.full((48, 64), min(500 + 200 * (i > 65), brightest), np.uint16)
+            image[0, 0] = brightest if (side, i) == ("right", 40) else 65535 if i == 69 else 0
+            bag.raw(START_NS + i * STEP_NS, side, "mono16", image)
+    source = open_source(str(bag.write(tmp_path / "a.mcap")))
+    frames, _ = read(source)
+    assert frames[0].left[9, 9] == 500 >> (bits - 8) and frames[68].left[9, 9] == 700 >> (bits - 8)
+    assert frames[40].right is not None and frames[40].right[0, 0] == brightest >> (bits - 8)
+    assert frames[69].left[0, 0] == 255
+    assert any(f"hold {bits} bits" in note for note in source.report.notes) == (bits < 16)
+
+
+@pytest.mark.parametrize("encoding", ["mono10", "mono12"])
+def test_an_encoding_that_names_its_bits_is_scaled_by_them(tmp_path: Path, encoding: str) -> None:
+    bag = Bag()
+    bag.info(START_NS, "eye")
+    bag.raw(START_NS, "eye", encoding, np.full((48, 64), 500, np.uint16))
+    frames, _ = read(open_source(str(bag.write(tmp_path / "a.mcap"))))
+    assert (frames[0].left == 500 >> (int(encoding[4:]) - 8)).all()
+
+
 # --- Foxglove
