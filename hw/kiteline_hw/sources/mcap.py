@@ -19,7 +19,7 @@ from kiteline_core import odometry
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration, OdometryBatch, Trajectory
 from kiteline_core.geometry.cameras import CameraRig
 from kiteline_hw.calibration.told import ToldCalibration
-from kiteline_hw.logs.mcap_file import McapFile, RawMessage
+from kiteline_hw.logs.mcap_file import RawMessage
 from kiteline_hw.logs.mcap_log import DEPTH, GROUND_TRUTH, IMU, LEFT, ODOMETER, RIG, RIGHT
 from kiteline_hw.logs.rig_json import rig_from_json
 from kiteline_hw.ports import SourceError, SourceReport
@@ -35,10 +35,9 @@ from kiteline_hw.sensors.imu_buffer import ImuStream, NoImu
 from kiteline_hw.sensors.odometry_buffer import OdometerStream, insert_before_frames
 from kiteline_hw.sensors.raw_pixels import BadImage, RawPixels
 from kiteline_hw.sensors.split_imu import ImuJoiner, join_imu
-from kiteline_hw.sources.bags.bag_files import open_bag, unpacked
+from kiteline_hw.sources.bags.bag_files import Bag, open_bag, unpacked
 from kiteline_hw.sources.bags.grey_bits import bits_of_grey
 from kiteline_hw.sources.bags.imu_topics import ImuChoice, ImuTopic, accelerations_in_g, choose_imu, what_is_measured
-from kiteline_hw.sources.bags.sqlite_bag import SqliteBag
 from kiteline_hw.sources.mcap_messages import (
     KINDS,
     BadMessage,
@@ -77,7 +76,7 @@ def open_source(path_name: str, mono: bool, imu: bool, told: ToldCalibration | N
 class McapSource:
     """A FrameSource over an MCAP file or a ROS 2 bag, whose messages are read while iterating."""
 
-    def __init__(self, file: McapFile | SqliteBag, mono: bool, imu: bool, told: ToldCalibration | None = None) -> None:
+    def __init__(self, file: Bag, mono: bool, imu: bool, told: ToldCalibration | None = None) -> None:
         self.name = f"mcap:{file.path}"
         self.report = SourceReport()
         self._file = file

@@ -6,6 +6,7 @@ import sqlite3
 from contextlib import closing, suppress
 from pathlib import Path
 
+import numpy as np
 import pytest
 import zstandard
 from mcap.writer import Writer
@@ -15,7 +16,7 @@ from kiteline_hw.ports import SourceError
 from kiteline_hw.sources.bags.ros2_definitions import definition_of
 from kiteline_hw.sources.mcap_messages import KINDS
 from kiteline_hw.sources.open import open_source
-from tests.hw.sources.camera_messages import read
+from tests.hw.sources.camera_messages import START_NS, quaternion, read, xyz
 from tests.hw.sources.test_mcap import Bag, check_stereo, stereo_bag
 
 _TABLES = """
@@ -65,6 +66,55 @@ def test_the_parts_of_a_split_bag_follow_each_other(tmp_path: Path) -> None:
     (tmp_path / "metadata.yaml").write_text("rosbag2_bagfile_information:\n")
     db3(stereo_bag(20), tmp_path / "b_0.db3", tmp_path / "b_1.db3", tmp_path / "b_2.db3")
     check_stereo(open_source(str(tmp_path)), 20)
+
+
+def mcap_parts(folder: Path, names: list[str], bag: Bag) -> list[Path]:
+    """Write a bag in as many parts as there are names; channels have other numbers in each."""
+    folder.mkdir(exist_ok=True)
+    share = -(-len(bag.messages) // len(names))
+    paths = []
+    for k, name in enumerate(names):
+        part = Bag()
+        if k:  # a topic that no other part has moves the numbers
+            part.add(bag.messages[k * share][0], f"/only/{k}", "geometry_msgs/msg/PoseStamped", "x",
+                     pose={"position": xyz(np.zeros(3)), "orientation": quaternion(np.eye(4))})  # fmt: skip
+        part.messages += bag.messages[k * share : (k + 1) * share]
+        paths.append(part.write(folder / name))
+    return paths
+
+
+@pytest.mark.parametrize("listed", [False, True])
+def test_the_parts_of_a_split_bag_in_mcap_follow_each_other(tmp_path: Path, listed: bool) -> None:
+    names = ["late.mcap", "early.mcap"] if listed else [f"b_{k}.mcap" for k in (9, 10, 11)]
+    if listed:
+        (tmp_path / "metadata.yaml").write_text("relative_file_paths:\n- late.mcap\n- early.mcap\n")
+    mcap_parts(tmp_path, names, stereo_bag(20))
+    source = open_source(str(tmp_path))
+    check_stereo(source, 20)
+    assert source.frame_count == 20 and source.imu is not None
+    assert source.imu.rate_hz == pytest.approx(200, rel=0.1)
+
+
+def test_the_part_of_a_split_bag_that_was_cut_is_read_up_to_the_cut(tmp_path: Path) -> None:
+    paths = mcap_parts(tmp_path, ["b_0.mcap", "b_1.mcap"], stereo_bag(20))
+    data = paths[1].read_bytes()
+    paths[1].write_bytes(data[: len(data) // 2])
+    source = open_source(str(tmp_path))
+    frames, _ = read(source)
+    assert 11 < len(frames) < 20 and any("b_1.mcap is cut" in note for note in source.report.notes)
+
+
+def test_files_that_are_no_parts_of_one_bag_are_refused(tmp_path: Path) -> None:
+    mcap_parts(tmp_path / "names", ["monday.mcap", "tuesday.mcap"], stereo_bag())
+    mcap_parts(tmp_path / "times", ["a_0.mcap"], stereo_bag(60))
+    mcap_parts(tmp_path / "times", ["a_1.mcap"], stereo_bag(40))
+    mcap_parts(tmp_path / "topics", ["a_0.mcap"], stereo_bag())
+    other = Bag()
+    other.odometry(START_NS + 10**9, "/wheels", "base_link", [1.0, 0.0, 0.0], [0.0, 0.0, 0.0])
+    other.write(tmp_path / "topics" / "a_1.mcap")
+    for name, why in (("names", "not named"), ("times", r"begins \d\.\d s before"), ("topics", "shares no topic")):
+        with pytest.raises(SourceError, match=rf"2 MCAP files.*{why}.*kiteline log merge OUT\.mcap"):
+            open_source(str(tmp_path / name))
 
 
 def test_messages_packed_one_by_one_in_mcap(tmp_path: Path) -> None:

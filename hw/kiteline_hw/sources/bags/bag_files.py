@@ -9,11 +9,14 @@ import zstandard
 from kiteline_hw.logs.mcap_file import MOST_CHUNK_BYTES, McapFile
 from kiteline_hw.ports import SourceError
 from kiteline_hw.sources.bags.bag_heads import SQLITE_MAGIC, ZSTD_MAGIC, refuse_unreadable
+from kiteline_hw.sources.bags.mcap_parts import McapParts
 from kiteline_hw.sources.bags.sqlite_bag import SqliteBag
 from kiteline_hw.sources.mcap_messages import BadMessage
 
+Bag = McapFile | McapParts | SqliteBag
 
-def open_bag(path: Path) -> McapFile | SqliteBag:
+
+def open_bag(path: Path) -> Bag:
     """Open an MCAP file, a SQLite bag, or the bag in a folder. Raises SourceError."""
     if path.is_dir():
         return _bag_in_folder(path)
@@ -23,12 +26,10 @@ def open_bag(path: Path) -> McapFile | SqliteBag:
     return SqliteBag([path]) if head == SQLITE_MAGIC else McapFile(path)
 
 
-def _bag_in_folder(folder: Path) -> McapFile | SqliteBag:
+def _bag_in_folder(folder: Path) -> Bag:
     files = sorted(folder.glob("*.mcap"))
     if len(files) > 1:
-        raise SourceError(
-            f"{folder}: {len(files)} MCAP files: name one, or join them with `kiteline log merge OUT.mcap FILES…`"
-        )
+        return McapParts(folder, files)
     if files:
         return McapFile(files[0])
     parts = sorted(folder.glob("*.db3"))

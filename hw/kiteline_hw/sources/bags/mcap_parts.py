@@ -1,0 +1,111 @@
+"""The parts of a ROS 2 bag in MCAP storage that was split by size or duration, BAG_0.mcap, BAG_1.mcap…, read as one."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Iterator
+from itertools import pairwise
+from pathlib import Path
+
+from mcap.records import Channel, Schema
+
+from kiteline_hw.logs.mcap_file import McapFile, RawMessage
+from kiteline_hw.ports import SourceError
+
+_OVERLAP_NS = 200_000_000  # ns; topics are written by threads of their own, so that stamps cross where a part ends
+_MOST_METADATA_BYTES = 1 << 20
+_NUMBERED = re.compile(r"(.*)_(\d+)")
+
+
+class McapParts:
+    """The messages of all parts, with the attributes and methods of McapFile.
+
+    Raises SourceError if the files are no parts of one bag: by their names or metadata.yaml, topics and times.
+    """
+
+    def __init__(self, folder: Path, paths: list[Path]) -> None:
+        self.path = folder
+        self.schemas: dict[int, Schema] = {}
+        self.channels: dict[int, Channel] = {}
+        self.counts: dict[int, int] = {}
+        if not (_numbered(paths) or _listed(folder, paths)):
+            raise self._strangers(len(paths), "no metadata.yaml lists them, and they are not named BAG_0, BAG_1…")
+        parts = [McapFile(path) for path in paths]
+        self.cut = "; ".join(f"{part.path.name} is {part.cut}" for part in parts if part.cut) or None
+        parts = sorted((part for part in parts if any(part.counts.values())), key=lambda part: part.first_ns)
+        for before, after in pairwise(parts):
+            overlap_ns = before.last_ns - after.first_ns
+            if overlap_ns > min(_OVERLAP_NS, (before.last_ns - before.first_ns) // 2):
+                why = f"{after.path.name} begins {overlap_ns * 1e-9:.1f} s before"
+                raise self._strangers(len(paths), f"{why} {before.path.name} ends")
+        self._parts: list[tuple[McapFile, dict[int, int]]] = []  # with this object's number of each channel
+        for part in parts:
+            numbers = {own: self._channel(part, own) for own in sorted(part.channels)}
+            used = {numbers[own] for own, count in part.counts.items() if count and own in numbers}
+            if self._parts and not used & self.counts.keys():
+                raise self._strangers(len(paths), f"{part.path.name} shares no topic with those before it")
+            for own, count in part.counts.items():
+                if count and own in numbers:
+                    self.counts[numbers[own]] = self.counts.get(numbers[own], 0) + count
+            self._parts.append((part, numbers))
+        self.first_ns = parts[0].first_ns if parts else 0
+        self.last_ns = max((part.last_ns for part in parts), default=0)
+
+    @property
+    def notes(self) -> list[str]:
+        """Damaged parts of the files."""
+        return [f"{part.path.name}: {note}" for part, _ in self._parts for note in part.notes]
+
+    def schema_of(self, channel: int) -> Schema | None:
+        """The schema of a channel's messages, or None."""
+        return self.schemas.get(channel)
+
+    def messages(self, channels: Collection[int] | None = None, ordered: bool = True) -> Iterator[RawMessage]:
+        """Messages of the channels (None: all), part by part, as McapFile gives those of each."""
+        for part, numbers in self._parts:
+            wanted = [own for own, number in numbers.items() if channels is None or number in channels]
+            for message in part.messages(wanted, ordered):
+                yield message._replace(channel=numbers[message.channel])
+
+    def first(self, channel: int) -> RawMessage | None:
+        """The first message of a channel."""
+        return next(self.messages((channel,), ordered=False), None)
+
+    def _channel(self, part: McapFile, own: int) -> int:
+        """This object's number of a channel of a part: one a topic and schema."""
+        told, schema = part.channels[own], part.schema_of(own)
+        name = schema.name if schema is not None else ""
+        for number, channel in self.channels.items():
+            known = self.schemas.get(number)
+            if (channel.topic, known.name if known is not None else "") == (told.topic, name):
+                return number
+        number = len(self.channels) + 1
+        self.channels[number] = Channel(
+            id=number, topic=told.topic, message_encoding=told.message_encoding, metadata=told.metadata,
+            schema_id=number if schema is not None else 0,
+        )  # fmt: skip
+        if schema is not None:
+            self.schemas[number] = Schema(id=number, name=name, encoding=schema.encoding, data=schema.data)
+        return number
+
+    def _strangers(self, count: int, why: str) -> SourceError:
+        return SourceError(
+            f"{self.path}: {count} MCAP files that are no parts of one bag ({why}): name one, or join them with "
+            "`kiteline log merge OUT.mcap FILES…`"
+        )
+
+
+def _numbered(paths: list[Path]) -> bool:
+    """True if the files are named as rosbag2 names parts."""
+    found = [_NUMBERED.fullmatch(path.stem) for path in paths]
+    return all(found) and len({match[1] for match in found if match}) == 1
+
+
+def _listed(folder: Path, paths: list[Path]) -> bool:
+    """True if the bag's metadata.yaml names all files."""
+    try:
+        with (folder / "metadata.yaml").open("rb") as file:
+            text = file.read(_MOST_METADATA_BYTES)
+    except OSError:
+        return False
+    return all(path.name.encode() in text for path in paths)
