@@ -13,6 +13,7 @@ import pytest
 from kiteline_basestation.grid.grid_view import GridView
 from kiteline_basestation.web import messages
 from kiteline_basestation.web.snapshot import AgentStatus, PageSnapshot
+from kiteline_cli.main import main as kiteline
 from kiteline_core.ids import AgentId
 from kiteline_hw.ports import LinkError
 from kiteline_lab.tools import maps, status
@@ -78,6 +79,16 @@ def test_another_program_is_told_in_a_line(answer: tuple[bool, str], monkeypatch
         status.main([])
 
 
-def test_a_period_that_is_no_time_is_refused() -> None:
+@pytest.mark.parametrize("period", ["0", "nan", "inf"])
+def test_a_period_that_is_no_time_is_refused(period: str) -> None:
     with pytest.raises(SystemExit):
-        status.main(["--watch", "0"])
+        status.main(["--watch", period])
+
+
+def test_the_help_names_the_exit_status_of_a_base_that_does_not_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    def silent(*_: Any, **__: Any) -> None:
+        raise LinkError("no base station answers")
+
+    monkeypatch.setattr(maps, "ask", silent)
+    monkeypatch.setattr(maps, "default_path", lambda: Path("no keys"))
+    assert kiteline(["status"]) == 2 and "2 no base answers" in status.parser().format_help().replace("\n", " ")

@@ -74,6 +74,7 @@ def _measured_depth(item: Item, number: int) -> Item:
     rng = np.random.default_rng([number, 31])
     depth: NDArray[np.float64] = true + _DEPTH_NOISE * true.astype(np.float64) ** 2 * rng.standard_normal(true.shape)
     coarse = rng.random((true.shape[0] // 16, true.shape[1] // 16))
-    hole = cv2.resize(coarse, (true.shape[1], true.shape[0])) < _HOLES
+    smooth = cv2.resize(coarse, (true.shape[1], true.shape[0]))
+    hole = smooth < np.quantile(smooth, _HOLES)
     depth = np.where(hole | (depth < _SHORT_M) | (depth > _NEAR_M), 0.0, np.round(1000.0 * depth) / 1000.0)
     return replace(item, frame=replace(item.frame, depth_m=depth.astype(np.float32)))

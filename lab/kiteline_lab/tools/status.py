@@ -11,7 +11,7 @@ from typing import Any
 from kiteline_hw.ports import LinkError
 from kiteline_lab.tools.maps import DEFAULT_BASE, add_options, ask_base
 
-_WATCH_S = 2.0  # s between two reports
+_WATCH_S, _MOST_WATCH_S = 2.0, 86400.0  # s between two reports
 
 
 def parser() -> argparse.ArgumentParser:
@@ -19,7 +19,7 @@ def parser() -> argparse.ArgumentParser:
     p = argparse.ArgumentParser(
         prog="kiteline status",
         description="Ask a running base what it does: agents and their links, map, store, and what is wrong.",
-        epilog="Exit status: 0 all is well, 1 something is wrong, or no base answers. A base on a serial line or "
+        epilog="Exit status: 0 all is well, 1 something is wrong, 2 no base answers. A base on a serial line or "
         "MAVLink answers where its --maps says. The status page (`kiteline base --web`) shows the same with the map.",
     )
     add_options(p, endpoint=DEFAULT_BASE, key=None, as_json=False)
@@ -103,8 +103,8 @@ def _span(seconds: float) -> str:
 def main(argv: list[str]) -> int:
     """Run `kiteline status`; exit status 1 if something is wrong. Raises LinkError."""
     a = parser().parse_args(argv)
-    if a.watch is not None and not a.watch > 0.0:
-        parser().error(f"--watch {a.watch:g}: expected seconds above 0")
+    if a.watch is not None and not 0.0 < a.watch <= _MOST_WATCH_S:
+        parser().error(f"--watch {a.watch:g}: expected more than 0 and at most {_MOST_WATCH_S:g} seconds")
     before: Mapping[str, Any] | None = None
     while True:
         ok, text, report = ask_base(a.base, a.key, "status", "{}")

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import sqlite3
+import threading
 from contextlib import closing, suppress
 from pathlib import Path
 
@@ -115,6 +117,31 @@ def test_files_that_are_no_parts_of_one_bag_are_refused(tmp_path: Path) -> None:
     for name, why in (("names", "not named"), ("times", r"begins \d\.\d s before"), ("topics", "shares no topic")):
         with pytest.raises(SourceError, match=rf"2 MCAP files.*{why}.*kiteline log merge OUT\.mcap"):
             open_source(str(tmp_path / name))
+
+
+def test_bags_of_several_flights_in_a_folder_are_not_joined(tmp_path: Path) -> None:
+    db3(stereo_bag(), tmp_path / "morning_0.db3", tmp_path / "morning_1.db3")
+    db3(stereo_bag(), tmp_path / "noon_0.db3")
+    with pytest.raises(SourceError, match="3 SQLite bags: name one"):
+        open_source(str(tmp_path))
+    (tmp_path / "metadata.yaml").write_text("relative_file_paths: [morning_0.db3, morning_1.db3, noon_0.db3]\n")
+    assert open_source(str(tmp_path)).frame_count
+
+
+def test_a_named_pipe_in_a_folder_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    found: list[BaseException] = []
+
+    def opened() -> None:
+        try:
+            open_source(str(tmp_path))
+        except SourceError as error:
+            found.append(error)
+
+    thread = threading.Thread(target=opened, daemon=True)
+    thread.start()
+    thread.join(10.0)
+    assert "layout not recognised" in str(found)
 
 
 def test_messages_packed_one_by_one_in_mcap(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import zstandard
 from kiteline_hw.logs.mcap_file import MOST_CHUNK_BYTES, McapFile
 from kiteline_hw.ports import SourceError
 from kiteline_hw.sources.bags.bag_heads import SQLITE_MAGIC, ZSTD_MAGIC, refuse_unreadable
-from kiteline_hw.sources.bags.mcap_parts import McapParts
+from kiteline_hw.sources.bags.mcap_parts import McapParts, are_parts
 from kiteline_hw.sources.bags.sqlite_bag import SqliteBag
 from kiteline_hw.sources.mcap_messages import BadMessage
 
@@ -33,6 +33,11 @@ def _bag_in_folder(folder: Path) -> Bag:
     if files:
         return McapFile(files[0])
     parts = sorted(folder.glob("*.db3"))
+    if len(parts) > 1 and not are_parts(folder, parts):
+        raise SourceError(
+            f"{folder}: {len(parts)} SQLite bags: name one; no metadata.yaml lists them as parts of one bag, and they "
+            "are not named BAG_0, BAG_1…"
+        )
     if parts:
         return SqliteBag(parts)
     for path in sorted(folder.iterdir()):

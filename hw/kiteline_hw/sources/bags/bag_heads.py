@@ -15,6 +15,8 @@ _ROS1_MAGIC = b"#ROSBAG"
 def refuse_unreadable(path: Path) -> None:
     """Raise SourceError, with what helps, for a ROS 1 bag and for a file that was packed as a whole."""
     try:
+        if not path.is_file():  # to open a named pipe waits for what writes to it
+            return
         with path.open("rb") as file:
             head = file.read(len(_ROS1_MAGIC))
     except OSError:

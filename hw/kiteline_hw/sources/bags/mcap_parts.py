@@ -28,7 +28,7 @@ class McapParts:
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
         self.counts: dict[int, int] = {}
-        if not (_numbered(paths) or _listed(folder, paths)):
+        if not are_parts(folder, paths):
             raise self._strangers(len(paths), "no metadata.yaml lists them, and they are not named BAG_0, BAG_1…")
         parts = [McapFile(path) for path in paths]
         self.cut = "; ".join(f"{part.path.name} is {part.cut}" for part in parts if part.cut) or None
@@ -93,6 +93,11 @@ class McapParts:
             f"{self.path}: {count} MCAP files that are no parts of one bag ({why}): name one, or join them with "
             "`kiteline log merge OUT.mcap FILES…`"
         )
+
+
+def are_parts(folder: Path, paths: list[Path]) -> bool:
+    """True if the names of files in a folder, or its metadata.yaml, say that they are parts of one bag."""
+    return _numbered(paths) or _listed(folder, paths)
 
 
 def _numbered(paths: list[Path]) -> bool:
