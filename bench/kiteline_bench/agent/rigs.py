@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_bench.harness.bars import Bar, Bench, at_most
+from kiteline_bench.harness.bars import Bar, Bench, at_most, table
 from kiteline_bench.harness.recording import Item, Recording, items_of
-from kiteline_bench.reality.flown import flown, table
+from kiteline_bench.harness.run import fly_alone
 from kiteline_hw.sim.source import open_sim
 
 SEED, START_S, SECONDS = 4, 20.0, 8.0
@@ -44,16 +44,16 @@ RIGS: dict[str, tuple[dict[str, Any], float, str]] = {
 
 def run(bench: Bench) -> list[Bar]:
     """Every frame is tracked; the error is at most 4 mm, or a multiple of the usual rig's, whichever is more."""
-    usual_m = flown(bench, "752x480, 11 cm, 20 Hz", _recording(bench, {}), base=False).ate_m("odometry")
+    usual_m = fly_alone(_recording(bench, {})).ate_m("o")
     bars, rows = [], [("752x480, 11 cm, 20 Hz", 1000.0 * usual_m, 0, "")]
     for name, (options, times, why) in RIGS.items():
-        flight = flown(bench, name, _recording(bench, options), base=False)
-        lost, error_m = len(flight.run.t_ns) - len(flight.run.tracked), flight.ate_m("odometry")
+        flight = fly_alone(_recording(bench, options))
+        lost, error_m = flight.lost, flight.ate_m("o")
         bars.append(at_most(f"{name}: frames without a pose", lost, 0, ""))
         limit_m = max(times * usual_m, _LEAST_M)
         bars.append(at_most(f"{name}: ATE, agent alone", 1000.0 * error_m, 1000.0 * limit_m, "mm", 1))
         rows.append((name, 1000.0 * error_m, lost, why))
-        bench.say(f"  {1000.0 * error_m:.1f} mm, without a pose {lost}")
+        bench.say(f"{name}: {1000.0 * error_m:.1f} mm, without a pose {lost}")
     table(bench, "ATE in mm", ("rig", "ATE", "frames without a pose", "why it may err more"), rows)
     return bars
 

@@ -13,9 +13,8 @@ from kiteline_bench.grid.flown import FlownGrid, fly_grid, picture_path
 from kiteline_bench.grid.ideal import by_centres, by_whole_cells
 from kiteline_bench.grid.places import Place, all_places
 from kiteline_bench.grid.sparse import binary_grid, labels_by_height, log_odds_grid
-from kiteline_bench.harness.bars import Bar, Bench
+from kiteline_bench.harness.bars import Bar, Bench, table
 from kiteline_bench.harness.recording import load
-from kiteline_bench.reality.flown import table
 from kiteline_lab.grids.files import OCCUPIED, GridFile
 from kiteline_lab.grids.picture import draw_comparison, resampled
 from kiteline_lab.grids.prm import GridScore, score

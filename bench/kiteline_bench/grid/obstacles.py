@@ -11,10 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_agent.config import AgentConfig
-from kiteline_bench.harness.bars import Bar, Bench, at_most, is_true
+from kiteline_bench.harness.bars import Bar, Bench, at_most, is_true, table
 from kiteline_bench.harness.run import FlyingAgent, fly_recording
 from kiteline_bench.harness.simulated import random_flight
-from kiteline_bench.reality.flown import table
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import Rectifier
 from kiteline_hw.sim.truth.sight_kernels import level_distances

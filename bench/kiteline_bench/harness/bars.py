@@ -100,6 +100,19 @@ class Bench:
 Run = Callable[[Bench], list[Bar]]
 
 
+def table(bench: Bench, title: str, columns: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
+    """Show figures of single flights below the bars."""
+    lines = [f"{title}:", "", f"| {' | '.join(columns)} |", f"|{'---|' * len(columns)}"]
+    lines += [f"| {' | '.join(_text(value) for value in row)} |" for row in rows]
+    bench.more.append("\n".join(lines))
+
+
+def _text(value: object) -> str:
+    if isinstance(value, float):
+        return f"{value:.0f}" if abs(value) >= 100.0 else f"{value:.3g}"
+    return str(value)
+
+
 def in_turn(*runs: Run, warm: bool = False) -> Run:
     """A benchmark that runs others in turn."""
 

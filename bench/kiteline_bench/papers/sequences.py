@@ -11,9 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from kiteline_bench.harness.bars import Bar, Bench, FlightFailed, at_most, is_true
+from kiteline_bench.harness.bars import Bar, Bench, FlightFailed, at_most, is_true, table
 from kiteline_bench.harness.result import FlownProcesses
-from kiteline_bench.reality.flown import table
 from kiteline_hw.ports import SourceError
 from kiteline_hw.sources.open import open_source, recognise
 from kiteline_lab.evaluation import metrics, trajectories

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from kiteline_bench.harness.bars import Bar, Bench
+from kiteline_bench.harness.bars import Bar, Bench, table
 from kiteline_bench.harness.recording import Recording, load
 from kiteline_bench.reality import worn
-from kiteline_bench.reality.flown import flown, spread, table
+from kiteline_bench.reality.flown import flown, spread
 
 _RATIO, _WORST_RATIO = 1.0, 1.1
 _LINKS = {"wifi": (0, 0), "radio": (1000, 500)}  # bytes a second up and down; 0: no limit

@@ -5,9 +5,9 @@ from __future__ import annotations
 import os
 from typing import Any
 
-from kiteline_bench.harness.bars import Bar, Bench
+from kiteline_bench.harness.bars import Bar, Bench, table
 from kiteline_bench.harness.recording import Recording, items_of
-from kiteline_bench.reality.flown import flown, spread, table
+from kiteline_bench.reality.flown import flown, spread
 from kiteline_hw.sim.source import open_sim
 
 SEEDS = (951, 952, 953)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from kiteline_bench.harness.bars import Bar, Bench, at_most
+from kiteline_bench.harness.bars import Bar, Bench, at_most, table
 from kiteline_bench.harness.recording import load
-from kiteline_bench.reality.flown import flown, spread, table
+from kiteline_bench.reality.flown import flown, spread
 
 FLIGHT = "euroc_mh01_air"
 STARTS_S = tuple(2.0 * k for k in range(11))  # of 35 s

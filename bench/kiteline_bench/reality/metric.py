@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from kiteline_bench.harness.bars import Bar, Bench, at_most, is_true
+from kiteline_bench.harness.bars import Bar, Bench, at_most, is_true, table
 from kiteline_bench.harness.recording import Recording, load
 from kiteline_bench.harness.simulated import random_flight
 from kiteline_bench.reality.euroc import FLIGHT
-from kiteline_bench.reality.flown import flown, table
+from kiteline_bench.reality.flown import flown
 
 _SIMULATED = tuple(range(300, 327))  # numbers of random flights; every second one by a worn rig
 _SIMULATED_STARTS_S = (0.0, 2.0, 4.0)

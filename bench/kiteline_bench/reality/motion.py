@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from kiteline_bench.harness.bars import Bar, Bench
+from kiteline_bench.harness.bars import Bar, Bench, table
 from kiteline_bench.harness.recording import load
-from kiteline_bench.reality.flown import Flown, flown, spread, table
+from kiteline_bench.reality.flown import Flown, flown, spread
 from kiteline_core.geometry import se3
 from kiteline_lab.evaluation import metrics
 

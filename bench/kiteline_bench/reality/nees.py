@@ -7,10 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from kiteline_bench.agent.consistency import Counts, nees_bar, quality_bars
-from kiteline_bench.harness.bars import Bar, Bench
+from kiteline_bench.harness.bars import Bar, Bench, table
 from kiteline_bench.harness.run import fly_alone
 from kiteline_bench.harness.simulated import random_flight
-from kiteline_bench.reality.flown import table
 
 FLIGHTS = tuple(range(200, 230))  # numbers of random flights
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-from kiteline_bench.harness.bars import Bar, Bench, at_most
+from kiteline_bench.harness.bars import Bar, Bench, at_most, table
 from kiteline_bench.harness.recording import Recording
 from kiteline_bench.harness.simulated import random_flight
-from kiteline_bench.reality.flown import Flown, flown, spread, table
+from kiteline_bench.reality.flown import Flown, flown, spread
 
 _FLIGHTS = tuple(range(400, 420))  # numbers of random flights
 _STARTS_S = (0.0, 1.0, 2.0, 3.0, 4.0)

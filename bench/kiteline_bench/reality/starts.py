@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from kiteline_bench.harness.bars import Bar, Bench, at_most
+from kiteline_bench.harness.bars import Bar, Bench, at_most, table
 from kiteline_bench.harness.recording import Recording, load
 from kiteline_bench.reality.euroc import FLIGHT
-from kiteline_bench.reality.flown import flown, table
+from kiteline_bench.reality.flown import flown
 
 _AT_REST = "euroc_v101_start"  # moves by a few centimetres in two seconds: no scale is to be told
 _RENDERED = "room_flight.mcap"

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from kiteline_bench.harness.bars import Bar, Bench
+from kiteline_bench.harness.bars import Bar, Bench, table
 from kiteline_bench.harness.recording import load
-from kiteline_bench.reality.flown import flown, spread, table
+from kiteline_bench.reality.flown import flown, spread
 
 FLIGHT = "kitti_straight"
 STARTS_S = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0, 1.2)  # of 5 s

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from kiteline_agent.agent import Agent
 from kiteline_agent.config import AgentConfig
-from kiteline_bench.harness.bars import Bar, Bench
+from kiteline_bench.harness.bars import Bar, Bench, table
 from kiteline_bench.harness.recording import Recording, load
 from kiteline_bench.harness.simulated import render
-from kiteline_bench.reality.flown import Flown, flown, spread, table
+from kiteline_bench.reality.flown import Flown, flown, spread
 from kiteline_core.frame import ImuBatch
 from kiteline_hw.logs.rig_json import rig_from_json
 

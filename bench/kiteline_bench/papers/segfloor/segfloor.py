@@ -20,11 +20,10 @@ from kiteline_basestation.grid.grid_updates import GridUpdates
 from kiteline_bench.grid.flown import FlownGrid, fly_grid, picture_path
 from kiteline_bench.grid.scans import Scanner, as_file
 from kiteline_bench.grid.sparse import binary_grid, labels_by_height
-from kiteline_bench.harness.bars import Bar, Bench, at_most, is_true
+from kiteline_bench.harness.bars import Bar, Bench, at_most, is_true, table
 from kiteline_bench.harness.recording import Recording
 from kiteline_bench.papers.segfloor.plot import plot_scenes, plot_updates
 from kiteline_bench.papers.segfloor.scenes import Scene, corridor_1, corridor_2, rendered, synthetic, trajectory
-from kiteline_bench.reality.flown import table
 from kiteline_codec.channel import RecordChannel
 from kiteline_codec.schema import KeyframeScan, Record
 from kiteline_hw.sim.source import SimSource

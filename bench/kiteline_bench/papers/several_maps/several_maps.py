@@ -15,14 +15,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_bench.harness.bars import Bar, Bench, at_most, is_true
+from kiteline_bench.harness.bars import Bar, Bench, at_most, is_true, table
 from kiteline_bench.harness.placed import KeyframesInWorld
 from kiteline_bench.harness.result import AgentRun
 from kiteline_bench.harness.run import Part, Scenario, fly_with_base
 from kiteline_bench.papers.sequences import find_sequences
 from kiteline_bench.papers.several_maps.plot import Drawn, plot_experiments
 from kiteline_bench.papers.several_maps.street import street_recording
-from kiteline_bench.reality.flown import table
 from kiteline_core.geometry import se3
 from kiteline_hw.ports import SourceError
 from kiteline_lab.evaluation import metrics
