@@ -13,7 +13,9 @@ from kiteline_basestation.grid.placed_map import placed_map
 from kiteline_basestation.job_kinds import run_job
 from kiteline_basestation.jobs import JobDone
 from kiteline_basestation.station import Station
-from kiteline_basestation.web import empty_snapshot, snapshot, status, take_snapshot
+from kiteline_basestation.web import snapshot
+from kiteline_basestation.web.messages import status
+from kiteline_basestation.web.snapshot import empty_snapshot, take_snapshot
 from kiteline_codec.channel import CodedChannel
 from kiteline_codec.sync.config import SyncConfig
 from kiteline_core.ids import AgentId

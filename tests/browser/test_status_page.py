@@ -17,9 +17,10 @@ import pytest
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
-from kiteline_basestation import web
 from kiteline_basestation.grid.grid_view import CodedTile, GridView
 from kiteline_basestation.grid.tile_store import Place
+from kiteline_basestation.web.server import Handle, address, serve
+from kiteline_basestation.web.snapshot import AgentStatus, PageSnapshot
 from kiteline_codec.schema import GridTile, messages
 from kiteline_core.ids import AgentId
 
@@ -31,10 +32,10 @@ class Base:
         self.taken = 0
         tile = GridTile(0, 0, 0, 0.1, np.full((64, 64), 3, np.int8))
         grid = GridView(0.1, 1, 0, {Place(0, 0, 0): CodedTile(messages.encode(tile), 4096)})
-        agent = web.AgentStatus(AgentId(5), 9 * 10**9, 70, np.eye(4), np.zeros((2, 3)), 2, 9, 1, 100, 10)
-        self.now = web.PageSnapshot(10**10, 0, (agent,), np.zeros((9, 3)), np.zeros(9, np.uint8), grid, 1)
+        agent = AgentStatus(AgentId(5), 9 * 10**9, 70, np.eye(4), np.zeros((2, 3)), 2, 9, 1, 100, 10)
+        self.now = PageSnapshot(10**10, 0, (agent,), np.zeros((9, 3)), np.zeros(9, np.uint8), grid, 1)
 
-    def snapshot(self) -> web.PageSnapshot:
+    def snapshot(self) -> PageSnapshot:
         self.taken += 1
         return self.now
 
@@ -45,13 +46,13 @@ def base() -> Base:
 
 
 @pytest.fixture
-def page(base: Base) -> Iterator[web.Handle]:
-    handle = web.serve("127.0.0.1", 0, base.snapshot)
+def page(base: Base) -> Iterator[Handle]:
+    handle = serve("127.0.0.1", 0, base.snapshot)
     yield handle
     handle.close()
 
 
-def get(page: web.Handle, path: str, host: str | None = None) -> tuple[int, str, bytes]:
+def get(page: Handle, path: str, host: str | None = None) -> tuple[int, str, bytes]:
     at = page.url.removeprefix("http://").rstrip("/")
     connection = http.client.HTTPConnection(at, timeout=5)
     connection.request("GET", path, headers={"Host": host or at})
@@ -61,11 +62,11 @@ def get(page: web.Handle, path: str, host: str | None = None) -> tuple[int, str,
     return out
 
 
-def live(page: web.Handle, **options: object) -> ClientConnection:
+def live(page: Handle, **options: object) -> ClientConnection:
     return connect(page.url.replace("http", "ws") + "live", open_timeout=5, **options)  # type: ignore[arg-type]
 
 
-def test_the_page_and_its_parts_are_served_and_nothing_else(page: web.Handle) -> None:
+def test_the_page_and_its_parts_are_served_and_nothing_else(page: Handle) -> None:
     code, kind, body = get(page, "/")
     assert code == 200 and kind.startswith("text/html") and b"<canvas" in body
     parts = [p for p in (b"/page.css", b"/page.js", b"/map_canvas.js") if p in body + get(page, "/page.js")[2]]
@@ -77,14 +78,14 @@ def test_the_page_and_its_parts_are_served_and_nothing_else(page: web.Handle) ->
         assert get(page, path)[0] == 404
 
 
-def test_status_as_json(page: web.Handle) -> None:
+def test_status_as_json(page: Handle) -> None:
     code, kind, body = get(page, "/status.json")
     assert (code, kind) == (200, "application/json")
     found = json.loads(body)
     assert found["agents"][0]["agent"] == 5 and found["agents"][0]["link"] == "live"
 
 
-def test_a_viewer_gets_status_and_map_then_only_what_is_new(page: web.Handle, base: Base) -> None:
+def test_a_viewer_gets_status_and_map_then_only_what_is_new(page: Handle, base: Base) -> None:
     with live(page) as viewer:
         totals = {n["label"]: n["value"] for n in json.loads(viewer.recv(5))["totals"]}
         assert totals["Landmarks"] == sum(one.landmarks for one in base.now.agents) > 0
@@ -103,7 +104,7 @@ def test_a_viewer_gets_status_and_map_then_only_what_is_new(page: web.Handle, ba
         assert struct.unpack_from("<I", maps[1], 4)[0] == 4
 
 
-def test_nothing_is_computed_while_nobody_looks(page: web.Handle, base: Base) -> None:
+def test_nothing_is_computed_while_nobody_looks(page: Handle, base: Base) -> None:
     time.sleep(0.6)
     assert base.taken == 0
     with live(page) as viewer:
@@ -117,14 +118,14 @@ def test_nothing_is_computed_while_nobody_looks(page: web.Handle, base: Base) ->
     assert base.taken == before
 
 
-def test_several_viewers_cost_one_snapshot(page: web.Handle, base: Base) -> None:
+def test_several_viewers_cost_one_snapshot(page: Handle, base: Base) -> None:
     with ExitStack() as stack:
         for viewer in [stack.enter_context(live(page)) for _ in range(4)]:
             viewer.recv(5)
         assert base.taken <= 2
 
 
-def test_other_sites_and_bent_names_are_refused(page: web.Handle) -> None:
+def test_other_sites_and_bent_names_are_refused(page: Handle) -> None:
     with pytest.raises(InvalidStatus, match="403"):
         live(page, origin="http://example.com")
     own = page.url.rstrip("/")
@@ -134,7 +135,7 @@ def test_other_sites_and_bent_names_are_refused(page: web.Handle) -> None:
     assert get(page, "/", host="localhost:80")[0] == 200
 
 
-def test_noise_on_the_port_does_no_harm(page: web.Handle) -> None:
+def test_noise_on_the_port_does_no_harm(page: Handle) -> None:
     port = int(page.url.rsplit(":", 1)[1].rstrip("/"))
     for noise in (b"\x00\xff" * 50, b"POST / HTTP/1.1\r\n\r\n", b"GET"):
         with socket.create_connection(("127.0.0.1", port), timeout=5) as s:
@@ -143,7 +144,7 @@ def test_noise_on_the_port_does_no_harm(page: web.Handle) -> None:
 
 
 def test_closing_ends_viewers_and_thread_and_may_be_repeated(base: Base) -> None:
-    handle = web.serve("127.0.0.1", 0, base.snapshot)
+    handle = serve("127.0.0.1", 0, base.snapshot)
     with live(handle) as viewer:
         viewer.recv(5)
         handle.close()
@@ -151,17 +152,17 @@ def test_closing_ends_viewers_and_thread_and_may_be_repeated(base: Base) -> None
     assert not any(t.name == "kiteline-web" for t in threading.enumerate())
 
 
-def test_a_taken_port_is_an_error_that_names_it(page: web.Handle, base: Base) -> None:
+def test_a_taken_port_is_an_error_that_names_it(page: Handle, base: Base) -> None:
     port = int(page.url.rsplit(":", 1)[1].rstrip("/"))
     with pytest.raises(OSError) as e:
-        web.serve("127.0.0.1", port, base.snapshot)
+        serve("127.0.0.1", port, base.snapshot)
     assert e.value.filename == f"127.0.0.1:{port}"
 
 
 def test_addresses() -> None:
-    assert web.address("0.0.0.0:8080") == ("0.0.0.0", 8080)
-    assert web.address(":8080") == web.address("8080") == ("127.0.0.1", 8080)
-    assert web.address("[::1]:80") == ("::1", 80)
+    assert address("0.0.0.0:8080") == ("0.0.0.0", 8080)
+    assert address(":8080") == address("8080") == ("127.0.0.1", 8080)
+    assert address("[::1]:80") == ("::1", 80)
     for bad in ("here", "a:b", "1.2.3.4:99999", ""):
         with pytest.raises(ValueError, match="expected HOST:PORT"):
-            web.address(bad)
+            address(bad)

@@ -18,11 +18,12 @@ import numpy as np
 import pytest
 from websockets.sync.client import ClientConnection, connect
 
-from kiteline_basestation import web
 from kiteline_basestation.config import GridConfig
 from kiteline_basestation.grid.grid_view import GridViews
 from kiteline_basestation.grid.kept_scan import keep
 from kiteline_basestation.grid.scan_grid import ScanGrid
+from kiteline_basestation.web.server import serve
+from kiteline_basestation.web.snapshot import AgentStatus, PageSnapshot
 from kiteline_core.geometry import se3
 from kiteline_core.ids import AgentId
 from tests.basestation.flat_rooms import box, camera, scan_of
@@ -101,7 +102,7 @@ def _targets(port: int) -> Iterator[dict[str, Any]]:
         time.sleep(0.1)
 
 
-def room() -> web.PageSnapshot:
+def room() -> PageSnapshot:
     """Two agents in a room: one flies, the other has been silent for half a minute."""
     rng = np.random.default_rng(4)
     floor = np.column_stack([rng.uniform([0, 0], [9, 6], (1500, 2)), rng.normal(0, 0.01, 1500)])
@@ -124,10 +125,10 @@ def room() -> web.PageSnapshot:
     away[:3, 3] = [2.0, 4.5, 1.0]
     s = 10**9
     agents = (
-        web.AgentStatus(AgentId(0), 999 * s, 86, pose, path, 60, 2100, 1, 410_000, 52_000),
-        web.AgentStatus(AgentId(1), 968 * s, -1, away, path[:9] * 0.5 + [1, 3, 0.5], 9, 380, 2, 61_000, 8_000),
+        AgentStatus(AgentId(0), 999 * s, 86, pose, path, 60, 2100, 1, 410_000, 52_000),
+        AgentStatus(AgentId(1), 968 * s, -1, away, path[:9] * 0.5 + [1, 3, 0.5], 9, 380, 2, 61_000, 8_000),
     )
-    return web.PageSnapshot(1000 * s, 246 * s, agents, points, labels, view, 1, {"loops": 2, "merges": 1})
+    return PageSnapshot(1000 * s, 246 * s, agents, points, labels, view, 1, {"loops": 2, "merges": 1})
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
@@ -135,13 +136,13 @@ def test_the_page_draws_the_map_and_writes_the_numbers(browser: Browser, tmp_pat
     now = room()
     tick = 0
 
-    def snapshot() -> web.PageSnapshot:
+    def snapshot() -> PageSnapshot:
         nonlocal tick
         tick += 1
         agents = (replace(now.agents[0], bytes_up=410_000 + 1500 * tick), *now.agents[1:])
         return replace(now, agents=agents, now_ns=now.now_ns + tick * 500_000_000, started_ns=tick * 500_000_000)
 
-    handle = web.serve("127.0.0.1", 0, snapshot)
+    handle = serve("127.0.0.1", 0, snapshot)
     try:
         browser.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
         browser.call("Page.navigate", url=handle.url)

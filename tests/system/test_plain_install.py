@@ -125,3 +125,9 @@ def test_a_flight_needs_no_more_packages(plain: Path, recording: Path, tmp_path:
     assert "matplotlib is not installed: no trajectory.png" in done.stderr.partition("flying")[0]
     agent = json.loads((tmp_path / "out" / "report.json").read_text())["agents"][0]
     assert agent["tracked"] == agent["frames"] == 30
+
+
+def test_a_base_needs_no_web_server(plain: Path, tmp_path: Path) -> None:
+    code = {"PYTHONPATH": os.pathsep.join(str(ROOT / room) for room in ROOMS)}
+    done = run(plain / "python", "-c", "import kiteline_basestation.__main__", folder=tmp_path, **code)
+    assert done.returncode == 0, done.stderr

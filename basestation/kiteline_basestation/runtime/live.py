@@ -6,7 +6,7 @@ import contextlib
 import importlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from kiteline_basestation.runtime.base_runtime import BaseRuntime, missing_extras, report_restored
 from kiteline_basestation.runtime.options import BaseOptions, coded_channels
@@ -16,7 +16,8 @@ from kiteline_basestation.runtime.terminal import TerminalReporter
 from kiteline_basestation.runtime.warm import WARMING
 from kiteline_basestation.runtime.worker import Workers
 from kiteline_basestation.station import Station
-from kiteline_basestation.web.status_report import StatusReport
+from kiteline_basestation.web.messages import status
+from kiteline_basestation.web.snapshot import take_numbers
 from kiteline_codec.channel import CodedChannel
 from kiteline_codec.transport.framing import StreamFramer
 from kiteline_codec.transport.seal import Sealer
@@ -70,10 +71,12 @@ def fly_live(options: BaseOptions, parent: process.Parent | None, stop: process.
         except StoppedError:
             return True
         report_restored(restored, parent)
-        report = StatusReport(base.station, clock.now_ns())
-        questions = Questions(
-            options, link, stack, lambda: {**report.at(clock.now_ns()), **base.state()}, lambda: seals.maps_key, logins
-        )
+        begin_ns = clock.now_ns()
+
+        def report() -> dict[str, Any]:
+            return {**status(take_numbers(base.station, clock.now_ns(), begin_ns)), **base.state()}
+
+        questions = Questions(options, link, stack, report, lambda: seals.maps_key, logins)
         if parent is not None:
             parent.send_event("ready")
         terminal = TerminalReporter(base.station) if parent is None and not options.quiet else None

@@ -4,13 +4,7 @@
     ... in the loop that steps the station:
     latest = take_snapshot(station, now_ns, started_ns)
 
-A snapshot is frozen and the server's thread only reads it. A new number on the page is a line in `numbers.py`.
+`server` has `serve` and `address`, and alone needs a web server: nothing is imported here, so that a base without one
+answers `kiteline status`. A snapshot is frozen and the server's thread only reads it. A new number on the page is a
+line in `numbers.py`.
 """
-
-from __future__ import annotations
-
-from kiteline_basestation.web.messages import status
-from kiteline_basestation.web.server import Handle, address, serve
-from kiteline_basestation.web.snapshot import AgentStatus, PageSnapshot, empty_snapshot, take_snapshot
-
-__all__ = ["AgentStatus", "Handle", "PageSnapshot", "address", "empty_snapshot", "serve", "status", "take_snapshot"]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -65,13 +65,8 @@ def empty_snapshot(now_ns: int) -> PageSnapshot:
     return PageSnapshot(now_ns, now_ns, (), np.zeros((0, 3)), np.zeros(0, np.uint8), GridView(1.0), 0)
 
 
-def take_snapshot(
-    station: Station, now_ns: int, started_ns: int, before: PageSnapshot | None = None
-) -> PageSnapshot:  # fmt: skip
-    """The station now. before: an older one, whose points are taken while the map has hardly grown.
-
-    now_ns: on the clock of its steps.
-    """
+def take_numbers(station: Station, now_ns: int, started_ns: int) -> PageSnapshot:
+    """The station now, without points and paths. now_ns: on the clock of its steps."""
     mapper = station.mapper
     summary: dict[str, Any] = mapper.summary()
     landmarks = _landmarks_by_agent(mapper)
@@ -86,7 +81,7 @@ def take_snapshot(
                 last_packet_ns=state["last_seen_ns"],
                 quality=state["quality"] or None,
                 T_w_c=None if state["T_w_c"] is None else np.array(state["T_w_c"]),
-                path=_path(mapper, agent),
+                path=np.zeros((0, 3)),
                 keyframes=state["keyframes"],
                 landmarks=landmarks.get(agent, 0),
                 submaps=state["submaps"],
@@ -96,13 +91,26 @@ def take_snapshot(
         )
     counts = {name: value for name, value in summary.items() if isinstance(value, int)}
     revision = counts["keyframes"] + counts["bundles"] + counts["grids"]
-    grid = mapper.views.take()
-    if before is not None and revision - before.map_revision < counts["keyframes"] // POINTS_SHARE:
-        return PageSnapshot(
-            now_ns, started_ns, tuple(agents), before.points, before.labels, grid, before.map_revision, counts
-        )  # fmt: skip
+    empty = empty_snapshot(started_ns)
+    return replace(
+        empty, now_ns=now_ns, agents=tuple(agents), grid=mapper.views.take(), map_revision=revision, counts=counts
+    )
+
+
+def take_snapshot(
+    station: Station, now_ns: int, started_ns: int, before: PageSnapshot | None = None
+) -> PageSnapshot:  # fmt: skip
+    """The station now. before: an older one, whose points are taken while the map has hardly grown.
+
+    now_ns: on the clock of its steps.
+    """
+    mapper = station.mapper
+    now = take_numbers(station, now_ns, started_ns)
+    now = replace(now, agents=tuple(replace(agent, path=_path(mapper, agent.agent)) for agent in now.agents))
+    if before is not None and now.map_revision - before.map_revision < now.counts["keyframes"] // POINTS_SHARE:
+        return replace(now, points=before.points, labels=before.labels, map_revision=before.map_revision)
     slots, points = some_landmarks(mapper.map, mapper.placements, LOOKED_AT)
-    return PageSnapshot(now_ns, started_ns, tuple(agents), points, mapper.labels(slots), grid, revision, counts)
+    return replace(now, points=points, labels=mapper.labels(slots))
 
 
 def _path(mapper: Mapper, agent: AgentId) -> F64:
