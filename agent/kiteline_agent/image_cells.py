@@ -15,8 +15,8 @@ def with_cells_for(config: AgentConfig, width: int, height: int) -> AgentConfig:
     """The configuration with cells for images of this size: a smaller image has as many cells, not larger ones.
 
     At 320x240 cells of 32 px would leave 75 corners, fewer than `keyframe.min_inliers`, and a depth camera or a single
-    camera has depth for a part of these only. Larger images have more cells. Those of the start
-    from two views stay: it needs strong corners.
+    camera has depth for a part of these only. Larger images have more cells. Those of the start from two views stay:
+    it needs strong corners.
     """
     shrink = math.sqrt(width * height / _REFERENCE_PX)
     if shrink >= 1.0:

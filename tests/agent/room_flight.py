@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from kiteline_core import odometry
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration, OdometryBatch
 from kiteline_core.geometry.cameras import CameraRig
-from kiteline_hw.sim.source import FRAME_NS, START_NS, open_sim
+from kiteline_hw.sim.config import SimConfig
+from kiteline_hw.sim.source import START_NS, open_sim
 
 F64 = NDArray[np.float64]
 
@@ -29,7 +30,7 @@ class RoomFlight:
 
     def first(self, seconds: float) -> RoomFlight:
         """The first seconds of the flight."""
-        frames = self.frames[: round(seconds * 1e9) // FRAME_NS]
+        frames = self.frames[: round(seconds * 1e9) // SimConfig().frame_ns]
         felt, driven = (batch.t_ns <= frames[-1].t_ns for batch in (self.samples, self.driven))
         s = self.samples
         return replace(

@@ -325,17 +325,9 @@ class GroundSegmenter:
         lowest = round(self._lowest_px / level_kernels.BIN_PX)
         surface, bands = self._surface, np.empty(n, np.uint8)
         label_kernels.find_surfaces(
-            obstacles,
-            above,
-            self._sums,
-            self._in_band,
-            slab,
-            self._slab_sums,
-            config.column_pixels,
-            lowest,
-            surface,
+            obstacles, above, self._sums, self._in_band, slab, self._slab_sums, config.column_pixels, lowest, surface,
             bands,
-        )
+        )  # fmt: skip
         if view.pair is not None:
             label_kernels.refine_surfaces(
                 *view.pair, view.rotation, self._camera, self.bf, view.offset_px, self.x, self.z, self._column,

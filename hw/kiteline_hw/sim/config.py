@@ -63,6 +63,16 @@ class SimConfig:
     texture_bits: int = 11  # log2 of a texture's side; less only for tests
 
     @property
+    def frame_ns(self) -> int:
+        """Time between two frames."""
+        return round(1e9 / self.rate)
+
+    @property
+    def imu_ns(self) -> int:
+        """Time between two inertial samples."""
+        return round(1e9 / self.imu_rate)
+
+    @property
     def flight_seed(self) -> int:
         """Seed of what is drawn for this agent's flight alone."""
         return seed_of_agent(self.seed, self.agent)

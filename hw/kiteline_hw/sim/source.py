@@ -36,7 +36,6 @@ from kiteline_hw.sources.overrides import SourceView
 F64 = NDArray[np.float64]
 
 START_NS = 1_000_000_000  # stamp of flight time zero
-FRAME_NS = 50_000_000  # 20 Hz, the default
 
 
 def open_sim(scene: str, workers: int = 1, **options: object) -> SimSource:
@@ -79,8 +78,7 @@ class SimSource:
         self.config = config
         self.name = f"sim:{config.scene}?seed={config.seed}"
         self.report = SourceReport()  # stays empty
-        self._frame_ns, self._imu_ns = round(1e9 / config.rate), round(1e9 / config.imu_rate)
-        self.imu = ImuCalibration(rate_hz=1e9 / self._imu_ns) if config.imu else None
+        self.imu = ImuCalibration(rate_hz=1e9 / config.imu_ns) if config.imu else None
         stereo = not (config.mono or config.depth)
         size = config.width or WIDTH_PX, config.height or HEIGHT_PX
         rig = make_rig(Lens(config.lens), stereo, config.depth, config.baseline, config.scale, size, config.fov_deg)
@@ -92,10 +90,10 @@ class SimSource:
             self.world, self.path, self.rig.T_b_c, config.people, config.cars, config.flight_seed
         )
         seconds = self.path.duration_s if not config.seconds else min(config.seconds, self.path.duration_s)
-        self.frame_count = int(seconds * 1e9) // self._frame_ns + (1 if not config.seconds else 0)
+        self.frame_count = int(seconds * 1e9) // config.frame_ns + (1 if not config.seconds else 0)
         if self.frame_count < 1:
-            raise SourceError(f"a flight of {seconds:.2f} s has no frame: expected at least {self._frame_ns * 1e-9} s")
-        self._exposed_ns = START_NS + self._frame_ns * np.arange(self.frame_count, dtype=np.int64)
+            raise SourceError(f"a flight of {seconds:.2f} s has no frame: expected at least {config.frame_ns * 1e-9} s")
+        self._exposed_ns = START_NS + config.frame_ns * np.arange(self.frame_count, dtype=np.int64)
         self._stamps = self.worn.stamps(self._exposed_ns)
         self._has_partner = self.worn.has_partner(self.frame_count)
         self._motion: Motion = self.path.motion(flight_s(self._exposed_ns, START_NS))
@@ -121,8 +119,8 @@ class SimSource:
 
     def imu_samples(self) -> ImuBatch:
         """All inertial samples of the flight."""
-        stamps = np.arange(START_NS, int(self._stamps[-1]) + 1, self._imu_ns, dtype=np.int64)
-        calibration = ImuCalibration(rate_hz=1e9 / self._imu_ns)
+        stamps = np.arange(START_NS, int(self._stamps[-1]) + 1, self.config.imu_ns, dtype=np.int64)
+        calibration = ImuCalibration(rate_hz=1e9 / self.config.imu_ns)
         seed = self.config.flight_seed
         wear = self.worn.imu if self.config.rig == "worn" else None
         return inertial.measure(self.path, stamps, START_NS, calibration, seed, wear=wear)
@@ -207,14 +205,14 @@ def _worn_rig(config: SimConfig, rig: CameraRig) -> wear.WornRig:
     good = perturb(rig, np.random.default_rng([seed, 41]), config.miscalibration)
     chosen = wear.selected(config.wear, wear.WearConfig()) if config.rig == "worn" else wear.NO_WEAR
     own_seed = seed if config.rig_seed < 0 else seed_of_agent(config.rig_seed, config.agent)
-    return wear.draw(rig, good, ImuCalibration(rate_hz=config.imu_rate), own_seed, chosen)
+    return wear.draw(rig, good, ImuCalibration(rate_hz=1e9 / config.imu_ns), own_seed, chosen)
 
 
 def _gains(frames: int, config: SimConfig) -> F64:
     """Grey values per unit of radiance: slow drift of the exposure, and steps up or down."""
     rng = np.random.default_rng([config.flight_seed, 29])
     phase = rng.uniform(0, 2 * np.pi, 2)
-    frame_s = round(1e9 / config.rate) * 1e-9
+    frame_s = config.frame_ns * 1e-9
     t = np.arange(frames) * frame_s
     drift = 0.10 * np.sin(2 * np.pi * t / 11.0 + phase[0]) + 0.05 * np.sin(2 * np.pi * t / 3.7 + phase[1])
     draws = rng.random((frames, 2))

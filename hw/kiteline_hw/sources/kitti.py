@@ -13,10 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_core.frame import Trajectory
-from kiteline_core.geometry.cameras import CameraRig
-from kiteline_hw.calibration.checks import checked_baseline
 from kiteline_hw.ports import SourceError
-from kiteline_hw.sources.kitti_raw import camera_of, is_raw, offset_x_m, open_raw, pairs_by_name
+from kiteline_hw.sources.kitti_raw import is_raw, open_raw, pairs_by_name, rig_of
 from kiteline_hw.sources.recording import Recording, image_size, list_images, sorted_trajectory
 from kiteline_hw.sources.text_files import read_rows, row_values, seconds_to_ns
 
@@ -43,18 +41,11 @@ def open_source(folder_name: str, mono: bool, imu: bool) -> Recording:
     calib = folder / "calib.txt"
     p_left, p_right = _read_projections(calib, pair[2], pair[3])
     size = image_size(lefts)
-    right = T_c_r = None
-    left = camera_of(p_left, size, calib)
-    if rights:
-        if p_right is None:
-            raise SourceError(f"{calib}: one row, but two image folders: expected a row for each camera")
-        right = camera_of(p_right, size, calib)
-        T_c_r = np.eye(4)
-        T_c_r[0, 3] = offset_x_m(p_left) - offset_x_m(p_right)
-        checked_baseline(T_c_r, f"{calib}: {pair[2]} and {pair[3]}")
-        if T_c_r[0, 3] < 0:
-            raise SourceError(f"{calib}: baseline {T_c_r[0, 3]:g} m: left and right row are swapped")
-    rig = CameraRig(left, right, np.eye(4), T_c_r, has_body=False)
+    if rights and p_right is None:
+        raise SourceError(f"{calib}: one row, but two image folders: expected a row for each camera")
+    rig = rig_of(p_left, p_right if rights else None, size, f"{calib}: {pair[2]} and {pair[3]}")
+    if rig.T_c_r is not None and rig.T_c_r[0, 3] < 0:
+        raise SourceError(f"{calib}: baseline {rig.T_c_r[0, 3]:g} m: left and right row are swapped")
     times = _read_times(folder, lefts)
     return Recording(
         f"kitti:{folder}", rig, len(lefts), lambda report: pairs_by_name(times, lefts, rights, report),

@@ -49,13 +49,8 @@ def open_raw(folder: Path, mono: bool) -> Recording:
     rows = _read_rows(calib)
     p_left, size = _projection(rows, chosen[0], calib), image_size(lefts)
     _check_rectified(rows, chosen[0], size, folder, calib)
-    left, right, T_c_r = camera_of(p_left, size, calib), None, None
-    if rights:
-        p_right = _projection(rows, chosen[1], calib)
-        right, T_c_r = camera_of(p_right, size, calib), np.eye(4)
-        T_c_r[0, 3] = offset_x_m(p_left) - offset_x_m(p_right)
-        checked_baseline(T_c_r, f"{calib}: P_rect_{chosen[0]} and P_rect_{chosen[1]}")
-    rig = CameraRig(left, right, np.eye(4), T_c_r, has_body=False)
+    p_right = _projection(rows, chosen[1], calib) if rights else None
+    rig = rig_of(p_left, p_right, size, f"{calib}: P_rect_{chosen[0]} and P_rect_{chosen[1]}")
     times = _read_times(folder / f"image_{chosen[0]}" / "timestamps.txt", lefts)
     return Recording(
         f"kitti:{folder}", rig, len(lefts), lambda report: pairs_by_name(times, lefts, rights, report)
@@ -81,13 +76,25 @@ def pairs_by_name(
             report.skip("missing left image", f"{path.name} has no partner")
 
 
-def camera_of(p: F64, size: tuple[int, int], calib: Path) -> CameraModel:
-    """The rectified camera of a projection matrix (3,4). size: height and width in px. Raises SourceError."""
+def rig_of(p_left: F64, p_right: F64 | None, size: tuple[int, int], name: str) -> CameraRig:
+    """The rectified cameras of projection matrices (3,4). size: height and width in px. name: of the matrices.
+
+    Raises SourceError.
+    """
+    if p_right is None:
+        return CameraRig(_camera(p_left, size, name), None, np.eye(4), None, has_body=False)
+    T_c_r = np.eye(4)
+    T_c_r[0, 3] = _offset_x_m(p_left) - _offset_x_m(p_right)
+    checked_baseline(T_c_r, name)
+    return CameraRig(_camera(p_left, size, name), _camera(p_right, size, name), np.eye(4), T_c_r, has_body=False)
+
+
+def _camera(p: F64, size: tuple[int, int], name: str) -> CameraModel:
     camera = CameraModel(size[1], size[0], float(p[0, 0]), float(p[1, 1]), float(p[0, 2]), float(p[1, 2]))
-    return checked_camera(camera, str(calib))
+    return checked_camera(camera, name)
 
 
-def offset_x_m(p: F64) -> float:
+def _offset_x_m(p: F64) -> float:
     """t_x of p = K [I | t]; a camera to the right of the reference has a negative one."""
     return float((p[0, 3] - p[0, 2] * p[2, 3]) / p[0, 0])
 

@@ -120,20 +120,6 @@ def _of_store(a: argparse.Namespace) -> int:
     return 1 if checked.faults else 0
 
 
-def asked(endpoint: str, verb: str, question: str, key: bytes | None) -> tuple[bool, str]:
-    """Ask a base, signed if there is a key. Whether it succeeded, and the answer. Raises LinkError."""
-    if key is None:
-        return ask(endpoint, "maps", verb, question)
-
-    def ask_signed(start: str) -> tuple[bool, str]:
-        signed = sign(key, verb, question, int(time.time()), secrets.token_hex(16), start)
-        return ask(endpoint, "maps", verb, signed, logins=login_of(MAPS, key))
-
-    ok, text = ask_signed("")  # nothing comes of it: its refusal names the base's start
-    start = None if ok else _read(endpoint, text).get("start")
-    return ask_signed(start) if isinstance(start, str) else (ok, text)
-
-
 def ask_base(base: str, key_file: Path | None, verb: str, question: str) -> tuple[bool, str, dict[str, Any]]:
     """Ask the base at an endpoint, signed if a file of keys has the right. Whether it succeeded, the answer as text and
     as JSON types. key_file: None: the user's, if there is one. Raises LinkError.
@@ -141,8 +127,20 @@ def ask_base(base: str, key_file: Path | None, verb: str, question: str) -> tupl
     path = key_file or default_path()
     key = read_file(path).maps if key_file is not None or path.exists() else None
     endpoint = base.removeprefix("zenoh:")
-    ok, text = asked(endpoint, verb, question, key)
-    return ok, text, _read(endpoint, text)
+
+    def ask_once(start: str) -> tuple[bool, str]:
+        if key is None:
+            return ask(endpoint, "maps", verb, question)
+        signed = sign(key, verb, question, int(time.time()), secrets.token_hex(16), start)
+        return ask(endpoint, "maps", verb, signed, logins=login_of(MAPS, key))
+
+    ok, text = ask_once("")  # where it is signed nothing comes of it: its refusal names the base's start
+    answer = _read(endpoint, text)
+    start = None if ok or key is None else answer.get("start")
+    if isinstance(start, str):
+        ok, text = ask_once(start)
+        answer = _read(endpoint, text)
+    return ok, text, answer
 
 
 def _read(endpoint: str, text: str) -> dict[str, Any]:

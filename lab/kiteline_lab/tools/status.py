@@ -42,7 +42,7 @@ def lines(report: Mapping[str, Any], before: Mapping[str, Any] | None = None) ->
         ),
     ]  # fmt: skip
     if report["agents"]:
-        rows = [_agent(agent, _earlier(agent, report, before)) for agent in report["agents"]]
+        rows = [_agent(agent, _rates(agent, report, before)) for agent in report["agents"]]
         out += _columns([_HEAD, *rows])
     else:
         out.append("no agent yet")
@@ -72,7 +72,7 @@ def _agent(agent: Mapping[str, Any], rates: tuple[float, float] | None) -> tuple
     )
 
 
-def _earlier(
+def _rates(
     agent: Mapping[str, Any], report: Mapping[str, Any], before: Mapping[str, Any] | None
 ) -> tuple[float, float] | None:
     """Rates of an agent's link since an earlier report of the same base, kB/s up and down."""

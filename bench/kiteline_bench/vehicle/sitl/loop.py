@@ -20,7 +20,7 @@ from kiteline_core.geometry import se3
 from kiteline_hw.mavlink.coordinate_frames import mounting
 from kiteline_hw.sim.config import SimConfig
 from kiteline_hw.sim.sensors.camera import Shutter
-from kiteline_hw.sim.source import FRAME_NS, SimSource
+from kiteline_hw.sim.source import SimSource
 from kiteline_hw.sim.world.scenes import build_indoor
 from kiteline_hw.system.closing import Closing
 
@@ -68,7 +68,7 @@ class Loop(Closing):
             SimConfig("room", seed, seconds=1.0, scale=_SCALE), world=build_indoor("room", _volume(), seed, 10)
         )
         self._cameras, self._noise = source.cameras(), (source.config.read_noise, source.config.shot_noise)
-        self._shutter = Shutter(source.config.exposure_s)
+        self._shutter, self._frame_ns = Shutter(source.config.exposure_s), source.config.frame_ns
         self._T_f_b = se3.inverse(mounting(AXES))
         self.setting = Setting(source.rig, self.autopilot.url(1), folder / "agent", AXES, tunnel=tunnel)
         self.onboard: Onboard | None = None
@@ -122,7 +122,7 @@ class Loop(Closing):
         self.clock.t_ns = _START_NS + round(self.t_s * 1e9)
         if self._steps % _POLL_STEPS == 0:
             self.pilot.poll(self.t_s)
-        if self.t_s * 1e9 >= self._frames * FRAME_NS:
+        if self.t_s * 1e9 >= self._frames * self._frame_ns:
             self._frames += 1
             self.truth.t_s.append(self.t_s)
             self.truth.position_m.append(self.copter.position_m.copy())
