@@ -48,6 +48,9 @@ class InertialStartConfig:
 
     min_span_s: float = 2.4  # before which a window tells no scale
     max_span_s: float = 24.0  # longest window; older keyframes are dropped
+    rest_s: float = (
+        4.0  # of a rest before the flight that a window holds: enough for the biases, long ones are solved rarely
+    )
     attempt_s: float = 0.45  # time between two solutions: each costs as much as some frames
     attempt_share: float = 0.09  # the same over the window's length: long windows cost more
     landmarks: int = 220  # of the window, with the longest tracks: errors of few add up to a wrong turn and motion

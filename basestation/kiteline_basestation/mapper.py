@@ -50,12 +50,14 @@ class MapperInput:
     """Inputs since the last step: records by agent, in order of agent id, finished jobs, and commands of users.
 
     room_bytes: for corrections of an agent's map, by agent; 0: none now. Without an entry there is no limit.
+    imports: records by agent that come from a log, not from the agent.
     """
 
     arrivals: tuple[tuple[AgentId, tuple[Record, ...]], ...]
     done: tuple[JobDone, ...] = ()
     commands: tuple[Command, ...] = ()
     room_bytes: tuple[tuple[AgentId, int], ...] = ()
+    imports: tuple[tuple[AgentId, tuple[Record, ...]], ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,6 +84,7 @@ class Mapper:
         self.names: dict[SubmapId, str] = {}  # of maps, by map id
         self.counts = MapperCounts()
         self.jobs_failed = 0  # since the process began
+        self.failures: dict[str, str] = {}  # why the last job of a kind failed, while none of it succeeded since
         self._confirmed: Counter[AgentId] = Counter()  # keyframes since `take_confirmed`
         self.cpu_ns: Callable[[], int] = lambda: 0  # clock of `grid_ns`, which no output depends on
         self.grid_ns: deque[int] = deque(maxlen=_TIMED_UPDATES)  # time of the updates of the grid
@@ -113,6 +116,8 @@ class Mapper:
         # 1. Put the received records into the map, and align w with gravity and metres where an agent reports them.
         for agent, records in given.arrivals:
             self._intake.take(agent, records, now_ns)
+        for agent, records in given.imports:
+            self._intake.take(agent, records, now_ns, in_contact=False)
         if self._placements.align_with_gravity() or self._placements.make_metric():
             self.grid_updates.rebuild()
         # 2. Apply the results of finished jobs, then carry out commands.
@@ -121,6 +126,7 @@ class Mapper:
             if done.failed:
                 self._set_aside(done, now_ns)
             else:
+                self.failures.pop(done.kind, None)
                 changes += self._finish[done.kind](done, now_ns)
         answers = []
         for command in given.commands:
@@ -211,8 +217,7 @@ class Mapper:
         self, agent: AgentId, received: tuple[Record, ...], own: tuple[Record, ...], now_ns: int
     ) -> None:  # fmt: skip
         """Restore an agent's values: `received` by an earlier base process, and its `own`, written for the agent."""
-        self._intake.take(agent, received, now_ns)
-        self._intake.last_contact_ns.pop(agent, None)  # it was in contact with the earlier process
+        self._intake.take(agent, received, now_ns, in_contact=False)
         for record in own:
             self.adopt(record)
             if isinstance(record, SubmapPlacement):
@@ -321,6 +326,7 @@ class Mapper:
     def _set_aside(self, done: JobDone, now_ns: int) -> None:
         """Forget a job that failed: the map stays as it is until another job of its kind is due."""
         self.jobs_failed += 1
+        self.failures[done.kind] = done.failed
         self._local_bundles.forget(done.id)
         self.image_scans.forget(done.id)
         if self.merger is not None:

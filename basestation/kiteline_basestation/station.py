@@ -91,11 +91,12 @@ class Station:
         self.received = sum(len(records) for _, records in arrivals)
         for agent, records in arrivals:
             self._track(agent, False, records)
-        arrivals += [(order.agent, self._imported(order)) for order in orders if isinstance(order, Import)]
+        imports = tuple((order.agent, self._imported(order)) for order in orders if isinstance(order, Import))
         commands = tuple(order for order in orders if isinstance(order, Command))
         rooms = [(agent, self._batches[agent].room_bytes(end, now_ns)) for agent, end in sorted(self.channels.items())]
         limits = tuple((agent, room) for agent, room in rooms if room is not None)
-        output = self.mapper.step(MapperInput(tuple(arrivals), tuple(done), commands, limits), now_ns)
+        given = MapperInput(tuple(arrivals), tuple(done), commands, limits, imports)
+        output = self.mapper.step(given, now_ns)
         for agent, keyframes in self.mapper.take_confirmed().items():
             if isinstance(end := self.channels.get(agent), CodedChannel):
                 end.endpoint.claims.earned += KEYFRAME_BYTES * keyframes

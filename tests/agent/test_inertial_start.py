@@ -18,6 +18,7 @@ from kiteline_agent.initialisation.inertial_window import WindowSolution
 from kiteline_agent.initialisation.metric_restart import MetricPoints
 from kiteline_agent.initialisation.window_noise import WindowNoise
 from kiteline_agent.tracking.frame_context import FrameContext
+from kiteline_core.frame import ImuBatch
 from tests.agent.test_inertial_bundle import CALIBRATION, FOCAL, T_B_C, window
 
 CAMERA: Any = SimpleNamespace(fx=FOCAL, fy=FOCAL, cx=376.0, cy=240.0, width=752, height=480, T_b_c=T_B_C)
@@ -133,3 +134,44 @@ def test_a_lower_cost_at_the_same_scale_confirms_it(monkeypatch: pytest.MonkeyPa
     assert is_lowest(1.2, 1000.0) == (True, 1.0)
     assert is_lowest(1.2, 990.0) == (False, 1.2)
     assert is_lowest(1.005, 990.0) == (True, 1.0)  # it left out other corners
+
+
+def test_a_window_begins_after_the_samples_that_are_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An IMU that starts after the camera: keyframes from its first sample on count, not only those of later frames."""
+    start = InertialStart(CAMERA, CALIBRATION, AgentConfig(), Work())
+    monkeypatch.setattr(start._tracks, "flow_px", lambda: 100.0)
+    monkeypatch.setattr(start._tracks, "add", lambda _t_ns, _left: True)
+    start._tracks.keyframes = [SimpleNamespace(t_ns=250_000_000 * k) for k in range(20)]  # type: ignore[misc]
+    t_ns = np.arange(1_100_000_000, 4_800_000_000, 5_000_000)
+    ctx: Any = SimpleNamespace(
+        t_ns=4_750_000_000, images=SimpleNamespace(left=None),
+        imu=ImuBatch(t_ns, np.zeros((len(t_ns), 3)), np.tile([0.0, 0.0, 9.8], (len(t_ns), 1))),
+    )  # fmt: skip
+    start.add_samples(ctx)
+    solved: list[int] = []
+    monkeypatch.setattr(start, "_attempt", lambda _ctx, keyframes, *_: solved.append(len(keyframes)))
+    start.add(ctx, None, 0.0)
+    assert [k.t_ns for k in start._tracks.keyframes] == [250_000_000 * k for k in range(4, 20)]  # 0.2 s are bridged
+    start.add(ctx, None, 0.0)
+    assert solved == [16]
+
+
+@pytest.mark.parametrize(("flow_px", "kept"), [(0.2, 17), (8.0, 77)])
+def test_of_a_long_rest_a_window_holds_the_end(monkeypatch: pytest.MonkeyPatch, flow_px: float, kept: int) -> None:
+    """A window of 20 s is solved every 2 s at most: the scale would be known seconds later than after a short rest."""
+    config = AgentConfig()
+    tracks = replace(config.inertial_start.corner_tracks, keyframes=100)
+    start = InertialStart(
+        CAMERA,
+        CALIBRATION,
+        replace(config, inertial_start=replace(config.inertial_start, corner_tracks=tracks)),
+        Work(),
+    )
+    monkeypatch.setattr(start._tracks, "flow_px", lambda: flow_px)
+    monkeypatch.setattr(start._tracks, "add", lambda _t_ns, _left: True)
+    monkeypatch.setattr(start, "_attempt", lambda *_: None)
+    monkeypatch.setattr(start, "_intervals", lambda *_: None)
+    start._tracks.keyframes = [SimpleNamespace(t_ns=250_000_000 * k) for k in range(77)]  # type: ignore[misc]
+    ctx: Any = SimpleNamespace(t_ns=19_000_000_000, images=SimpleNamespace(left=None))
+    start.add(ctx, None, 0.0)
+    assert len(start._tracks.keyframes) == kept

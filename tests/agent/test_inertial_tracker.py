@@ -250,6 +250,28 @@ def test_a_wrong_scale_is_found_and_corrected(unit: float) -> None:
     assert bool(corrections) == (unit != 1.0)
 
 
+@pytest.mark.parametrize("unit", [0.96, 1.04])
+def test_velocity_follows_lengths_that_the_base_corrects(unit: float) -> None:
+    """A map that is 4 % off is corrected under the camera: the velocity in it was as wrong."""
+    steps, at = flight(64, 7), 60
+    tracker = InertialTracker(CAMERA, CALIBRATION, InertialConfig(), metric=False)
+    tracker.predict(steps[10].imu, steps[10].t_ns)
+    mono_start(tracker, steps[10], (steps[11].truth[:3, 3] - steps[9].truth[:3, 3]) / 0.1, unit)
+    for k, step in enumerate(steps[11:-1], 11):
+        if k == at:
+            before = camera_scaled(steps[k - 1].visual, 1.0 / unit, T_B_C[:3, 3])
+            watched = tracker._scale.scale[0]
+            tracker.move_map(steps[k - 1].visual @ se3.inverse(before))
+            tracker.scale_map(unit)
+            assert tracker._scale.scale[0] == pytest.approx(watched / unit)
+        total = unit if k < at else 1.0
+        tracker.predict(step.imu, step.t_ns)
+        visual = camera_scaled(step.visual, 1.0 / total, T_B_C[:3, 3])
+        state = tracker.update(step.t_ns, visual, in_unit(step.points, total))
+        true = (steps[k + 1].truth - steps[k - 1].truth)[:3, 3] / 0.1
+        assert k < at or (state is not None and np.linalg.norm(state.velocity - true) < 0.02)  # 0.03 to 0.06 if not
+
+
 def test_a_moved_map_and_a_new_one() -> None:
     steps = flight(90, 8)
     shift = se3.exp(np.array([0.2, 0.1, -0.1, 0.01, 0.02, 0.1]))

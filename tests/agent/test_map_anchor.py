@@ -68,18 +68,33 @@ def test_a_map_that_moves_as_a_whole_takes_the_camera_along(seed: int) -> None:
     motion = se3.exp(np.random.default_rng(seed + 1).normal(0.0, 0.02, 6))
     for k in range(3):
         move(local_map, k, motion)
-    T_new_old = anchor.T_new_old()
-    assert T_new_old is not None
-    assert np.allclose(T_new_old, motion, atol=1e-5)
+    found = anchor.motion()
+    assert found is not None and found.growth == pytest.approx(1.0, abs=1e-5)
+    assert np.allclose(found.T_new_old, motion, atol=1e-5)
+
+
+@pytest.mark.parametrize("factor", [0.97, 1.04])
+def test_lengths_that_grow_in_view_are_told(factor: float) -> None:
+    """The base multiplies lengths about the first keyframe: landmarks and the other keyframes."""
+    local_map, track = scene()
+    anchor = MapAnchor(local_map, track, CONFIG, inertial=False)
+    first = local_map.T_m_k[0, :3, 3].copy()
+    local_map.T_m_k[:3, :3, 3] = first + factor * (local_map.T_m_k[:3, :3, 3] - first)
+    local_map.rho[:3, :LANDMARKS] /= factor
+    found = anchor.motion()
+    assert found is not None and found.growth == pytest.approx(factor, abs=1e-4)
+    camera = se3.inverse(track.T_c_m)[:3, 3]
+    expected = first + factor * (camera - first)
+    assert np.allclose(se3.transform(found.T_new_old, camera[None])[0], expected, atol=1e-3)
 
 
 def test_a_keyframe_out_of_view_moves_nothing() -> None:
     local_map, track = scene()
     anchor = MapAnchor(local_map, track, CONFIG, inertial=False)
     move(local_map, 2, se3.exp(np.array([0.3, 0.1, 0.0, 0.0, 0.1, 0.0])))
-    T_new_old = anchor.T_new_old()
-    assert T_new_old is not None
-    assert np.allclose(T_new_old, np.eye(4), atol=1e-7)
+    found = anchor.motion()
+    assert found is not None
+    assert np.allclose(found.T_new_old, np.eye(4), atol=1e-7)
 
 
 def test_a_keyframe_that_moves_without_its_landmarks_moves_nothing() -> None:
@@ -96,9 +111,9 @@ def test_a_keyframe_that_moves_without_its_landmarks_moves_nothing() -> None:
         inverse = (1.0 / p[:, 2]).astype(np.float32)
         local_map.refine(RefinedLandmarks(KeyframeId(k), index.astype(np.uint16), inverse, offset))
     assert local_map.apply_corrections()
-    T_new_old = anchor.T_new_old()
-    assert T_new_old is not None
-    assert np.allclose(T_new_old, np.eye(4), atol=1e-5)
+    found = anchor.motion()
+    assert found is not None
+    assert np.allclose(found.T_new_old, np.eye(4), atol=1e-5)
 
 
 @pytest.mark.parametrize("left", [10, 40])
@@ -109,19 +124,19 @@ def test_culled_landmarks_do_not_count(left: int) -> None:
     move(local_map, 0, se3.exp(np.array([0.2, 0.0, 0.0, 0.0, 0.0, 0.0])))
     local_map.remove(CulledLandmarks(KeyframeId(0), np.arange(LANDMARKS, dtype=np.uint16), 0))
     local_map.remove(CulledLandmarks(KeyframeId(1), np.arange(left, LANDMARKS, dtype=np.uint16), 0))
-    T_new_old = anchor.T_new_old()
+    found = anchor.motion()
     if left < CONFIG.pose.min_inliers:
-        assert T_new_old is None
+        assert found is None
     else:
-        assert T_new_old is not None
-        assert np.allclose(T_new_old, np.eye(4), atol=1e-7)
+        assert found is not None
+        assert np.allclose(found.T_new_old, np.eye(4), atol=1e-7)
 
 
 def test_an_evicted_keyframe_does_not_count() -> None:
     local_map, track = scene()
     anchor = MapAnchor(local_map, replace(track, inlier=track.rows < local_map.slot_size), CONFIG, inertial=False)
     local_map.keyframe[0] = 77
-    assert anchor.T_new_old() is None
+    assert anchor.motion() is None
 
 
 def corrected(local_map: LocalMap, moved: dict[int, F64], anchor: MapAnchor) -> bool:
@@ -217,9 +232,10 @@ def test_a_trial_moves_what_is_in_view_as_taking_over_all_does(seed: int) -> Non
         else:
             assert local_map.apply_corrections()
             assert not np.array_equal(local_map.rho[2], out_of_view)
-        maps.append((local_map, anchor.T_new_old(), anchor.matters()))
-    (tried, moved, matters), (applied, T_new_old, all_matter) = maps
-    assert moved is not None and T_new_old is not None and np.array_equal(moved, T_new_old) and matters == all_matter
+        maps.append((local_map, anchor.motion(), anchor.matters()))
+    (tried, moved, matters), (applied, found, all_matter) = maps
+    assert moved is not None and found is not None and matters == all_matter
+    assert np.array_equal(moved.T_new_old, found.T_new_old) and moved.growth == found.growth
     assert tried.apply_corrections()
     for array, other in zip(tried.save(), applied.save(), strict=True):
         assert np.array_equal(array, other)

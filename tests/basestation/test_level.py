@@ -15,7 +15,7 @@ from kiteline_basestation.mapper import Mapper, MapperInput
 from kiteline_basestation.merging.essential_graph import GraphInputs, Scaled, optimise
 from kiteline_basestation.merging.loop_consistency import keeps_level
 from kiteline_basestation.merging.loop_edges import LoopEdge
-from kiteline_codec.schema import CameraIntrinsics, KeyframeHeader, LivePose, Record, SubmapTie
+from kiteline_codec.schema import CameraIntrinsics, KeyframeHeader, LivePose, Record, SubmapScale, SubmapTie
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, AgentId, keyframe_id, submap_id
@@ -168,6 +168,19 @@ def test_a_submap_after_a_loss_lies_where_its_tie_says(late: bool) -> None:
     found = placed(mapper)
     assert found is not None
     assert np.allclose(found, better, atol=1e-9)
+
+
+@pytest.mark.parametrize("up_to_scale", [False, True])
+def test_a_submap_without_metres_keeps_the_unit_of_the_one_before(up_to_scale: bool) -> None:
+    mapper, one_eye = Mapper(BaseConfig()), replace(CAMERA, stereo=False)
+    step(mapper, 0.0, CameraIntrinsics(AGENT, one_eye), *FLOWN[1:3])
+    mapper._placements._set(OLD, sim3.of(2.0, np.eye(4)))  # as after a merge with a map in metres
+    metres = () if up_to_scale else (SubmapScale(NEW, 1.0),)
+    step(mapper, 1.0, *metres, SubmapTie(NEW, LAST, T_K_F, 0.005, 0.002), FLOWN[3])
+    S = mapper.placements[NEW]
+    assert sim3.scale_of(S) == pytest.approx(2.0 if up_to_scale else 1.0)
+    expected = sim3.place(mapper.placements[OLD], T_M_LAST @ T_K_F)
+    assert np.allclose(sim3.place(S, T_M_FIRST), expected, atol=1e-9)
 
 
 def test_submaps_after_one_that_follows_its_tie_move_along() -> None:

@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 
 from kiteline_basestation.config import BaseConfig, OdometryFactorConfig
+from kiteline_basestation.inertial.units import units_of
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.mapper_state import map_state, restore_map
 from kiteline_basestation.refinement.bundle_window import bundle_window
 from kiteline_basestation.refinement.disparity_calibration import with_border
 from kiteline_basestation.refinement.odometry_factors import (
-    _units,
     median_depths,
     with_odometry_factors,
     without_odometry_factors,
@@ -331,17 +329,15 @@ def test_where_accelerations_have_corrected_lengths_steps_are_as_long_as_the_map
         parent = keyframe_id(SUBMAP, k - 1) if k else NO_KEYFRAME
         sparse_map.add_keyframe(keyframe_id(SUBMAP, k), k, parent, step if k else np.eye(4), 0)  # of equal weight
     rows = np.array([sparse_map.rows[keyframe_id(SUBMAP, k)] for k in range(n)], np.int32)
-    number = {keyframe_id(SUBMAP, k): k for k in range(n)}
-    window: Any = SimpleNamespace(rows=rows)
-    assert np.array_equal(_units(sparse_map, window, number, 20), np.ones(n))
-    sparse_map.scale_submap(SUBMAP, 0.95)
+    assert np.array_equal(units_of(sparse_map, rows, 20), np.ones(n))
+    sparse_map.scaled_submaps.add(SUBMAP)
     grown = np.where(np.arange(n) < n // 2, 1.0, 0.95)  # the newest keyframes have another length
     grown[10] = 40.0  # and one step is torn
     sparse_map.keyframes.T_w_k[rows, 0, 3] = np.cumsum(np.r_[0.0, 0.5 * grown[1:]])
-    found = _units(sparse_map, window, number, 20)
+    found = units_of(sparse_map, rows, 20)
     assert np.allclose(found[1:20], 1.0) and np.allclose(found[40:], 0.95)
     sparse_map.keyframes.T_w_k[rows, 0, 3] *= 3.0
-    assert _units(sparse_map, window, number, 20).max() < 1.1  # a map that is torn as a whole is not held
+    assert units_of(sparse_map, rows, 20).max() < 1.11  # a map that is torn as a whole is not held
 
 
 def test_inertial_steps_tie_a_keyframe_without_a_parent() -> None:

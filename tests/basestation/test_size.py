@@ -1,4 +1,4 @@
-"""Maps of any size: regions, parts, memory that serves again, loops that many votes close."""
+"""Maps of any size: regions, memory, corrections of many keyframes, loops that many votes close."""
 
 from __future__ import annotations
 
@@ -17,30 +17,19 @@ from hypothesis import strategies as st
 
 from kiteline_basestation.config import BaseConfig, PublishConfig
 from kiteline_basestation.exchange.publisher import Publisher
-from kiteline_basestation.intake.intake import Intake
-from kiteline_basestation.job_kinds import run_job
-from kiteline_basestation.jobs import Job, JobDone
-from kiteline_basestation.management import Command
 from kiteline_basestation.map.free_runs import FreeRuns
 from kiteline_basestation.map.map_tables import CULLED, LANDMARK
 from kiteline_basestation.map.sparse_map import SparseMap
-from kiteline_basestation.mapper import Mapper, MapperInput
-from kiteline_basestation.merging.correction import full_bundle_window, keyframes_of, move_keyframes, part_spans
-from kiteline_basestation.merging.correction_jobs import FullBundle
+from kiteline_basestation.mapper import Mapper
+from kiteline_basestation.merging.correction import keyframes_of, move_keyframes
 from kiteline_basestation.merging.loop_detector import LoopDetector
 from kiteline_basestation.refinement.bundle_window import bundle_window, local_keyframes
 from kiteline_basestation.refinement.culling import cull_weak_landmarks
 from kiteline_basestation.refinement.local_bundles import LocalBundles
-from kiteline_basestation.station import Station
-from kiteline_basestation.store.integrity import contradictions
-from kiteline_codec.channel import CodedChannel, coded_channel
-from kiteline_codec.schema import KEYFRAME_KINDS, CameraIntrinsics, CulledLandmarks, KeyframePose
-from kiteline_codec.sync.resumption import agent_session
+from kiteline_codec.schema import CulledLandmarks, KeyframePose
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import NO_KEYFRAME, KeyframeId, keyframe_id, submap_id, submap_of_keyframe
-from kiteline_core.optimisation.bundle import BundleResult
-from tests.basestation.feeding import STEP_NS, WITHOUT_GRID, feed, keyframes_in
-from tests.entries import entries_of
+from tests.basestation.feeding import WITHOUT_GRID, feed, keyframes_in
 from tests.yardstick import slowness
 
 MakeFlight = Callable[..., Any]
@@ -312,103 +301,6 @@ def test_what_moves_nothing_is_coded_over_several_steps_too(mapped: tuple[Any, M
     assert keyframes_in(records) == flight.keyframes
 
 
-def test_deleted_maps_leave_their_memory_to_the_next_ones(make_flight: MakeFlight, words: Any) -> None:
-    stays = make_flight(keyframes=12, agent=1, seed=5)
-    mapper, alone = Mapper(WITHOUT_GRID, words), Mapper(WITHOUT_GRID, words)
-    feed(alone, [stays])
-    feed(mapper, [stays])
-    sizes = []
-    for number in range(4):
-        flight = make_flight(keyframes=12, submap=number, seed=20 + number)
-        feed(mapper, [flight])
-        sizes.append((mapper.map.height, mapper.map.slots, mapper.map.nbytes()))
-        command = Command(number, "delete", f'{{"map": "0.1.{number}"}}')
-        for n in range(2):
-            output = mapper.step(MapperInput((), (), (command,) if n == 0 else ()), (10**6 + number * 10 + n) * STEP_NS)
-            assert all(answer.ok for answer in output.answers)
-        assert contradictions(mapper) == []
-        assert len(mapper.map) == 12 and mapper.idle
-    assert {height for height, _, _ in sizes} == {24}
-    assert max(slots for _, slots, _ in sizes) < 1.05 * sizes[0][1]  # flights are not all of one size
-    for keyframe in stays.keyframes:
-        assert np.array_equal(mapper.map.pose(keyframe), alone.map.pose(keyframe))
-    assert mapper.map.count_live() == alone.map.count_live() == len(mapper.map.live_landmarks())
-
-
-def test_flights_that_come_and_are_deleted_leave_nothing_behind(
-    make_flight: MakeFlight, words: Any, lively_room: Any
-) -> None:  # fmt: skip
-    station = Station(BaseConfig(), lambda agent: coded_channel(1, 0, "wifi", peer=agent), words)
-    done: tuple[JobDone, ...] = ()
-    counts = []
-    now_ns = 0
-    for boot in range(1, 6):
-        looks = np.random.default_rng(boot).integers(0, 256, lively_room.descriptors.shape, np.uint8)
-        scene = replace(lively_room, descriptors=looks)
-        flight = make_flight(keyframes=10, boot=boot, submap=boot, turns=0.2, scene=scene)
-        end, down = coded_channel(agent_session(boot, boot), 0, "wifi"), list[bytes]()
-        end.put(CameraIntrinsics(flight.agent, flight.camera))
-        for n in range(70):
-            end.receive(down, now_ns)
-            for record in flight.records[n] if n < len(flight.records) else ():
-                end.put(record)
-            delete = Command(n, "delete", f'{{"map": "0.{boot - 1}.{boot - 1}"}}')
-            orders = [delete] if n == 40 and boot > 1 else []
-            output = station.step({flight.agent: end.poll(now_ns)}, done, now_ns, orders)
-            assert all(answer.ok for answer in output.answers)
-            done = tuple(run_job(job) for job in output.jobs)
-            down = list(dict(output.packets).get(flight.agent, ()))
-            now_ns += STEP_NS
-        counts.append(entries_of(station))
-    before, after = counts[2], counts[4]  # one flight in two is placed: it comes when there is no other map
-    grown = {name: after[name] - before[name] for name in after if after[name] > before[name]}
-    assert {name for name in grown if not name.endswith(_MAY_GROW)} == set()
-
-
-def test_what_was_written_of_a_deleted_map_is_removed_once_the_agent_has_it(
-    make_flight: MakeFlight, words: Any, lively_room: Any
-) -> None:  # fmt: skip
-    station = Station(BaseConfig(), lambda agent: coded_channel(1, 0, "wifi", peer=agent), words)
-    flight = make_flight(keyframes=8, boot=1, submap=1, turns=0.2, scene=lively_room)
-    end, down, done = coded_channel(agent_session(1, 1), 0, "wifi"), list[bytes](), tuple[JobDone, ...]()
-    end.put(CameraIntrinsics(flight.agent, flight.camera))
-    held, culled = list[int](), False
-    channel = station.join(flight.agent)
-    assert isinstance(channel, CodedChannel)
-    for n in range(60):
-        records = end.receive(down if n < 30 or n >= 40 else [], n * STEP_NS)  # the link is down for a while
-        culled |= any(isinstance(r, CulledLandmarks) and r.keyframe_too for r in records)
-        for record in flight.records[n] if n < len(flight.records) else ():
-            end.put(record)
-        orders = [Command(n, "delete", '{"map": "0.1.1"}')] if n == 30 else []
-        up = end.poll(n * STEP_NS) if n < 30 or n >= 40 else []
-        output = station.step({flight.agent: up}, done, n * STEP_NS, orders)
-        done = tuple(run_job(job) for job in output.jobs)
-        down = list(dict(output.packets).get(flight.agent, ()))
-        held.append(sum(key.kind in KEYFRAME_KINDS for key in channel.endpoint.own_values()))
-    assert held[29] > 10 and min(held[30:40]) >= held[29]  # the agent does not know yet
-    assert culled and held[-1] == 0
-    assert not any(key.kind in KEYFRAME_KINDS for key in end.endpoint.peer_values())
-    assert channel.endpoint.stats.mismatches == end.endpoint.stats.mismatches == 0
-
-
-# Ids of what was deleted, which are ignored for ever, and times, of which the newest are kept.
-_MAY_GROW = (".deleted", ".grid_ns")
-
-
-def test_nothing_is_left_of_a_forgotten_submap_whose_keyframes_did_not_all_come(make_flight: MakeFlight) -> None:
-    flight, sparse_map = make_flight(keyframes=12), SparseMap()
-    intake = Intake(BaseConfig().intake, sparse_map)
-    never = flight.keyframes[5]
-    for records in flight.records:
-        intake.take(flight.agent, tuple(r for r in records if getattr(r, "keyframe", None) != never), 0)
-    sparse_map.up[never] = np.array([0.0, -1.0, 0.0]), 0.01
-    assert sparse_map._waiting and sparse_map.children_of(never)
-    sparse_map.forget([submap_of_keyframe(never)])
-    assert len(sparse_map) == 0
-    assert not (sparse_map._waiting or sparse_map.up or any(sparse_map._children.values()))
-
-
 def test_a_large_map_is_merged_in_a_step(words: Any) -> None:
     mapper = Mapper(BaseConfig(), words)
     assert mapper.merger is not None
@@ -434,87 +326,3 @@ def test_a_keyframe_whose_time_changed_leaves_no_frame_behind(words: Any) -> Non
     sparse_map.add_keyframe(b, 5, NO_KEYFRAME, np.eye(4), 0)
     detector.add(b)
     assert detector.query(b) is None
-
-
-def test_parts_overlap_by_half_and_cover_everything() -> None:
-    for count in (1, 799, 800, 801, 1199, 1200, 1201, 20_000):
-        spans = part_spans(count, 800)
-        assert spans[0][0] == 0 and spans[-1][1] == count
-        assert all(b[0] - a[0] == 400 and b[0] < a[1] for a, b in pairwise(spans))
-        assert all(end - begin <= 800 for begin, end in spans)
-
-
-@pytest.mark.parametrize("most", [0, 1])
-def test_without_full_bundles_a_base_goes_on(make_flight: MakeFlight, most: int) -> None:
-    config = BaseConfig()
-    mapper = Mapper(replace(config, graph=replace(config.graph, max_full=most)), _no_words())
-    feed(mapper, [make_flight(keyframes=6)])
-    assert mapper.counts.bundles > 0
-
-
-def test_a_map_too_large_for_one_bundle_is_bundled_in_parts(make_flight: MakeFlight, ring: Any) -> None:
-    flight = make_flight(keyframes=40, turns=0.8, scene=ring, drift_m=0.01, seed=3)
-    errors = {}
-    for most in (0, 16):
-        config = WITHOUT_GRID
-        graph = replace(config.graph, max_full=most or 800, full_share=1.0)
-        jobs: list[Job] = []
-
-        def run(job: Job, jobs: list[Job] = jobs) -> JobDone:
-            jobs.append(job)
-            return run_job(job)
-
-        mapper = Mapper(replace(config, graph=graph), _no_words())
-        feed(mapper, [flight], run=run)
-        full = [job for job in jobs if job.kind == "full"]
-        if most:
-            assert max(len(job.inputs.problem.T_c_m) for job in full) <= 16 + 16  # free, and held around them
-            assert mapper.merger is not None
-            bundled = mapper.merger._corrections._schedule.bundled
-            assert {part for _, part in bundled} >= set(range(len(part_spans(40, 16))))
-        poses = [mapper.map.pose(k) for k in flight.keyframes]
-        errors[most] = np.sqrt(np.mean([np.sum((p - t)[:3, 3] ** 2) for p, t in zip(poses, flight.true_T_m_k)]))
-    assert errors[16] < 1.5 * errors[0] + 0.01
-
-
-def test_what_follows_a_part_is_held_also_behind_culled_keyframes(make_flight: MakeFlight) -> None:
-    flight, mapper, config = make_flight(keyframes=20), Mapper(), BaseConfig()
-    feed(mapper, [flight])
-    for k in (10, 11):
-        mapper.map.cull_keyframe(flight.keyframes[k])
-    alone = replace(config.bundle_window, max_fixed=0)
-    free = flight.keyframes[2:10]
-    window = bundle_window(mapper.map, free, alone, config.measurement, set(), with_children=True)
-    assert window is not None
-    held = mapper.map.keyframes.id[window.rows[~window.problem.free]].tolist()
-    assert held == [flight.keyframes[1], flight.keyframes[12]]
-
-
-def test_a_part_tells_all_that_it_moves_also_what_came_since_it_began(make_flight: MakeFlight) -> None:
-    flight, config = make_flight(keyframes=30), BaseConfig()
-    mapper = Mapper(replace(config, graph=replace(config.graph, max_full=16)), _no_words())
-    assert mapper.merger is not None
-    camera = CameraIntrinsics(flight.agent, flight.camera)
-    for n, records in enumerate(flight.records[:20]):
-        mapper.step(MapperInput(((flight.agent, (camera, *records)),)), n * STEP_NS)
-    submap = submap_of_keyframe(flight.keyframes[0])
-    window = full_bundle_window(mapper.map, submap, (), mapper.config, (submap, 1))
-    assert window is not None
-    for n, records in enumerate(flight.records[20:], 20):
-        mapper.step(MapperInput(((flight.agent, tuple(records)),)), n * STEP_NS)
-    T_c_m = window.problem.T_c_m.copy()
-    T_c_m[window.problem.free] = T_c_m[window.problem.free] @ se3.exp(np.array([0.1, 0.0, 0.0, 0.0, 0.0, 0.0]))
-    points = window.problem.points
-    result = BundleResult(T_c_m, points, np.ones(len(window.slots), np.bool_), 0.0, 0.0, 1, 0)
-    before = mapper.map.keyframes.T_w_k.copy()
-    changes = mapper.merger._apply_full_bundle(FullBundle(submap, window, (), part=(submap, 1)), result)
-    moved = np.flatnonzero((before != mapper.map.keyframes.T_w_k).any(axis=(1, 2))).tolist()
-    assert mapper.map.rows[flight.keyframes[-1]] in moved
-    assert changes.bent == frozenset(moved)
-
-
-def _no_words() -> Any:
-    from kiteline_core.places.place_index import Vocabulary, nodes
-
-    centres = np.random.default_rng(5).integers(0, 2**64, (nodes(20, 2), 4), dtype=np.uint64)
-    return Vocabulary(20, 2, centres, np.ones(400, np.float32))

@@ -87,6 +87,25 @@ def test_a_map_that_the_base_has_scaled_keeps_its_metre() -> None:
     assert sim3.scale_of(tie.S_older_newer) == pytest.approx(0.98 / UNIT)
 
 
+def test_a_map_in_the_base_s_metres_tells_how_long_the_agents_unit_was_there() -> None:
+    """The base corrected the old submap to 0.98 of what the agent measured, in keyframes, not in the placement."""
+    sparse_map, n = a_map(), 12
+    step = se3.from_rt(np.eye(3), np.array([0.3, 0.0, 0.0]))
+    for k in range(2, n):
+        sparse_map.add_keyframe(keyframe_id(OLD, k), k, keyframe_id(OLD, k - 1), step, 0)
+    for k in range(n):
+        keyframe = keyframe_id(OLD, k)
+        T = sparse_map.pose(keyframe)
+        assert T is not None
+        sparse_map.set_pose(keyframe, sim3.with_scaled_translation(T, 0.98), carry=False)
+    sparse_map.scaled_submaps.add(OLD)
+    ties = InertialTies(sparse_map)
+    ties.add(replace(a_record(), since=keyframe_id(OLD, n - 1)))
+    tie = ties.take()
+    assert tie is not None and tie.metre == 1.0
+    assert sim3.scale_of(tie.S_older_newer) == pytest.approx(0.98 / UNIT)
+
+
 def test_nothing_is_tied_that_is_one_map_already_or_has_no_metre() -> None:
     for change in ("merged", "unknown", "alone"):
         sparse_map, record = a_map(), a_record()

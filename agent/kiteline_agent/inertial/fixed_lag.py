@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from kiteline_agent.inertial import fixed_lag_kernels as kernels
 from kiteline_agent.inertial import inertial_kernels
+from kiteline_agent.inertial.inertial_config import FixedLagConfig, StartDeviations
 from kiteline_agent.inertial.preintegration import Preintegrated, Samples, preintegrate
 from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry import se3
@@ -21,39 +22,6 @@ from kiteline_core.geometry.cameras import RectifiedCamera
 
 F64 = NDArray[np.float64]
 Bools = NDArray[np.bool_]
-
-
-@dataclass(frozen=True, slots=True)
-class FixedLagConfig:
-    """Length of the window, and error models of the measurements."""
-
-    states: int = 3  # frames in the window; with fixed points, 2 to 6 are equally accurate and more cost time
-    fresh: int = 1  # newest frames whose points are relinearised; older ones are condensed to 6x6
-    iterations: int = 3  # Gauss-Newton steps; the prediction is close
-    points: int = 320  # most points of a frame
-    chi2: float = 9.21  # 99 % of a chi-square with 2 degrees of freedom; Huber's knee is at half of it
-    velocity_chi2: float = 7.81  # 95 % with 3 degrees of freedom: an odometer's velocity beyond it is down-weighted
-    velocity_gate: float = 16.27  # 99.9 %: beyond it a velocity is rejected: wheels slip
-    visual_inflation: float = 16.0  # of variance: errors of templates and points are correlated over frames
-    imu_inflation: float = 3.0  # of noise densities: vibration, uncalibrated scale and axes, a bent map
-    turn_floor_rad: float = 2e-5  # error of a preintegrated rotation that no noise density explains
-    velocity_floor_m_s: float = 5e-4  # the same of velocity: interpolated ends of the interval
-    position_floor_m: float = 2e-5  # the same of position
-    tilt_walk_rad: float = 2e-4  # per sqrt(s): the map itself bends while it grows
-    relinearise_gyro_rad_s: float = 0.01  # change of bias above which an interval is integrated again
-    relinearise_accel_m_s2: float = 0.2  # the same of the accelerometer
-
-
-@dataclass(frozen=True, slots=True)
-class StartDeviations:
-    """Standard deviations of the initial state."""
-
-    turn_rad: float = 0.02
-    position_m: float = 0.02
-    velocity_m_s: float = 0.1
-    gyro_bias_rad_s: float = 0.01
-    accel_bias_m_s2: float = 0.1
-    tilt_rad: float = 0.03
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,7 +163,7 @@ class FixedLagSmoother:
         return motion.propagate(state.T_m_b, state.velocity, state.bias, self.gravity)
 
     def _integrated(self, samples: Samples, bias: F64) -> Preintegrated:
-        """The samples preintegrated; a frame's prediction and its update ask for the same ones."""
+        """The samples preintegrated; cached, as a frame's prediction and its update need the same ones."""
         held = self._newest
         if held is None or held[0] is not samples or not (held[1].bias == bias).all():
             motion = preintegrate(samples, bias, self._calibration, self._config.imu_inflation)
@@ -308,6 +276,23 @@ class FixedLagSmoother:
         self._vis_b[:n] = self._vis_b[:n] @ q6.T
         self._xyz[:n] = self._xyz[:n] @ r.T + t
         self._ray[:n] = self._ray[:n] @ r.T
+
+    def scale_map(self, factor: float, centre: F64) -> None:
+        """Scale all states after lengths in the map were multiplied by `factor` about centre (3,)."""
+        n = self._n
+        for block in (self._state[:n], self._prior_s[None, :]):
+            block[:, :3] = centre + factor * (block[:, :3] - centre)
+            block[:, 3:6] *= factor
+        self._vis_p[:n] = centre + factor * (self._vis_p[:n] - centre)
+        self._xyz[:n] = centre + factor * (self._xyz[:n] - centre)
+        self._ray[:n] *= factor
+        q = np.ones(17)
+        q[3:9] = factor
+        self._prior_h /= np.outer(q, q)
+        self._prior_b /= q
+        self._cov *= np.outer(q, q)
+        self._vis_h[:n] /= np.outer(q[:6], q[:6])
+        self._vis_b[:n] /= q[:6]
 
     def _put_interval(self, k: int, motion: Preintegrated) -> None:
         self._imu_dt[k], self._imu_turn[k], self._imu_vp[k] = motion.dt_s, motion.turn, motion.vp

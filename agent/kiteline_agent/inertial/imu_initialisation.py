@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_agent.inertial import initial_alignment
-from kiteline_agent.inertial.fixed_lag import FixedLagSmoother, StartDeviations
-from kiteline_agent.inertial.inertial_config import InertialConfig
+from kiteline_agent.inertial.fixed_lag import FixedLagSmoother
+from kiteline_agent.inertial.inertial_config import InertialConfig, StartDeviations
 from kiteline_agent.inertial.preintegration import Preintegrated, Samples, preintegrate
 from kiteline_agent.inertial.sample_buffer import SampleBuffer
 from kiteline_core.frame import ImuCalibration

@@ -5,7 +5,39 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from kiteline_agent.inertial.calibration.self_calibration import SelfCalibrationConfig
-from kiteline_agent.inertial.fixed_lag import FixedLagConfig
+
+
+@dataclass(frozen=True, slots=True)
+class FixedLagConfig:
+    """Length of the window, and error models of the measurements."""
+
+    states: int = 3  # frames in the window; with fixed points, 2 to 6 are equally accurate and more cost time
+    fresh: int = 1  # newest frames whose points are relinearised; older ones are condensed to 6x6
+    iterations: int = 3  # Gauss-Newton steps; the prediction is close
+    points: int = 320  # most points of a frame
+    chi2: float = 9.21  # 99 % of a chi-square with 2 degrees of freedom; Huber's knee is at half of it
+    velocity_chi2: float = 7.81  # 95 % with 3 degrees of freedom: an odometer's velocity beyond it is down-weighted
+    velocity_gate: float = 16.27  # 99.9 %: beyond it a velocity is rejected: wheels slip
+    visual_inflation: float = 16.0  # of variance: errors of templates and points are correlated over frames
+    imu_inflation: float = 3.0  # of noise densities: vibration, uncalibrated scale and axes, a bent map
+    turn_floor_rad: float = 2e-5  # error of a preintegrated rotation that no noise density explains
+    velocity_floor_m_s: float = 5e-4  # the same of velocity: interpolated ends of the interval
+    position_floor_m: float = 2e-5  # the same of position
+    tilt_walk_rad: float = 2e-4  # per sqrt(s): the map itself bends while it grows
+    relinearise_gyro_rad_s: float = 0.01  # change of bias above which an interval is integrated again
+    relinearise_accel_m_s2: float = 0.2  # the same of the accelerometer
+
+
+@dataclass(frozen=True, slots=True)
+class StartDeviations:
+    """Standard deviations of the initial state."""
+
+    turn_rad: float = 0.02
+    position_m: float = 0.02
+    velocity_m_s: float = 0.1
+    gyro_bias_rad_s: float = 0.01
+    accel_bias_m_s2: float = 0.1
+    tilt_rad: float = 0.03
 
 
 @dataclass(frozen=True, slots=True)

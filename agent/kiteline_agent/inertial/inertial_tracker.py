@@ -10,16 +10,9 @@ from numpy.typing import NDArray
 
 from kiteline_agent.inertial.calibration.known_imu import KnownImuConfig
 from kiteline_agent.inertial.calibration.self_calibration import SelfCalibration
-from kiteline_agent.inertial.fixed_lag import (
-    BodyVelocity,
-    FixedLagSmoother,
-    InertialState,
-    StartDeviations,
-    VisualPoints,
-    tilt_of,
-)
+from kiteline_agent.inertial.fixed_lag import BodyVelocity, FixedLagSmoother, InertialState, VisualPoints, tilt_of
 from kiteline_agent.inertial.imu_initialisation import ImuInitialiser, InertialStartState, TimedPose
-from kiteline_agent.inertial.inertial_config import InertialConfig
+from kiteline_agent.inertial.inertial_config import InertialConfig, StartDeviations
 from kiteline_agent.inertial.preintegration import BiasPrior, Preintegrated, Samples, preintegrate
 from kiteline_agent.inertial.sample_buffer import SampleBuffer
 from kiteline_agent.inertial.scale_filter import ScaleFilter, camera_scaled
@@ -265,6 +258,16 @@ class InertialTracker:
             self._scale_from = (self._scale_from[0], T_new_old @ self._scale_from[1])
         self._scale.rotate_map(T_new_old[:3, :3])
 
+    def scale_map(self, factor: float) -> None:
+        """Lengths in a monocular map were multiplied by `factor` about the camera of the last frame."""
+        if self._last is None or not self._smoother.running:
+            return
+        camera = self._last[1][:3, 3] + self._last[1][:3, :3] @ self._p_b_c
+        self._smoother.scale_map(factor, camera)
+        self._scale.rescale(factor)
+        if self._scale_from is not None:
+            self._scale_from = self._scale_from[0], camera_scaled(self._scale_from[1], factor, self._p_b_c, camera)
+
     def begin_map(self, t_ns: int, T_m_b: F64) -> None:
         """Begin a new map at this frame, with the body at T_m_b (4,4) by definition.
 
@@ -333,7 +336,7 @@ class InertialTracker:
         return self._between(from_ns + self._offset_ns, to_ns + self._offset_ns)
 
     def _between(self, from_ns: int, to_ns: int) -> Samples | None:
-        """Corrected samples; the prediction and the update of a frame ask for the same ones."""
+        """Corrected samples; cached, as the prediction and the update of a frame need the same ones."""
         key = (from_ns, to_ns, self._buffer.newest_t_ns)
         if self._cached is None or self._cached[0] != key:
             samples = self._buffer.between(from_ns, to_ns)

@@ -128,7 +128,12 @@ class ScaleFilter:
         self._x, self._cov = q @ self._x, q @ self._cov @ q.T
 
 
-def camera_scaled(T_m_b: F64, scale: float, p_b_c: F64) -> F64:
-    """T_m_b (4,4) after the map was scaled: the camera's position scales, its lever arm p_b_c (3,) does not."""
+def camera_scaled(T_m_b: F64, scale: float, p_b_c: F64, centre: F64 | None = None) -> F64:
+    """T_m_b (4,4) after the map was scaled about a centre (3,): the camera's position scales.
+
+    Its lever arm p_b_c (3,) does not. centre: None for the origin.
+    """
     offset = T_m_b[:3, :3] @ p_b_c
-    return se3.from_rt(T_m_b[:3, :3], scale * (T_m_b[:3, 3] + offset) - offset)
+    camera = T_m_b[:3, 3] + offset
+    scaled = scale * camera if centre is None else centre + scale * (camera - centre)
+    return se3.from_rt(T_m_b[:3, :3], scaled - offset)

@@ -28,6 +28,7 @@ F64 = NDArray[np.float64]
 
 _NEARLY = 1.3  # times the deviation of a known scale: below it the landmarks are aligned again, to know it sooner
 _MIN_VIEWS = 3  # keyframes in which a landmark is aligned again, to be kept
+_STILL_FLOW = 0.25  # share of `min_flow` below which the vehicle stands
 _LOWER_COST = 1.0  # by which a solution from nothing must be better: a deviation of the scale is worth 0.5
 _SAME_SCALE = 0.5  # deviations of the scale: solutions that differ by less left out other corners
 _MIN_COMMON = 3  # keyframes of two windows whose distances are compared
@@ -115,6 +116,8 @@ class InertialStart:
             return None
         config = self._config.inertial_start
         self._tracks.drop_before(ctx.t_ns - round(config.max_span_s * 1e9))
+        if self._tracks.flow_px() < _STILL_FLOW * config.min_flow * self._camera.fx:
+            self._tracks.drop_before(ctx.t_ns - round(config.rest_s * 1e9))
         keyframes = self._tracks.keyframes
         span_s = (ctx.t_ns - keyframes[0].t_ns) * 1e-9
         wait_s = max(config.attempt_s, config.attempt_share * span_s)
@@ -277,13 +280,15 @@ class InertialStart:
         return BiasPrior(np.zeros(6), np.repeat([bundle.gyro_bias_rad_s, bundle.accel_bias_m_s2], 3))
 
     def _intervals(self, keyframes: list[TrackedKeyframe], offset_ns: int) -> list[Samples] | None:
-        """Samples between the keyframes; None if some are missing, when the window begins anew."""
+        """Samples between the keyframes; None if some are missing: the window then begins with the keyframe after."""
         found = [self._buffer.between(a.t_ns + offset_ns, b.t_ns + offset_ns) for a, b in pairwise(keyframes)]
         complete = [samples for samples in found if samples is not None]
-        if len(complete) < len(found):
-            self.clear()
-            return None
-        return complete
+        if len(complete) == len(found):
+            return complete
+        last_missing = max(k for k, samples in enumerate(found) if samples is None)
+        self._tracks.drop_before(keyframes[last_missing + 1].t_ns)
+        self._tried_ns = None
+        return None
 
 
 def _lengths_apart(a: F64, b: F64) -> float:

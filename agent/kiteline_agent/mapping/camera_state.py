@@ -15,6 +15,7 @@ from kiteline_agent.motion.motion_model import MotionModel
 from kiteline_agent.relocalisation.relocaliser import Relocalisation
 from kiteline_agent.step import Identity
 from kiteline_agent.tracking.frame_context import FrameContext
+from kiteline_agent.tracking.map_anchor import MapMotion
 from kiteline_agent.tracking.pose_state import PoseState
 from kiteline_agent.tracking.track import Track
 from kiteline_codec.schema import GravityAlignment
@@ -111,17 +112,17 @@ class CameraState:
         """Carry the covariance over to the odometry frame, before the map changes under the camera."""
         self.covariance.before_map_change(self.pose, self.T_c_b, self.submaps.active)
 
-    def move_map(self, T_m_c: F64) -> None:
-        """The map moved: the camera is at T_m_c (4,4) in it now."""
+    def move_map(self, T_m_c: F64, growth: float = 1.0) -> None:
+        """The map moved: the camera is at T_m_c (4,4) in it now. growth: factor of lengths around it."""
         before = self.pose.T_m_c
         self.pose.move_map(T_m_c)
-        self.motion.move_map(se3.orthonormalise(self.pose.T_m_c @ se3.inverse(before)))
+        self.motion.move_map(se3.orthonormalise(self.pose.T_m_c @ se3.inverse(before)), growth)
         self.reference.set_camera(self.pose.T_m_c)
 
-    def follow_corrections(self, T_new_old: F64 | None) -> None:
-        """The base moved the local map: move by T_new_old (4,4), or with the reference keyframe if that is None."""
-        if T_new_old is not None:
-            self.move_map(T_new_old @ self.pose.T_m_c)
+    def follow_corrections(self, motion: MapMotion | None) -> None:
+        """The base moved the local map: move with it, or with the reference keyframe if its motion is not known."""
+        if motion is not None:
+            self.move_map(motion.T_new_old @ self.pose.T_m_c, motion.growth)
         elif self.reference.T_m_k is not None:
             self.move_map(self.reference.T_m_k @ self.reference.T_k_c)
         else:

@@ -86,7 +86,7 @@ class MotionModel:
 
     @property
     def awaits_scale(self) -> bool:
-        """True if lengths are not in metres yet, but the odometer may still tell the scale."""
+        """True if lengths are not in metres yet, but the odometer may still give the scale."""
         return not self.metric and self.odometer.awaits_scale
 
     def known_imu(self) -> KnownImuConfig | None:
@@ -187,12 +187,17 @@ class MotionModel:
         self._restart_steps(t_ns)
         self.odometer.restart(self._pose.T_m_c, t_ns)
 
-    def move_map(self, T_new_old: F64) -> None:
-        """Transform the state after the submap frame moved by T_new_old (4,4)."""
+    def move_map(self, T_new_old: F64, growth: float = 1.0) -> None:
+        """Transform the state after the submap frame moved by T_new_old (4,4).
+
+        growth: factor of lengths around the camera; not followed where images measure distances.
+        """
         if self.tracker is not None:
             self.tracker.move_map(T_new_old)
         if self._steps is not None:
             self._steps.move_map(T_new_old)
+        if self.tracker is not None and not self._metric:
+            self.tracker.scale_map(growth)
         self.odometer.move_map(T_new_old)
 
     def begin_unscaled_map(self) -> None:
@@ -223,7 +228,7 @@ class MotionModel:
         return found[0] if found is not None and found[1] <= sigma * found[0] else None
 
     def scale_correction(self) -> tuple[float, float] | None:
-        """Factor by which the map in metres is to be scaled, and its deviation; None if nothing says so."""
+        """Factor by which the map in metres is to be scaled, and its deviation; None if no correction is due."""
         return None if self._metric or self.tracker is None else self.tracker.scale_correction()
 
     def reports(self) -> dict[str, Any]:
@@ -241,6 +246,11 @@ class MotionModel:
             self.tracker.rescale(metres_per_unit)
             self.tracker.move_map(T_new_old)
         self.odometer.set_metric(metric=True)
+        self._restart_steps(t_ns)
+
+    def continue_map(self, t_ns: int, T_new_old: F64) -> None:
+        """Continue in a submap that begins at this frame, in the same unit; the old one lies at T_new_old (4,4)."""
+        self.move_map(T_new_old)
         self._restart_steps(t_ns)
 
     def _restart_steps(self, t_ns: int) -> None:

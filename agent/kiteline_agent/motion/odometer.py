@@ -112,7 +112,7 @@ class Odometer:
 
     @property
     def awaits_scale(self) -> bool:
-        """True in a map of unknown scale while the odometer may still tell it."""
+        """True in a map of unknown scale while the odometer may still give it."""
         if self.metric or not self.has_samples:
             return False
         began_ns = self._unscaled_ns

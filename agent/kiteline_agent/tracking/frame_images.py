@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_agent.config import PyramidConfig, StereoConfig
+from kiteline_agent.config import PyramidConfig
 from kiteline_agent.imaging import stereo_kernels
 from kiteline_agent.imaging.features import Pyramid, build_pyramid
 from kiteline_core.frame import Frame
@@ -59,8 +59,8 @@ class RightImage:
         return np.asarray(cv2.pyrDown(self._image), np.uint8) if self._raw is None else self._raw[1]
 
     def refine(
-        self, left: Pyramid, left_grid: F32, uv: F64, octave: U8, sure: NDArray[np.bool_], config: StereoConfig,
-        search_px: float, disparity: F64, found: NDArray[np.bool_],
+        self, left: Pyramid, left_grid: F32, uv: F64, octave: U8, sure: NDArray[np.bool_], search_px: float,
+        disparity: F64, found: NDArray[np.bool_],
     ) -> None:  # fmt: skip
         """Measure disparities to sub-pixel (stereo_kernels.refine_rows); rectifies only the patches that it reads."""
         grid = self._rectifier.right_grid

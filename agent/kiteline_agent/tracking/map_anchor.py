@@ -6,6 +6,8 @@ hang on many keyframes. The camera moves with what it sees, so that the next fra
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,8 +22,18 @@ from kiteline_core.pose import pose_kernels
 F64 = NDArray[np.float64]
 
 
+_LEAST_DEPTH_M = 1e-3  # m
+
+
+class MapMotion(NamedTuple):
+    """Motion of the map under a camera: p_new = T_new_old p_old, (4,4). growth: factor of the depths that it sees."""
+
+    T_new_old: F64
+    growth: float
+
+
 class MapAnchor:
-    """The landmarks of a frame before corrections are applied; compare them with `T_new_old` afterwards."""
+    """The landmarks of a frame before corrections are applied; `motion` compares them with those afterwards."""
 
     def __init__(self, local_map: LocalMap, track: Track, config: AgentConfig, *, inertial: bool) -> None:
         """inertial: the track was fused with an IMU."""
@@ -40,27 +52,29 @@ class MapAnchor:
         return set(self._keyframes.tolist())
 
     def matters(self) -> bool:
-        """True if the map moved the camera by enough pixels, or if too few landmarks tell."""
-        T_new_old = self.T_new_old()
-        if T_new_old is None:
+        """True if the map moved the camera by enough pixels, or if too few landmarks are left to say by how many."""
+        moved = self.motion()
+        if moved is None:
             return True
         T_c_m = self._track.T_c_m
-        change = T_c_m @ T_new_old @ se3.inverse(T_c_m)
+        change = T_c_m @ moved.T_new_old @ se3.inverse(T_c_m)
         depth = median(self._track.depth_m[self._track.inlier])
         shift_m, turn = se3.shift_and_turn(change)
         return self._map.camera.fx * (shift_m / depth + turn) >= self._least_px
 
-    def T_new_old(self) -> F64 | None:
-        """Motion (4,4) of the map under the camera: p_new = T_new_old p_old. None with too few landmarks left."""
+    def motion(self) -> MapMotion | None:
+        """How the map moved under the camera. None with too few landmarks left."""
         m = self._map
         left = m.usable.reshape(-1)[self._rows] & (m.keyframe[self._rows // m.slot_size] == self._keyframes)
         if np.count_nonzero(left) < self._config.pose.min_inliers:
             return None
-        after, _ = m.positions(self._rows[left])
+        before, (after, _) = self._xyz[left], m.positions(self._rows[left])
         self.posed_points += len(after)
-        T_c_old = self._pose(self._xyz[left], left)
-        T_c_new = self._pose(after, left)
-        return se3.orthonormalise(se3.inverse(T_c_new) @ T_c_old)
+        T_c_old, T_c_new = self._pose(before, left), self._pose(after, left)
+        depth_before, depth_after = (
+            np.maximum(xyz @ T[2, :3] + T[2, 3], _LEAST_DEPTH_M) for T, xyz in ((T_c_old, before), (T_c_new, after))
+        )
+        return MapMotion(se3.orthonormalise(se3.inverse(T_c_new) @ T_c_old), median(depth_after / depth_before))
 
     def _pose(self, xyz: F64, left: NDArray[np.bool_]) -> F64:
         """T_c_m (4,4) from the frame's observations of landmarks at xyz (n,3)."""

@@ -190,9 +190,7 @@ class Tracker:
                 disparity[skipped] = -1.0
             self._work.stereo_points += min(len(uv), stereo.points)
             found = np.zeros(len(uv), np.bool_)
-            images.right.refine(
-                images.sampled, images.grid, uv, octave, sure, stereo, stereo.search_px, disparity, found
-            )
+            images.right.refine(images.sampled, images.grid, uv, octave, sure, stereo.search_px, disparity, found)
             observed[found, 2] = disparity[found]
         elif images.depth_m is not None:
             depth_m = depth_at(images.depth_m, uv)

@@ -29,7 +29,7 @@ _UNSAVED = 100  # batches that an earlier process may have made after its store 
 
 
 class CorrectionBatches:
-    """Numbers the batches of one agent, and says when there is room for the next one."""
+    """Numbers the batches of one agent, and computes the room for the next one."""
 
     def __init__(self, agent: AgentId, config: PublishConfig) -> None:
         self._agent = agent

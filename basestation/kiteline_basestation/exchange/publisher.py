@@ -93,7 +93,7 @@ class Publisher:
         moves.add(int(kind), keyframe)
 
     def mark_deleted(self, keyframe: KeyframeId) -> None:
-        """Mark a keyframe as culled that will be forgotten once the next call of `collect` has told of it."""
+        """Mark a keyframe as culled that will be forgotten once the next call of `collect` has published that."""
         self.mark_changed(CulledLandmarks.KIND, keyframe)
         self._whole = True
 

@@ -150,7 +150,7 @@ class GridUpdates:
         return changed
 
     def ground_below(self, keyframe: KeyframeId) -> float | None:
-        """Height in w of the ground below a keyframe, or the last one before it that knows; None if none does."""
+        """Height in w of the ground below a keyframe, or below the last one before it with a scan; None without one."""
         siblings = self._map.submaps.get(submap_of_keyframe(keyframe), [])
         for other in siblings[: bisect_right(siblings, keyframe)][: -1 - self._config.ground_keyframes : -1]:
             S_w_k = self._pose(other)

@@ -158,7 +158,7 @@ class ImageScans:
         return scans
 
     def _keep(self, scan: KeyframeScan) -> KeyframeScan:
-        """The scan as its code says: what is saved, and what is drawn."""
+        """The scan as it is decoded: what is saved, and what is drawn."""
         code = messages.encode(scan)
         self.made[int(scan.keyframe), scan.part] = MadeScan(code.hex())
         read = messages.decode(scan.key(), code)

@@ -1,4 +1,4 @@
-"""What the columns of a scan say of the cells around a camera, in cells of w."""
+"""Sectors of free cells and obstacles around a camera, from the columns of a scan, in cells of w."""
 
 from __future__ import annotations
 

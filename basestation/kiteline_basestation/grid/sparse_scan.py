@@ -33,7 +33,7 @@ def label(config: GridConfig, height_m: F64, distance_m: F64) -> U8:
 def sparse_scan(
     config: GridConfig, camera: RectifiedCamera, S_w_k: F64, points_k: F64, seen: Bool
 ) -> tuple[ColumnScan, U8] | None:
-    """A scan of the landmarks that a keyframe sees, and the labels of all. None if they tell no ground.
+    """A scan of the landmarks that a keyframe sees, and the labels of all. None if they show no ground.
 
     S_w_k: (4,4), z of w up. points_k: (n,3) landmarks around it in its camera, in m. seen: (n,) those
     that the keyframe sees; the others only tell the ground.

@@ -31,7 +31,7 @@ class Level:
 
 
 def level_of(sparse_map: SparseMap, keyframes: Sequence[KeyframeId]) -> Level | None:
-    """Gravity at the keyframes of one map, as far as their agents know it; None if none does."""
+    """Gravity at the keyframes of one map, where their agents measured it; None if nowhere."""
     rows = np.array([i for i, k in enumerate(keyframes) if k in sparse_map.up], np.int64)
     if not len(rows):
         return None

@@ -60,7 +60,7 @@ class _State:
 def in_metres(
     result: BundleResult, problem: BundleProblem, segments: tuple[Segment, ...], held: int, config: InertialScaleConfig
 ) -> BundleResult:  # fmt: skip
-    """The result of a bundle, scaled from the camera `held` on by what the segments tell, if that matters."""
+    """The result of a bundle, scaled from the camera `held` on by the scales of the segments, if that matters."""
     T_w_c: F64 = np.linalg.inv(result.T_c_m).astype(np.float64)
     shared = shared_landmarks(problem, result.inlier)
     found = map_scale(segments, T_w_c, shared, config)

@@ -12,12 +12,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from kiteline_basestation.inertial.units import units_of
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_codec.schema import InertialSteps
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import SubmapId, agent_of_keyframe, submap_of_keyframe
 
 F64 = NDArray[np.float64]
+
+_RUN = 20  # keyframes before a tie whose steps tell how long the agent's unit is there
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,8 +78,11 @@ class InertialTies:
             return None
         # Where the older map was never scaled by the base, the agent's new metre replaces its old one.
         unit = sparse_map.metres_per_unit.get(before, 1.0)
-        held = sparse_map.scale(before)
-        metre = unit if held == 1.0 else 1.0
+        scaled = before in sparse_map.scaled_submaps or sparse_map.scale(before) != 1.0
+        metre = 1.0 if scaled else unit
+        keyframes = [k for k in sparse_map.submaps[before] if k <= record.since and sparse_map.pose(k) is not None]
+        rows = np.array([sparse_map.rows[k] for k in keyframes[-_RUN:]], np.int32)
+        held = float(units_of(sparse_map, rows, _RUN)[-1])
         T_a_k = sim3.with_scaled_translation(moved_camera(sparse_map, record), held)
         S_older_newer = sim3.of(held / unit / sparse_map.scale(after), T_w_a @ T_a_k) @ se3.inverse(T_w_k)
         if newer < older:

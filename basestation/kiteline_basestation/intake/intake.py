@@ -96,10 +96,11 @@ class Intake:
             SubmapTie: self._take_tie,
         }
 
-    def take(self, agent: AgentId, records: tuple[Record, ...], now_ns: int) -> None:
-        """Put an agent's records into the map."""
-        for record in records:
+    def take(self, agent: AgentId, records: tuple[Record, ...], now_ns: int, *, in_contact: bool = True) -> None:
+        """Put an agent's records into the map. in_contact: the agent sent them now; they are no copy of a log."""
+        if records and in_contact:
             self.last_contact_ns[agent] = now_ns
+        for record in records:
             if not _is_own(agent, record):
                 self.refused += 1
                 continue

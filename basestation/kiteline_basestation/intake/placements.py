@@ -102,7 +102,7 @@ class SubmapPlacements:
         self._set(submap, S_w_m)
 
     def follow_ties(self) -> bool:
-        """Place submaps that are not recognised where their agents' motion over a loss says. True if one moved.
+        """Place submaps that are not recognised by their agents' motion over a loss. True if one moved.
 
         Submaps that were placed after such a submap, by how the agent left it, move along.
         """
@@ -139,17 +139,22 @@ class SubmapPlacements:
         if agent_of_submap(before) != agent_of_submap(submap):
             return False
         T_w_first = sim3.place(S_w_before, T_before_k @ tie.T_k_f)
-        self.unmerged[submap] = S_w_m = se3.orthonormalise(T_w_first @ se3.inverse(T_m_first))
+        scale = sim3.scale_of(S_w_before) if self._map.is_up_to_scale(submap) else 1.0
+        self.unmerged[submap] = S_w_m = sim3.normalise(sim3.of(scale, T_w_first) @ se3.inverse(T_m_first))
         self._set(submap, S_w_m)
         return True
 
     def rescale(self, factors: Mapping[SubmapId, float], scale_sigma: Mapping[SubmapId, float]) -> None:
         """Scale placements of submaps whose units grew in their maps, about their first keyframes.
 
-        scale_sigma: relative deviations of lengths, by map id; they are told with the change.
+        scale_sigma: relative deviations of lengths, by map id, which are told.
         """
         for map_id, sigma in scale_sigma.items():
-            self._scale_sigma |= dict.fromkeys(self._map.submaps_of_map(map_id), sigma)
+            submaps = self._map.submaps_of_map(map_id)
+            self._scale_sigma |= dict.fromkeys(submaps, sigma)
+            for submap in submaps:
+                if submap in self.S_w_m and submap in self._map.scaled_submaps and submap not in factors:
+                    self._set(submap, self.S_w_m[submap])
         for submap, factor in factors.items():
             first = self._map.first_pose(submap)
             if submap in self.S_w_m:
@@ -216,9 +221,10 @@ class SubmapPlacements:
         self._recognised = set(state.recognised)
 
     def restore_scale_sigma(self, record: SubmapPlacement) -> None:
-        """Continue with the deviation of lengths that an earlier process told."""
+        """Continue with the deviation of lengths that an earlier process published."""
         if record.scale_sigma > 0.0:
             self._scale_sigma[record.submap] = record.scale_sigma
+            self._map.scaled_submaps.add(record.submap)
 
     def _set(self, submap: SubmapId, S_w_m: F64) -> None:
         self.S_w_m[submap] = S_w_m

@@ -80,6 +80,7 @@ class MapView:
         self.root_submaps: dict[SubmapId, SubmapId] = {}  # merged submaps -> root submap of their map
         self.cameras: dict[AgentId, RectifiedCamera] = {}
         self.metric_submaps: set[SubmapId] = set()  # monocular submaps of known metric scale
+        self.scaled_submaps: set[SubmapId] = set()  # of these, those with lengths that the base corrected by the IMU
         self.inertial_steps: dict[KeyframeId, InertialSteps] = {}  # from the keyframe before to this one
         # Unit vector (3,) against gravity in the keyframe's camera, and its deviation in rad.
         self.up: dict[KeyframeId, tuple[F64, float]] = {}
@@ -289,7 +290,7 @@ class MapView:
         return out, known
 
     def has_position(self, landmark: int) -> bool:
-        """Whether `positions` knows where a landmark is."""
+        """Whether `positions` has a position of a landmark."""
         table, row = self.keypoints, self.keypoints.row[landmark]
         inverse = (table.refined if table.flags[landmark] & REFINED else table.inv_depth)[landmark]
         known = inverse > 0 and self.keyframes.pose_source[row] != NO_POSE and table.kind[landmark] == LANDMARK

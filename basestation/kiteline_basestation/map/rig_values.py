@@ -1,4 +1,4 @@
-"""What the map knows of the agents' cameras: calibrations and disparity offsets."""
+"""Calibrations and disparity offsets of the agents' cameras."""
 
 from __future__ import annotations
 

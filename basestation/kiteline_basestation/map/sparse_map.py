@@ -280,6 +280,7 @@ class SparseMap(RigValues):
                               self.root_submaps, self.metres_per_unit):  # fmt: skip
                 of_submap.pop(submap, None)
             self.metric_submaps.discard(submap)
+            self.scaled_submaps.discard(submap)
 
     # -- inside ------------------------------------------------------------------------------------------------------
 

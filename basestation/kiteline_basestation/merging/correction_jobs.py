@@ -32,7 +32,6 @@ class FullBundle:
     map_id: SubmapId
     window: BundleWindow
     calibrated: tuple[AgentId, ...]
-    inertial: bool = False  # whether inertial steps scale it
     part: Part | None = None  # of a large map
 
 
@@ -166,8 +165,7 @@ class CorrectionJobs:
                 trials = self._config.graph.robust_trials, self._config.graph.final_trials
                 solver = replace(self._config.bundle, robust_trials=trials[0], final_trials=trials[1])
                 chain = segments_of(self._map, bundle.window.rows, bundle.window.problem) if self.fits(map_id) else ()
-                bundle = replace(bundle, inertial=tells_scale(chain))
-                chain = chain if bundle.inertial else ()
+                chain = chain if tells_scale(chain) else ()
                 held = int(np.flatnonzero(~bundle.window.problem.free)[0])
                 inputs = BundleInputs(problem, solver, chain, held, self._config.inertial_scale)
                 out.append(Job(next(self._job_ids), FULL_BUNDLE.name, inputs))

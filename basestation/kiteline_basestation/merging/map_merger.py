@@ -372,7 +372,7 @@ class MapMerger:
         map_id, window = bundle.map_id, bundle.window
         units: dict[SubmapId, float] = {}
         if self._corrections.fits(map_id):
-            result, units = keep_scales(self._map, map_id, window, result, inertial=bundle.inertial)
+            result, units = keep_scales(self._map, map_id, window, result)
         free = window.problem.free
         ids = self._map.keyframes.id[window.rows]
         poses = np.linalg.inv(result.T_c_m[free])

@@ -116,16 +116,17 @@ def _points(
 
 
 def keep_scales(
-    sparse_map: SparseMap, map_id: SubmapId, window: BundleWindow, result: BundleResult, *, inertial: bool
+    sparse_map: SparseMap, map_id: SubmapId, window: BundleWindow, result: BundleResult
 ) -> tuple[BundleResult, dict[SubmapId, float]]:  # fmt: skip
-    """Move the change of scale that a full bundle found into the scale of monocular submaps.
+    """Set the units of monocular submaps to what a full bundle found.
 
-    inertial: also of those in metres, because inertial steps tell their scale. It is measured at each submap's newest
-    keyframes, so that the agent's lengths there do not change. In a map without metric scale, lengths at the oldest
-    keyframes do not change in w. Returns the result, and the factors by submap.
+    A submap of unknown scale keeps the lengths of its newest keyframes, so that nothing changes for the agent there:
+    its unit takes on the change. If the whole map has no metric scale, lengths at the oldest keyframes do not change
+    in w. Agents take the unit of a submap in metres for a metre: once inertial steps tell lengths in w, it is one, and
+    these agents are told corrected lengths. Returns the result, and the factors by submap.
     """
     submaps = sparse_map.submaps_of_map(map_id)
-    own = [s for s in submaps if sparse_map.is_up_to_scale(s) or (inertial and sparse_map.has_metric_scale_by_imu(s))]
+    own = [s for s in submaps if sparse_map.is_up_to_scale(s)]
     factors = {s: _scale_change(sparse_map, sparse_map.submaps[s][-_ENDS:], window, result) for s in own}
     root = sparse_map.map_id(map_id)
     if sparse_map.is_up_to_scale(root):
@@ -135,6 +136,10 @@ def keep_scales(
         poses[:, :3, 3] = centre + (poses[:, :3, 3] - centre) / whole
         result = replace(result, T_c_m=np.linalg.inv(poses), points=centre + (result.points - centre) / whole)
         factors = {submap: factor / whole for submap, factor in factors.items()}
+    elif result.scale_sigma > 0.0:
+        scaled = [s for s in submaps if sparse_map.has_metric_scale_by_imu(s)]
+        factors |= {s: 1.0 / sparse_map.scale(s) for s in scaled if sparse_map.scale(s) != 1.0}
+        sparse_map.scaled_submaps.update(scaled)
     for submap, factor in factors.items():
         sparse_map.scale_submap(submap, factor)
     return result, factors

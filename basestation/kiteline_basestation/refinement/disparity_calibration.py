@@ -101,7 +101,7 @@ def _prior_px(focal: float) -> F64:
 
 
 def has_bent(sparse_map: SparseMap, agent: AgentId) -> bool:
-    """True if rows of an agent's right image say that its mount has bent.
+    """True if the rows of an agent's right image show that its mount has bent.
 
     What bends a mount turns the camera about all axes. Rows show two of the three turns directly: their offset in the
     middle and its growth along x. The third moves disparities.

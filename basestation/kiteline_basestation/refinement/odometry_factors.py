@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from kiteline_basestation.config import OdometryFactorConfig
 from kiteline_basestation.inertial.ties import moved_camera
+from kiteline_basestation.inertial.units import units_of
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.refinement.bundle_window import BundleWindow
 from kiteline_core.geometry import disparity_offset, se3, sim3
@@ -40,7 +41,6 @@ _ROTATION_DEPTHS = 8.0 * _ON_PLANE  # the same for rotation alone
 _MOST_PX = 1e5  # above any disparity, so that one sort orders by camera and disparity
 _UNKNOWN_DEPTH = 3.0  # where a keyframe has no disparities
 _LEAST_POINTS = 4  # synthetic points of a step
-_MOST_GROWTH = 1.1  # by which lengths in a map differ from those at its newest keyframes
 _NO_DISPARITY, _NO_GROUP = -1.0, -1
 _ROTATION_SIGMA_PX = 0.1  # px; of each of 6 far synthetic points: together they hold rotation to 0.15 mrad
 _SCALE_SIGMA_PX = 2.0  # px; of each of 12 more in monocular submaps in metres, whose images tell no scale
@@ -106,7 +106,7 @@ def _steps(
     counts = np.bincount(problem.camera, minlength=len(window.rows))
     number = {int(table.id[row]): i for i, row in enumerate(window.rows.tolist())}
     difference_px = _PX_OF_ROTATION * _rotation_difference_px(sparse_map, window, number, config.run)
-    depth, units = median_depths(problem), _units(sparse_map, window, number, config.run)
+    depth, units = median_depths(problem), units_of(sparse_map, window.rows, config.run)
     for k, row in enumerate(window.rows.tolist()):
         keyframe = KeyframeId(int(table.id[row]))
         p, T_p_k = number.get(int(table.parent[row])), table.T_p_k[row]
@@ -136,41 +136,6 @@ def _steps(
                 change_px = sparse_map.offset_measured_with(keyframe) - _assumed(sparse_map, agent, of_camera[k])
                 step = _following_offset(problem.lens[k], step, change_px)
             yield step
-
-
-def _units(sparse_map: SparseMap, window: BundleWindow, number: dict[int, int], run: int) -> F64:
-    """Length (k,) in w of the agent's unit at each keyframe of a window.
-
-    One for a whole submap; once accelerations have corrected lengths, those that runs of steps have in the map now.
-    """
-    table = sparse_map.keyframes
-    submaps = [submap_of_keyframe(KeyframeId(k)) for k in table.id[window.rows].tolist()]
-    units = np.array([sparse_map.scale(s) for s in submaps])
-    place = table.T_w_k[window.rows, :3, 3]
-    for submap in dict.fromkeys(submaps):
-        if not sparse_map.has_metric_scale_by_imu(submap) or sparse_map.scale(submap) == 1.0:
-            continue
-        own = [k for k, s in enumerate(submaps) if s == submap]
-        steps = [(k, p) for k in own if (p := number.get(int(table.parent[window.rows[k]]))) is not None]
-        if len(steps) < _MIN_RUN:
-            continue
-        k, p = np.array(steps).T
-        here = np.linalg.norm(place[k] - place[p], axis=1)
-        told = np.linalg.norm(table.T_p_k[window.rows[k], :3, 3], axis=1)
-        one = sparse_map.scale(submap)
-        each = np.divide(here, told, out=np.full(len(k), one), where=told > 0.0)
-        for i, keyframe in enumerate(k.tolist()):
-            near = slice(max(i - run // 2, 0), i + run // 2 + 1)
-            typical = _weighted_median(each[near], told[near])  # single steps may be torn
-            units[keyframe] = np.clip(typical, one / _MOST_GROWTH, one * _MOST_GROWTH)
-    return units
-
-
-def _weighted_median(values: F64, weights: F64) -> float:
-    """The value of (n,) below and above which there is half of the weight (n,)."""
-    order = np.argsort(values, kind="stable")
-    up_to = np.cumsum(weights[order])
-    return float(values[order[min(int(np.searchsorted(up_to, 0.5 * up_to[-1])), len(order) - 1)]])
 
 
 def _following_offset(lens: F64, step: _Step, change_px: F64) -> _Step:

@@ -30,6 +30,7 @@ from kiteline_codec import warm as codec_warm
 from kiteline_codec.channel import RecordChannel, settled
 from kiteline_core.ids import AgentId
 from kiteline_core.places.place_index import Vocabulary
+from kiteline_hw.durable_files import write_atomically
 from kiteline_hw.links.kinds import link_traits
 from kiteline_hw.lockstep.messages import Down, Phase, Up
 from kiteline_hw.lockstep.shared_core import SharedCore
@@ -133,7 +134,7 @@ class BaseRuntime:
         return log
 
     def take_notices(self) -> list[str]:
-        """What is to be told of files: each kind of trouble once."""
+        """Messages about files that cannot be written: each kind of trouble once."""
         if self._log is not None and self._log.why:
             self._notices.say("log", f"log: messages are lost: {self._log.why}; the base goes on")
         if self._budget is not None and self._budget.deleted:
@@ -151,8 +152,8 @@ class BaseRuntime:
             troubles.append("log: there is none of this start")
         elif self._log is not None and self._log.why:
             troubles.append(f"log: messages are lost: {self._log.why}")
-        if failed := self.station.mapper.jobs_failed:
-            troubles.append(f"{failed} job{'s' * (failed != 1)} failed since the start")
+        for kind, why in sorted(self.station.mapper.failures.items()):
+            troubles.append(f"job {kind}: the last one failed, and its part of the map stays as it was: {why}")
         return {
             "link": options.link,
             "session": options.session,
@@ -267,7 +268,7 @@ class BaseRuntime:
         """Write the map's files. Raises OSError, but for a base that goes on without them."""
         for name, content in map_files(self.station.mapper).items():
             try:
-                process.write_atomically(self._folder / name, content)
+                write_atomically(self._folder / name, content)
             except OSError as error:
                 if not self.options.log_optional:
                     raise
@@ -292,7 +293,7 @@ class BaseRuntime:
         }
 
     def close(self) -> bool:
-        """Close the store and the log. False if the store does not hold all of the map; that was said."""
+        """Close the store and the log. False if the store does not hold all of the map; a message was printed."""
         stored = self.keeper is None or self.keeper.close(self.station)
         if self._log is not None:
             self._log.close()

@@ -30,7 +30,7 @@ def logins_of(path: Path) -> dict[str, str]:
 
 
 class BaseSeals:
-    """Seals packets if there is a file of keys, and tells in either case why agents are not understood."""
+    """Seals packets if there is a file of keys; reports in either case why packets of agents cannot be opened."""
 
     def __init__(self, options: BaseOptions, link: LinkHub) -> None:
         """Raises LinkError."""
@@ -50,7 +50,7 @@ class BaseSeals:
         self.hub: LinkHub = WatchedHub(link, self._watch) if self._sealed is None else self._sealed
 
     def lines(self, now_ns: int) -> list[str]:
-        """What the user is to be told since the last call. Takes new keys, too."""
+        """Messages to the user since the last call. Takes new keys, too."""
         lines = self._watch.lines()
         if now_ns - self._looked_ns >= _LOOK_NS:
             self._looked_ns = now_ns

@@ -13,6 +13,7 @@ from urllib.parse import quote
 
 from kiteline_basestation.store import checksums
 from kiteline_basestation.store.saved_map import SavedMap
+from kiteline_hw.durable_files import sync_folder
 
 _BESIDE = ("-wal", "-shm")  # files that SQLite keeps beside a database
 
@@ -100,12 +101,3 @@ def _exchange(path: Path) -> Path:
             os.replace(path.with_name(path.name + end), kept.with_name(kept.name + end))
     os.replace(fresh(path), path)
     return kept
-
-
-def sync_folder(folder: Path) -> None:
-    """Wait until the names in a folder are on the disk."""
-    fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(fd)
-    finally:
-        os.close(fd)

@@ -1,0 +1,52 @@
+"""The length in w of the unit in which a monocular agent measured its motion, along the keyframes of a map."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_basestation.map.sparse_map import SparseMap
+from kiteline_core.ids import KeyframeId, submap_of_keyframe
+
+F64 = NDArray[np.float64]
+I32 = NDArray[np.int32]
+
+_MIN_RUN = 5  # steps that tell a length
+_MOST_GROWTH = 1.1  # by which lengths along a map differ from those of its unit
+
+
+def units_of(sparse_map: SparseMap, rows: I32, run: int) -> F64:
+    """Length (k,) in w of the agent's unit at keyframes in `rows` (k,), by age in each submap.
+
+    One for a whole submap; once accelerations have corrected lengths, the agent's steps from keyframe to keyframe tell
+    it, the weighted median of `run` of them, by the lengths that they have in the map now.
+    """
+    table = sparse_map.keyframes
+    number = {int(table.id[row]): i for i, row in enumerate(rows.tolist())}
+    submaps = [submap_of_keyframe(KeyframeId(k)) for k in number]
+    units = np.array([sparse_map.scale(s) for s in submaps])
+    place = table.T_w_k[rows, :3, 3]
+    for submap in dict.fromkeys(submaps):
+        one, corrected = sparse_map.scale(submap), submap in sparse_map.scaled_submaps
+        if not sparse_map.has_metric_scale_by_imu(submap) or not (corrected or one != 1.0):
+            continue
+        own = [k for k, s in enumerate(submaps) if s == submap]
+        steps = [(k, p) for k in own if (p := number.get(int(table.parent[rows[k]]))) is not None]
+        if len(steps) < _MIN_RUN:
+            continue
+        k, p = np.array(steps).T
+        here = np.linalg.norm(place[k] - place[p], axis=1)
+        told = np.linalg.norm(table.T_p_k[rows[k], :3, 3], axis=1)
+        each = np.divide(here, told, out=np.full(len(k), one), where=told > 0.0)
+        for i, keyframe in enumerate(k.tolist()):
+            near = slice(max(i - run // 2, 0), i + run // 2 + 1)
+            typical = _weighted_median(each[near], told[near])  # single steps may be torn
+            units[keyframe] = np.clip(typical, one / _MOST_GROWTH, one * _MOST_GROWTH)
+    return units
+
+
+def _weighted_median(values: F64, weights: F64) -> float:
+    """The value of (n,) below and above which there is half of the weight (n,)."""
+    order = np.argsort(values, kind="stable")
+    up_to = np.cumsum(weights[order])
+    return float(values[order[min(int(np.searchsorted(up_to, 0.5 * up_to[-1])), len(order) - 1)]])
