@@ -68,8 +68,7 @@ class Agent:
     ) -> None:
         """vocabulary: of the place index; without it only the reference keyframe is tried in relocalisation."""
         self._channel = channel
-        if rig.right is None:
-            config = with_cells_for(config, rig.left.width, rig.left.height)
+        config = with_cells_for(config, rig.left.width, rig.left.height)
         self._full_config = self._config = config  # the latter at the governor's effort
         self._rectifier = Rectifier(rig)
         camera = self._rectifier.camera
@@ -96,7 +95,7 @@ class Agent:
             None if self.right_camera is None else self.right_camera.take_base, config.local_grid.tiles,
         )  # fmt: skip
         rows = None if self.right_camera is None else self.right_camera.rows
-        maker = KeyframeMaker(self.map, channel, rows, self.work)
+        maker = KeyframeMaker(self.map, channel, rows, self.work, has_depth=self._has_depth)
         self._keyframes = KeyframeStage(self._camera, maker, self._relocaliser, self._governor, channel, self.work)
         self._depth = DepthFromMotion(self.map, config, self.work)
         self._two_view_start = None if self._has_depth else TwoViewStart(camera, config, self.work)
@@ -121,7 +120,7 @@ class Agent:
         self._skipped_imu: list[ImuBatch] = []  # since the last processed frame
         self._frame_number = 0
         self._last_t_ns: int | None = None  # of the last processed frame
-        self._last_track: Track | None = None  # of the last processed frame, if images gave its pose
+        self._last_track: Track | None = None  # of the last frame, if images gave its pose in the submap
         self._placed_ns: int | None = None  # of the last frame with a pose
         self._motion_known = False  # in the last frame, for a rolling shutter
         self._was_lost = False  # the last frame had no pose from the images
@@ -175,7 +174,7 @@ class Agent:
             repeated=self._stuck_camera.repeated, shutter=self._shutter(frame.t_ns, dt_s),
         )  # fmt: skip
         # 3. Track the landmarks of the local map.
-        track = self._track(ctx) if has_map and not stuck else None
+        submap, track = self.submap, self._track(ctx) if has_map and not stuck else None
         if track is None:
             # 4. Not tracked: dead reckoning, relocalisation, or a new submap.
             outcome = self._loss.handle(ctx, stuck=stuck)
@@ -207,12 +206,12 @@ class Agent:
             # 7. Make a keyframe if the policy needs one.
             events += self._keyframes.add_if_needed(ctx, track)
             events += self._scan(ctx)
-            # 8. Join an older submap, or continue a monocular one in metres.
+            # 8. Join an older submap, continue one without ids in another, or a monocular one in metres.
             events += self._submaps.join_older(ctx, track)
-            restarted = self._submaps.restart_in_metres(ctx, track)
-            if restarted:
+            continued = self._submaps.continue_full(ctx, track) or self._submaps.restart_in_metres(ctx, track)
+            if continued:
                 self._corrections.note_continued(self.submap)
-            events += restarted
+            events += continued
             outcome = FrameOutcome(True, False, track.inliers, events)
         if self.right_camera is not None:
             outcome.events.extend(self.right_camera.share_rows())
@@ -223,7 +222,7 @@ class Agent:
             self._image_shift.remember(images.sampled, camera.pose.T_c_m)
         self._last_t_ns = frame.t_ns
         self._placed_ns = frame.t_ns if outcome.tracked else self._placed_ns
-        self._last_track = None if self._was_lost else track
+        self._last_track = None if self._was_lost or self.submap != submap else track
         return self._report.report(ctx, outcome), outcome.events
 
     # stages of a frame
@@ -303,7 +302,7 @@ class Agent:
         return [] if around is None else [around.line]
 
     def _forget_scans(self, ctx: FrameContext, outcome: FrameOutcome) -> None:
-        """Forget what scans saw around the vehicle once nothing has told its motion for too long."""
+        """Forget the obstacles of scans once the motion of the vehicle has been unknown for too long."""
         if outcome.bridged or self._placed_ns is None:
             return
         if ctx.t_ns - self._placed_ns > self._full_config.local_grid.lost_s * 1e9:
@@ -337,7 +336,7 @@ class Agent:
             anchor = MapAnchor(self.map, last, self._config, inertial=self._camera.motion.running)
         moved, events = self._corrections.take(records, self._channel.take_removed(), anchor)
         if moved:
-            self._camera.follow_corrections(None if anchor is None else anchor.T_new_old())
+            self._camera.follow_corrections(None if anchor is None else anchor.motion())
         self.work.posed_points += 0 if anchor is None else anchor.posed_points
         return events
 

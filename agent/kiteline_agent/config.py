@@ -299,5 +299,6 @@ class AgentConfig:
     local_grid: LocalGridConfig = field(default_factory=LocalGridConfig)
     ground: GroundConfig = field(default_factory=GroundConfig)
     log: LogConfig = field(default_factory=LogConfig)
+    shrink_cells: bool = True  # every cell_px that has its default, in images below 752x480; else they have few corners
     tracker: Literal["map", "ekf"] = "map"  # ekf: the Kalman filter, for one camera with odometry and little CPU
     ekf: EkfConfig = field(default_factory=EkfConfig)

@@ -47,7 +47,7 @@ class KnownRigConfig:
         return bool(self.camera) and np.allclose(self.camera, numbers_of(camera), rtol=_SAME, atol=0.0)
 
     def knows_imu_of(self, camera: RectifiedCamera) -> bool:
-        """True if the IMU was compared with this camera, told to be there in the body."""
+        """True if the IMU was calibrated against this camera, mounted as this calibration says."""
         return self.is_of(camera) and bool(self.T_b_c) and np.allclose(self.T_b_c, camera.T_b_c.ravel(), atol=_SAME)
 
     def updated(

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from kiteline_agent.inertial.fixed_lag import StartDeviations
 from kiteline_agent.inertial.gravity_alignment import up_of
-from kiteline_agent.inertial.inertial_config import InertialConfig
+from kiteline_agent.inertial.inertial_config import InertialConfig, StartDeviations
 from kiteline_agent.inertial.inertial_tracker import InertialTracker
 from kiteline_agent.motion.loss_motion import LossMotion, LossMotionEstimator, _largest
 from kiteline_core.frame import ImuBatch, ImuCalibration

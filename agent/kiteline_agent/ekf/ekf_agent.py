@@ -151,7 +151,7 @@ class EkfAgent:
 
     @property
     def submap(self) -> SubmapId:
-        """The submap in which the camera is tracked: one for the whole flight."""
+        """The submap in which the camera is tracked."""
         return self._keyframes.submap
 
     @property

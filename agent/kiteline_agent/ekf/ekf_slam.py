@@ -200,7 +200,7 @@ class EkfSlam:
         return out
 
     def _may_enter(self, track: Track) -> bool:
-        """True if the rays of a track meet, and tell its distance."""
+        """True if the rays of a track intersect well enough to give its distance."""
         state = self.state
         rays = linearised(state, track, state.T_o_c, state.view_T_o_c)
         if rays is None or not rays_meet(state, rays, self._config.residual_gate):

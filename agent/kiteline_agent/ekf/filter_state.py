@@ -201,7 +201,7 @@ class FilterState:
 
 
 def _root(cov: F64) -> F64:
-    """A factor (6,6) of a covariance, factor factor^T; without the negative variances that some odometers tell."""
+    """A factor (6,6) of a covariance, factor factor^T; negative variances, as some odometers send them, become 0."""
     try:
         return np.asarray(np.linalg.cholesky(cov + 1e-18 * np.eye(6)))
     except np.linalg.LinAlgError:

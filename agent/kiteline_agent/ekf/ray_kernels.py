@@ -34,7 +34,7 @@ def _solve(a: F64, b: F64, x: F64) -> bool:
 
 @njit
 def position_by_rays(xy: F64, T_o_c: F64, point: F64) -> bool:
-    """Set the point (3,) that rays see; False if they do not tell it, or it lies behind a camera.
+    """Set the point (3,) nearest to the rays; False if it is not determined, or lies behind a camera.
 
     First the point nearest to all rays, by linear least squares, then that of least reprojection error. xy: (v,2) x/z,
     y/z in cameras T_o_c (v,4,4).

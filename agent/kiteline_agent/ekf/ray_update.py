@@ -1,4 +1,4 @@
-"""Correction of camera and past views by what the rays of tracks tell beyond the points where they meet.
+"""Correction of camera and past views by the rays of tracks, with the points where they intersect eliminated.
 
 Source: A. Mourikis, S. Roumeliotis, "A multi-state constraint Kalman filter for vision-aided inertial navigation",
 2007.

@@ -23,6 +23,7 @@ from kiteline_agent.keyframes.policy import KeyframeNeed, Situation, coverage, k
 from kiteline_agent.keyframes.reference import ReferenceKeyframe
 from kiteline_agent.local_map.keyframe_landmarks import KeyframeLandmarks
 from kiteline_agent.local_map.local_map import LocalMap
+from kiteline_agent.mapping.submaps import TRACKED_M, TRACKED_RAD, Submaps
 from kiteline_agent.relocalisation.map_cache import MapCache
 from kiteline_agent.step import Identity
 from kiteline_codec.channel import RecordChannel
@@ -37,10 +38,11 @@ from kiteline_codec.schema import (
     Observations,
     Record,
     SubmapScale,
+    SubmapTie,
 )
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
-from kiteline_core.ids import KEYPOINT_BITS, MAX_KEYFRAMES, NO_KEYFRAME, KeyframeId, submap_id
+from kiteline_core.ids import KEYPOINT_BITS, NO_KEYFRAME, KeyframeId, SubmapId
 from kiteline_core.order_statistics import median
 
 F64 = NDArray[np.float64]
@@ -80,7 +82,8 @@ class SharedKeyframes:
     ) -> None:  # fmt: skip
         self._agent, self._camera, self._channel = identity.agent, camera, channel
         self._governor, self._work = governor, work
-        self.submap = submap_id(identity.agent, identity.boot, identity.submap)
+        self._submaps = Submaps(identity)
+        self._submaps.open_next()
         few = min(config.keyframe.min_inliers, config.ekf.corners // 3)
         self._policy = replace(config.keyframe, min_inliers=few)
         # Poses of keyframes alone; one point at their typical depth tells by how much a correction moves the image.
@@ -92,9 +95,13 @@ class SharedKeyframes:
         self._landmark_of: dict[int, int] = {}  # id at the base of the landmark of a track
         self._anchored = 0  # tracks with such an id in the first frame after the newest keyframe
         self._made_ns = self._made_frame = 0  # of the newest keyframe
-        self._count = 0
         self.T_m_o: F64 = np.eye(4)
         channel.put(CameraIntrinsics(identity.agent, camera))
+
+    @property
+    def submap(self) -> SubmapId:
+        """The submap in which the camera is tracked."""
+        return self._submaps.active
 
     # what the base sends
 
@@ -116,7 +123,7 @@ class SharedKeyframes:
 
     @property
     def keyframe(self) -> KeyframeId:
-        """The keyframe to which poses are told."""
+        """The keyframe relative to which poses are reported."""
         return self._reference.keyframe
 
     @property
@@ -151,14 +158,18 @@ class SharedKeyframes:
             if not self._governor.may(Extra.KEYFRAME):
                 return ["governor: keyframe postponed"]
         self._make(frame, T_m_c, anchored)
-        return [f"keyframe: {need.rule}"]
+        events = [f"keyframe: {need.rule}"]
+        if self._reference.is_full(self.submap) and self._submaps.room:
+            self._continue_full(frame, T_m_c)
+            events += ["submap: full", "submap: opened"]
+        return events
 
     def _need(self, frame: FilteredFrame, anchored: NDArray[np.bool_]) -> KeyframeNeed | None:
         """Why a frame should become a keyframe; None if it need not."""
         if self.keyframe == NO_KEYFRAME:
             return KeyframeNeed("first", True)
-        if self._count >= MAX_KEYFRAMES:
-            return None  # no ids are left
+        if self._reference.is_full(self.submap):
+            return None  # nor are ids of submaps left
         held, since = int(np.count_nonzero(anchored)), frame.number - self._made_frame
         if since == 1:
             self._anchored = held
@@ -201,12 +212,24 @@ class SharedKeyframes:
         for index, track in enumerate(frame.ids[order[:shared]].tolist()):
             self._landmark_of[track] = (keyframe << KEYPOINT_BITS) | index
         self._store(header, T_m_c, frame)
-        T_m_k = header.T_p_k if T_m_p is None else se3.orthonormalise(T_m_p @ header.T_p_k)
+        T_m_k = se3.orthonormalise(header.T_p_k if T_m_p is None or parent == NO_KEYFRAME else T_m_p @ header.T_p_k)
         reference.set_new(keyframe, self.submap, T_m_c, T_m_k, frame.t_ns, frame.number)
-        self._made_ns, self._made_frame, self._count = frame.t_ns, frame.number, self._count + 1
+        self._made_ns, self._made_frame = frame.t_ns, frame.number
         self._work.keyframes += 1
         self._work.new_landmarks += len(order)
         self._work.observations += len(observations.index)
+
+    def _continue_full(self, frame: FilteredFrame, T_m_c: F64) -> None:
+        """Continue in another submap, as the ids of keyframes in this one are used up.
+
+        It has the axes of the old one. The base merges the two by their keyframes of this frame.
+        """
+        since, T_k_c = self.keyframe, self.T_k_c.copy()
+        submap = self._submaps.open_next()
+        self._map.activate(submap)
+        self._make(frame, T_m_c, np.zeros(len(frame.ids), np.bool_))
+        self._channel.put(SubmapTie(submap, since, T_k_c, TRACKED_M, TRACKED_RAD))
+        self._corrections.note_continued(submap)
 
     def _new_rows(self, frame: FilteredFrame, anchored: NDArray[np.bool_], most: int) -> I64:
         """Rows of the corners that become landmarks, the best `most` first, each group by image rows."""

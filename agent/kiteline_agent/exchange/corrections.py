@@ -216,7 +216,7 @@ class Corrections:
             self._whole.clear()
 
     def _contradicts_gravity(self, submap: SubmapId, S_w_m: F64) -> bool:
-        """True if a placement tilts a submap whose vertical the agent knows."""
+        """True if a placement contradicts the vertical that the agent measured in the submap."""
         if self._upright is None or self._upright.submap != submap:
             return False
         up, told = self._upright.T_l_m[2, :3], sim3.rigid(S_w_m)[2, :3]

@@ -43,7 +43,7 @@ class DetectorConfig:
 
     levels: int = 3  # pyramid levels searched; each halves the size
     first: int = 0  # finest of them
-    cell_px: int = 32  # at most one new corner per cell: 350 at 752x480; smaller in smaller images without a right one
+    cell_px: int = 32  # at most one new corner per cell: 350 at 752x480; see shrink_cells
     fast_threshold: int = 12  # grey levels; low, since only the best corner of a cell is kept
     min_score: float = 12.0  # (grey levels / px)^2; weaker corners are sensor noise
     faint_below: int = 100  # corners, existing ones included: with fewer, empty cells are searched for faint corners

@@ -34,18 +34,21 @@ _DEPTH_CAMERA_SIGMA_RHO = 2.85e-3  # 1/m, of a structured-light camera, constant
 class KeyframeMaker:
     """Turns a frame into records for the base and a slot of the local map."""
 
-    def __init__(self, local_map: LocalMap, channel: RecordChannel, rows: RowAlignment | None, work: Work) -> None:
-        """rows: of the right image; None without one."""
+    def __init__(
+        self, local_map: LocalMap, channel: RecordChannel, rows: RowAlignment | None, work: Work, *, has_depth: bool
+    ) -> None:  # fmt: skip
+        """rows: of the right image; None without one. has_depth: of a stereo or depth camera."""
         self._map = local_map
         self._rows = rows
         self._camera = local_map.camera
+        self._has_depth = has_depth
         self._channel = channel
         self._work = work
         self.new_uv: F64 = np.zeros((0, 2))  # px of the first keypoints of the last keyframe that was shared
 
-    def lacks_right_image(self, ctx: FrameContext) -> bool:
-        """True if a frame of a stereo camera came without its right image."""
-        return self._camera.stereo and ctx.images.right is None
+    def lacks_depth(self, ctx: FrameContext) -> bool:
+        """True if a frame of a stereo or depth camera came without its right or depth image."""
+        return self._has_depth and ctx.images.right is None and ctx.images.depth_m is None
 
     def first_points(self, ctx: FrameContext) -> NewPoints | None:
         """New landmarks for a keyframe without a track; None if too few of them have a depth."""
@@ -63,7 +66,7 @@ class KeyframeMaker:
         return points if ctx.shutter is None else moved_to_frame(points, self._camera, ctx.shutter)
 
     def _points_of_image(self, ctx: FrameContext, taken: F64) -> NewPoints:
-        """New landmarks where the image shows them; they also tell how the right image's rows lie."""
+        """New landmarks where the image shows them; their matches also measure the offset of the right image's rows."""
         points = new_points(ctx.images, taken, self._camera, ctx.config)
         right = ctx.images.right
         if self._rows is None or right is None:

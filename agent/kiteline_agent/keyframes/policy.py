@@ -17,6 +17,7 @@ from kiteline_core.order_statistics import median
 
 F64 = NDArray[np.float64]
 
+_COVER_KEPT = 0.8  # share of the reference's cover: a keyframe that regains a fifth of the landmarks is worth its bytes
 _COVER_CELLS = 39  # of the image, 8 x 5 at 752x480: coarse enough that an even track fills nearly all
 
 
@@ -31,6 +32,7 @@ class Situation:
     cover: float  # share of coarse image cells with a tracked landmark
     moved_ratio: float  # translation since the reference keyframe over median depth
     turned_rad: float  # rotation since the reference keyframe
+    reference_cover: float = 1.0  # cover of the first frame that was tracked after the newest keyframe
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,11 +44,19 @@ class Rule:
     pressing: bool = False
 
 
+def _is_bare(now: Situation, config: KeyframeConfig) -> bool:
+    """True if few cells hold a landmark, and fewer than after the newest keyframe.
+
+    Another keyframe fills no more cells where the image shows nothing: sky, plain walls, the dark rim of a fisheye.
+    """
+    return now.cover < min(config.min_cover, _COVER_KEPT * now.reference_cover)
+
+
 # A frame becomes a keyframe if any row needs one; the frame after a keyframe never does.
 RULES = (
     Rule("few points left", lambda s, c: s.inliers < c.min_inliers, True),
     Rule("share of the reference", lambda s, c: s.inliers < c.min_share * s.reference_inliers, True),
-    Rule("bare image regions", lambda s, c: s.cover < c.min_cover, True),
+    Rule("bare image regions", _is_bare, True),
     Rule("new viewpoint", lambda s, c: s.moved_ratio > c.baseline_ratio),
     Rule("new direction", lambda s, c: s.turned_rad > c.rotation_rad),
     Rule("heartbeat", lambda s, c: s.seconds_since > c.max_gap_s),
@@ -70,9 +80,10 @@ def keyframe_need(situation: Situation, config: KeyframeConfig) -> KeyframeNeed 
 
 
 def situation(
-    track: Track, camera: RectifiedCamera, T_m_k: F64, frames_since: int, seconds_since: float, reference_inliers: int
-) -> Situation:
-    """Measure what the rules read. T_m_k: (4,4) of the reference keyframe."""
+    track: Track, camera: RectifiedCamera, T_m_k: F64, frames_since: int, seconds_since: float, reference_inliers: int,
+    cover: float, reference_cover: float,
+) -> Situation:  # fmt: skip
+    """Measure what the rules read. T_m_k: (4,4) of the reference keyframe. cover, reference_cover: see Situation."""
     uv = track.observed[track.inlier, :2]
     T_c_k = track.T_c_m @ T_m_k
     depth = median(track.depth_m[track.inlier]) if len(uv) else 1.0
@@ -81,9 +92,10 @@ def situation(
         seconds_since,
         track.inliers,
         reference_inliers,
-        coverage(uv, camera),
+        cover,
         math.hypot(*T_c_k[:3, 3].tolist()) / max(depth, 0.1),
         math.hypot(*se3.so3_log(T_c_k[:3, :3]).tolist()),
+        reference_cover,
     )
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_agent.keyframes.policy import KeyframeNeed, keyframe_need, situation
+from kiteline_agent.keyframes.policy import KeyframeNeed, coverage, keyframe_need, situation
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_agent.tracking.track import Track
@@ -20,16 +20,21 @@ from kiteline_core.ids import MAX_KEYFRAMES, NO_KEYFRAME, KeyframeId, SubmapId, 
 F64 = NDArray[np.float64]
 
 _UNSHARED = 1024  # sequence numbers of keyframes that are not shared, used in turn: many times those in a local map
+_LAST = MAX_KEYFRAMES - _UNSHARED - 1  # the highest sequence number of a keyframe that is shared
+# Sequence number at which a submap is full, after 6 hours at 2.8 keyframes a second. Some are left for keyframes that
+# losses and returns to it ask for.
+FULL_AT = _LAST - 512
 
 
 @dataclass(slots=True)
 class _Made:
-    """When a keyframe was made. inliers: of the first frame that was tracked after it."""
+    """When a keyframe was made. inliers, cover (see `Situation`): of the first frame that was tracked after it."""
 
     keyframe: KeyframeId = NO_KEYFRAME
     t_ns: int = 0
     frame_number: int = 0
     inliers: int = 0
+    cover: float = 1.0
 
 
 class ReferenceKeyframe:
@@ -73,26 +78,29 @@ class ReferenceKeyframe:
         After a keyframe that was not shared, another such one serves the tracker: what presses is that the base's
         landmarks leave the view.
         """
-        if self._last_sequence.get(submap_of_keyframe(self.keyframe), 0) >= MAX_KEYFRAMES - _UNSHARED - 1:
-            return None  # no ids are left in this submap: what is lost then begins another
+        if self._last_sequence.get(submap_of_keyframe(self.keyframe), 0) >= _LAST:
+            return None  # no ids are left, in this submap and of further submaps
         unshared = self._newest.keyframe != self._shared.keyframe
+        cover = coverage(track.observed[track.inlier, :2], self._map.camera)
         frames, of_base = ctx.number - self._newest.frame_number, self._of_base(track)
         if frames == 1:
-            self._newest.inliers = track.inliers
+            self._newest.inliers, self._newest.cover = track.inliers, cover
         if ctx.number - self._shared.frame_number == 1:
             self._shared.inliers = of_base
         T_m_k = self._pose_of(self._newest.keyframe) if unshared else None
         T_m_k = self._pose_of(self.keyframe) if T_m_k is None else T_m_k
         assert T_m_k is not None
         age_s = (ctx.t_ns - self._newest.t_ns) * 1e-9
-        now = situation(track, self._map.camera, T_m_k, frames, age_s, self._newest.inliers)
+        now = situation(
+            track, self._map.camera, T_m_k, frames, age_s, self._newest.inliers, cover, self._newest.cover
+        )  # fmt: skip
         need = keyframe_need(now, ctx.config.keyframe)
         if need is None or not unshared:
             return need
         return replace(need, pressing=of_base < ctx.config.keyframe.min_share * self._shared.inliers)
 
     def _of_base(self, track: Track) -> int:
-        """Number of tracked landmarks that the base knows."""
+        """Number of tracked landmarks that are shared with the base."""
         return int(np.count_nonzero(self._map.is_shared(track.rows[track.inlier])))
 
     def age_ns(self, t_ns: int) -> int:
@@ -108,6 +116,10 @@ class ReferenceKeyframe:
             return keyframe_id(submap, 0), NO_KEYFRAME, T_m_c
         return keyframe_id(submap, self._last_sequence[submap] + 1), self.keyframe, se3.orthonormalise(self.T_k_c)
 
+    def is_full(self, submap: SubmapId) -> bool:
+        """True if the sequence numbers of a submap are used up, but for some."""
+        return self._last_sequence.get(submap, 0) >= FULL_AT
+
     def next_unshared(self, submap: SubmapId) -> KeyframeId:
         """Id of the next keyframe that is not shared: from the end of the sequence numbers, where no other ones are."""
         return keyframe_id(submap, MAX_KEYFRAMES - 1 - self._unshared % _UNSHARED)
@@ -120,12 +132,12 @@ class ReferenceKeyframe:
         self.keyframe, self.T_k_c = keyframe, se3.inverse(T_m_k) @ T_m_c
         self._rounding = se3.inverse(self.T_k_c)
         self._shared = _Made(keyframe, t_ns, frame_number, self._shared.inliers)
-        self._newest = _Made(keyframe, t_ns, frame_number, self._newest.inliers)
+        self._newest = _Made(keyframe, t_ns, frame_number, self._newest.inliers, self._newest.cover)
 
     def set_unshared(self, keyframe: KeyframeId, t_ns: int, frame_number: int) -> None:
         """A keyframe was made that is not shared."""
         self._unshared += 1
-        self._newest = _Made(keyframe, t_ns, frame_number, self._newest.inliers)
+        self._newest = _Made(keyframe, t_ns, frame_number, self._newest.inliers, self._newest.cover)
 
     def is_of(self, frame_number: int) -> bool:
         """True if the newest keyframe that is shared was made of this frame."""

@@ -169,7 +169,7 @@ class DisparityAlignment:
         return self._parallax_of(slot, T_c_m) / max(float(self._parallax[slot]), _LEAST_PARALLAX)
 
     def _add_pair(self, slot: int, T_c_m: F64, rows: I64, observed: F64) -> bool:
-        """Compare a frame with a keyframe. Returns True if it tells more than the pairs of that keyframe before."""
+        """Compare a frame with a keyframe. True if the pair has more information than earlier ones of that keyframe."""
         config, m = self._config, self._map
         at = np.flatnonzero(rows // m.slot_size == slot)
         index = rows[at] % m.slot_size
@@ -255,7 +255,7 @@ class DisparityAlignment:
         return bool(moved[:2].sum() >= _MIN_SIDEWAYS * moved.sum())
 
     def _rows_are_worn(self) -> bool:
-        """True if the right camera's rows alone tell a worn rig: then what passes for an offset is one."""
+        """True if the right camera's rows alone show a worn rig: then the estimated offset of disparities is taken."""
         return _probability(self._prior_log_odds + self._row_evidence) >= _ROWS_SURE
 
     def _expected_cov(self) -> F64:
@@ -266,7 +266,7 @@ class DisparityAlignment:
         return np.asarray(self.rig_worn * (self.cov + np.outer(self._estimate, self._estimate)))
 
     def _apply(self) -> F64 | None:
-        """Change the offset of the map's disparities where the rig is worn, unless the base knows better."""
+        """Change the offset of the map's disparities if the rig is worn, unless the base's estimate is more certain."""
         if self._base_sigma_px is not None and self._base_sigma_px <= self.sigma_px:
             return None
         offset = self._estimate

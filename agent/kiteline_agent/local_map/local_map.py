@@ -166,7 +166,7 @@ class LocalMap:
         self.shared[self.slot_of(keyframe)] = landmarks
 
     def is_shared(self, rows: I64) -> NDArray[np.bool_]:
-        """Which landmarks of rows (n,) the base knows."""
+        """Which landmarks of rows (n,) are shared with the base."""
         return np.asarray(rows % self.slot_size < self.shared[rows // self.slot_size])
 
     def candidates(

@@ -81,7 +81,7 @@ class OffsetHistory:
         return best
 
     def moved(self, T_m_k: F64, keyframe: int, known: int, parents: Mapping[int, int]) -> F64:
-        """A keyframe's pose (4,4), told with the first `known` changes, as the later ones move it."""
+        """A keyframe's pose (4,4), estimated with the first `known` changes of the offset, moved by the later ones."""
         for change in self._changes[known:]:
             twist = change.twist(keyframe, parents)
             if twist is not None:

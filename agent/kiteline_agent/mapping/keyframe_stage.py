@@ -19,7 +19,7 @@ from kiteline_core.ids import NO_KEYFRAME, KeyframeId
 
 F64 = NDArray[float64]
 
-_WAIT_RIGHT_S = 0.26  # s that a keyframe waits for a lost right image: without it points have no depth
+_WAIT_DEPTH_S = 0.26  # s that a keyframe waits for a lost right or depth image; slow depth cameras have 5 a second
 _DEAD_RECKONING_RAD = 0.02  # rad: standard deviation up to which dead reckoning extends the map, a degree
 _THIN_TRACK = 3.0  # times the fewest inliers of a pose; with fewer a keyframe does not wait for CPU time
 
@@ -37,19 +37,19 @@ class KeyframeStage:
         self._governor = governor
         self._channel = channel
         self._work = work
-        self._right_t_ns = 0  # of the last frame with all images of its camera
+        self._depth_t_ns = 0  # of the last frame whose images measure depth
 
     def add_if_needed(self, ctx: FrameContext, track: Track) -> list[str]:
         """Make a keyframe if the policy needs one and CPU time allows it; share it if the link does. Returns events."""
-        if not self._maker.lacks_right_image(ctx):
-            self._right_t_ns = ctx.t_ns
+        if not self._maker.lacks_depth(ctx):
+            self._depth_t_ns = ctx.t_ns
         need = self._camera.reference.keyframe_need(ctx, track)
         if need is None:
             return []
         urgent = track.inliers < _THIN_TRACK * ctx.config.pose.min_inliers
         if not self._governor.may(Extra.KEYFRAME, urgent=urgent):
             return ["governor: keyframe postponed"]
-        if not urgent and 0.0 < (ctx.t_ns - self._right_t_ns) * 1e-9 < _WAIT_RIGHT_S:
+        if not urgent and 0.0 < (ctx.t_ns - self._depth_t_ns) * 1e-9 < _WAIT_DEPTH_S:
             return []  # its new landmarks would have no depth
         if not need.pressing and self._camera.reference.age_ns(ctx.t_ns) < self._channel.keyframe_gap_ns():
             self._add_unshared(ctx, track)

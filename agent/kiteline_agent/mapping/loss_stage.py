@@ -73,7 +73,7 @@ class LossStage:
         if placed and self._camera.submaps.active == submap:
             T_o_n = T_o_m @ se3.inverse(self._camera.pose.T_o_m)
         # c. Open a new submap.
-        if not placed and self._submaps.may_open(ctx, self.failed_searches):
+        if not placed and self._submaps.may_open(self.failed_searches):
             opened = self._submaps.open(ctx)
             if opened is not None:
                 self.failed_searches = 0

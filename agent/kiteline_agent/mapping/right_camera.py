@@ -1,4 +1,4 @@
-"""What the flight finds of the right camera: errors of its rows and disparities, and what the base is told of them."""
+"""Estimates the errors of the right camera's rows and disparities in flight, and shares them with the base."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Opens submaps, joins new ones to older ones, and restarts monocular ones in metres."""
+"""Opens submaps, joins new ones to older ones, continues full ones, and restarts monocular ones in metres."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from kiteline_agent.keyframes.keyframe_maker import KeyframeMaker
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.mapping.camera_state import CameraState
 from kiteline_agent.mapping.keyframe_stage import KeyframeStage
+from kiteline_agent.mapping.submaps import TRACKED_M, TRACKED_RAD
 from kiteline_agent.motion.loss_motion import LossMotion
 from kiteline_agent.relocalisation.relocaliser import Relocaliser
 from kiteline_agent.tracking.frame_context import FrameContext
@@ -31,7 +32,6 @@ from kiteline_core.ids import NO_KEYFRAME, KeyframeId, SubmapId
 
 F64 = NDArray[np.float64]
 
-_TRACKED_M, _TRACKED_RAD = 0.005, 0.002  # deviations of a tracked frame to its reference keyframe
 _FAILURES = 2  # failed searches in frames with texture before a new submap is opened
 
 
@@ -79,7 +79,7 @@ class SubmapStage:
         self._channel = channel
         self._loss: _Loss | None = None
 
-    def may_open(self, ctx: FrameContext, failed_searches: int) -> bool:
+    def may_open(self, failed_searches: int) -> bool:
         """True if there is no map yet, or the search for the old one failed and ids and CPU time are left."""
         submaps = self._camera.submaps
         if not submaps.any:
@@ -219,7 +219,7 @@ class SubmapStage:
         return ["submap: joined to an older one"]
 
     def restart_in_metres(self, ctx: FrameContext, track: Track) -> list[str]:
-        """Continue a monocular map in a new submap in metres, once IMU or odometer tell its scale. Returns events."""
+        """Continue a monocular map in a new submap in metres, once IMU or odometer give its scale. Returns events."""
         limits, camera = ctx.config.two_view_start, self._camera
         if self._two_view_start is None or ctx.number % limits.scale_every or not camera.submaps.room:
             return []
@@ -238,15 +238,44 @@ class SubmapStage:
 
     def _restart(self, ctx: FrameContext, unit_m: float, metric: MetricPoints) -> None:
         camera = self._camera
+        self._channel.put(SubmapScale(camera.submaps.active, unit_m))
+        T_new_old = self._begin_at_track(ctx, unit_m, metric, tells_scale=True)
+        camera.motion.set_scale(ctx.t_ns, unit_m, T_new_old)
+
+    def continue_full(self, ctx: FrameContext, track: Track) -> list[str]:
+        """Continue in a new submap where the ids of keyframes in the active one are used up. Returns events.
+
+        The base merges the two by keyframes of this frame in both, or by the inertial steps of a monocular map.
+        """
+        camera = self._camera
+        if not (camera.reference.is_full(camera.submaps.active) and camera.submaps.room):
+            return []
+        monocular, made = self._two_view_start is not None, camera.reference.is_of(ctx.number)
+        points = metric_points(ctx, track, self._map, 1.0)
+        if len(points.sigma_rho) < ctx.config.local_map.first_points or (monocular and made):
+            return []  # no inertial steps lead from a keyframe of this frame
+        if not (monocular or made):
+            self._keyframes.add(ctx, track)
+        T_new_old = self._begin_at_track(ctx, 1.0, points, tells_scale=monocular and camera.motion.metric)
+        camera.motion.continue_map(ctx.t_ns, T_new_old)
+        return ["submap: full", "submap: opened"]
+
+    def _begin_at_track(self, ctx: FrameContext, unit_m: float, points: MetricPoints, *, tells_scale: bool) -> F64:
+        """Begin a submap whose first landmarks are those that are tracked, and tie it to the one before.
+
+        unit_m: metres in one unit of the old submap. Returns T_new_old (4,4).
+        """
+        camera = self._camera
         since, T_k_c = camera.reference.keyframe, camera.reference.T_k_c.copy()
         camera.leave_map()
-        self._channel.put(SubmapScale(camera.submaps.active, unit_m))
         T_new_old = camera.pose.rescale(unit_m)
-        self._map.drop_submap(camera.submaps.active)
+        if unit_m != 1.0:
+            self._map.drop_submap(camera.submaps.active)
         submap = camera.open_submap()
-        keyframe = self._keyframes.make(ctx, None, metric.points, camera.pose.T_m_c, Extra.SUBMAP)
-        metric.set_sigma(self._map, keyframe)
-        self._channel.put(SubmapScale(submap, 1.0))
+        keyframe = self._keyframes.make(ctx, None, points.points, camera.pose.T_m_c, Extra.SUBMAP)
+        points.set_sigma(self._map, keyframe)
+        if tells_scale:
+            self._channel.put(SubmapScale(submap, 1.0))
         if since != NO_KEYFRAME:
-            self._channel.put(SubmapTie(submap, since, T_k_c, _TRACKED_M, _TRACKED_RAD))
-        camera.motion.set_scale(ctx.t_ns, unit_m, T_new_old)
+            self._channel.put(SubmapTie(submap, since, T_k_c, TRACKED_M, TRACKED_RAD))
+        return T_new_old

@@ -5,6 +5,8 @@ from __future__ import annotations
 from kiteline_agent.step import Identity
 from kiteline_core.ids import MAX_SUBMAPS, SubmapId, submap_id
 
+TRACKED_M, TRACKED_RAD = 0.005, 0.002  # deviations of a tracked frame to its reference keyframe
+
 
 class Submaps:
     """Ids of the submaps of one flight."""

@@ -188,7 +188,7 @@ class AgentRuntime:
         self._log_shift_ns = self.options.start_ns - begin_ns
 
     def await_frame(self, until_ns: int) -> list[str]:
-        """Await a camera's frame until a time of the clock at most; what the camera has to tell."""
+        """Wait for a camera's frame until a time of the clock at most. Returns messages of the camera."""
         if self.camera is None or not isinstance(self.reader, CameraReader):
             return []
         self.reader.poll(until_ns)
@@ -293,7 +293,7 @@ class AgentRuntime:
         return [f"{name}: {lost} {what} were not written: {why}" for name, lost, what, why in files if lost]
 
     def take_notices(self) -> list[str]:
-        """What is to be told of files: each kind of trouble once in a flight."""
+        """Messages about files that cannot be written: each kind of trouble once in a flight."""
         if self._log is not None and self._log.why:
             self._notices.say("log", f"log: messages are lost: {self._log.why}; the flight goes on")
         for why in [file.why for file in self._lines if file.why][:1]:

@@ -61,7 +61,7 @@ class FlightRecord:
                 self._log.blob(record_log.TOPIC, log_ns, record_log.write_record(self._agent, key, code))
 
     def text(self, line: str, log_ns: int) -> None:
-        """Write what was told to the user, for viewers."""
+        """Write a message to the user, for viewers."""
         self._log.text("/log", log_ns, "info", line)
 
     def pose(self, output: StepOutput) -> None:

@@ -109,7 +109,7 @@ class _Due(NamedTuple):
 
 
 class _LiveFlight:
-    """The loop of a live flight: waits for frames and poses that are due, steps the agent, sends and tells."""
+    """The loop of a live flight: waits for frames and poses that are due, steps the agent, sends packets."""
 
     def __init__(
         self, runtime: AgentRuntime, base: _BaseEnd, controller: ControllerLink | None, clock: MonotonicClock,
@@ -174,7 +174,7 @@ class _LiveFlight:
             process.notify("WATCHDOG=1")
 
     def _wait(self) -> list[str]:
-        """Wait for the next frame, the next pose, or one idle tick; what a camera has to tell."""
+        """Wait for the next frame, the next pose, or one idle tick. Returns messages of the camera."""
         runtime, now_ns = self._runtime, self._clock.now_ns()
         until_ns = now_ns + round(_IDLE_TICK_S * 1e9)
         if self._predictions.next_ns is not None:
@@ -219,7 +219,7 @@ class _LiveFlight:
 
 
 class _BaseEnd:
-    """The agent's end of the link to the base: seals, the session that the base may raise, what there is to tell."""
+    """The agent's end of the link to the base: seals, the session that the base may raise, messages to the user."""
 
     def __init__(self, options: AgentOptions, end: ByteLink, key: bytes | None, numbers: StartNumbers | None) -> None:
         """end: the link without seals. key: None: packets are not sealed. numbers: see `_SessionFollower`."""
@@ -245,7 +245,7 @@ class _BaseEnd:
             self._link.send(packet)
 
     def lines(self) -> list[str]:
-        """What there is to tell of seals, and of another agent with this number, each once."""
+        """Messages about seals, and about another agent with this number, each once."""
         lines = list(self._watch.lines())
         if not self._doubled_told and getattr(self._end, "doubled", False):
             self._doubled_told = True

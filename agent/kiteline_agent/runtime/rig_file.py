@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import tomllib
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,6 +9,7 @@ from pathlib import Path
 from kiteline_agent.known_rig import KnownRigConfig
 from kiteline_core import config as configuration
 from kiteline_core.config import ConfigError
+from kiteline_hw.durable_files import write_atomically
 
 _TABLE = "known_rig"
 _HEAD = """\
@@ -58,14 +58,8 @@ class RigFile:
         """Write what is known, if that changed, and wait for the disk. Raises ConfigError if it cannot be written."""
         if known is None or (text := text_of(known)) == self._written:
             return
-        part = self._path.with_name(f".{self._path.name}.part")
         try:
-            self._path.parent.mkdir(parents=True, exist_ok=True)
-            with part.open("w", encoding="utf-8") as file:
-                file.write(text)
-                file.flush()
-                os.fsync(file.fileno())  # else its name may be on the disk before its content: an empty file
-            os.replace(part, self._path)
+            write_atomically(self._path, text.encode())
         except OSError as error:
             raise ConfigError(f"{self._path}: cannot write the rig file ({error})") from error
         self._written = text

@@ -166,7 +166,7 @@ class LocalGrid:
         self._canvas.fits, self._again = False, None
 
     def _level(self, R_g_o: F64) -> None:
-        """Take a better vertical: a flight that begins in motion knows it late."""
+        """Level the grid by a better vertical: in a flight that begins in motion it is known late."""
         if self._R_g_o is not None:
             turn = R_g_o @ self._R_g_o.T
             self._scans = deque((drawn.turned(turn) for drawn in self._scans), maxlen=self._scans.maxlen)

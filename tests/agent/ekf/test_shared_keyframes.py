@@ -13,6 +13,7 @@ from kiteline_agent.ekf.shared_keyframes import FilteredFrame, SharedKeyframes
 from kiteline_agent.governor.cost_model import Work
 from kiteline_agent.governor.governor import Governor
 from kiteline_agent.imaging.features import build_pyramid
+from kiteline_agent.keyframes import reference
 from kiteline_agent.runtime.options import is_filter
 from kiteline_agent.step import Estimate, Identity, StepInput
 from kiteline_codec.channel import plain_pair
@@ -25,11 +26,20 @@ from kiteline_codec.schema import (
     Record,
     SubmapPlacement,
     SubmapScale,
+    SubmapTie,
 )
 from kiteline_core.frame import Frame, OdometryBatch
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraModel, CameraRig, RectifiedCamera
-from kiteline_core.ids import KEYPOINT_BITS, AgentId
+from kiteline_core.ids import (
+    KEYPOINT_BITS,
+    MAX_KEYFRAMES,
+    NO_KEYFRAME,
+    SEQUENCE_BITS,
+    AgentId,
+    keyframe_id,
+    submap_of_keyframe,
+)
 
 _PERIOD_NS = 50_000_000
 _DEPTH_M, _SPEED_M_S, _FOCAL_PX = 4.0, 0.8, 200.0
@@ -84,6 +94,30 @@ def test_base_receives_a_metric_submap_whose_observations_name_what_it_holds() -
     last = estimates[-1]
     assert last is not None
     np.testing.assert_allclose((T_m_k[live[-1].keyframe] @ live[-1].T_k_c)[:3, 3], last.T_o_b[:3, 3], atol=1e-3)
+
+
+def test_a_submap_without_ids_for_keyframes_is_continued_in_another_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    config = AgentConfig(tracker="ekf")
+    usual, _ = _flown(60, config)
+    monkeypatch.setattr(reference, "FULL_AT", 2)
+    estimates, received = _flown(60, config)
+    for a, b in zip(usual, estimates, strict=True):
+        assert a is not None and b is not None
+        np.testing.assert_array_equal(a.T_o_b, b.T_o_b)
+    headers = {r.keyframe: r for r in received if isinstance(r, KeyframeHeader)}
+    ties = [r for r in received if isinstance(r, SubmapTie)]
+    firsts = [r for r in headers.values() if r.parent == NO_KEYFRAME]
+    assert len(ties) == len(firsts) - 1 >= 2
+    assert [r.submap for r in received if isinstance(r, SubmapScale)] == [
+        submap_of_keyframe(r.keyframe) for r in firsts
+    ]
+    assert all(r.keyframe & MAX_KEYFRAMES - 1 <= 2 for r in headers.values())
+    for tie in ties:
+        first = headers[keyframe_id(tie.submap, 0)]
+        assert first.t_ns == headers[tie.since].t_ns  # two keyframes of one frame
+        np.testing.assert_allclose(tie.T_k_f, np.eye(4), atol=1e-5)
+    for r in (r for r in received if isinstance(r, Observations)):
+        assert {int(point) >> KEYPOINT_BITS + SEQUENCE_BITS for point in r.point} <= {submap_of_keyframe(r.keyframe)}
 
 
 def test_a_landmark_has_the_depth_that_the_filter_knows() -> None:

@@ -1,0 +1,65 @@
+"""Kernels of the local grid against plain arithmetic."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from kiteline_agent.scans import local_grid_kernels as kernels
+
+
+@pytest.mark.parametrize("clears", [True, False])
+def test_rays_clear_what_they_pass_and_mark_what_they_hit(clears: bool) -> None:
+    cells, marks = np.zeros((60, 60), np.int8), np.zeros((60, 60), np.int16)
+    for number in (1, 2):
+        kernels.draw_rays(
+            cells, marks, number, 1.025, 1.525, 0.0, np.zeros(1), 0.02, np.array([1.2]), np.array([10.0]), 0.05, clears
+        )  # fmt: skip
+    expected = np.zeros((60, 60), np.int8)
+    if clears:
+        expected[30, 20:43] = 2 * kernels.MISS  # up to a cell and a half before the surface
+    expected[30, 44] = 2 * kernels.HIT
+    assert np.array_equal(cells[:, :43], expected[:, :43])
+    assert np.array_equal(cells[:, 44:], expected[:, 44:])
+    assert cells[30, 43] <= 0
+
+
+@pytest.mark.parametrize(("gap_m", "near_m"), [(0.12, 0.4), (10.0, 0.0), (0.04, 0.0)])
+def test_distances_are_those_of_plain_arithmetic(gap_m: float, near_m: float) -> None:
+    rng = np.random.default_rng(5)
+    own = rng.choice([-2, 0, 4], (80, 80), p=[0.6, 0.37, 0.03]).astype(np.int8)
+    drawn = np.where((own != 0) | (rng.random((80, 80)) < 0.5), 3, 0).astype(np.int16)
+    tiles = rng.choice([-2, 0, 4], (80, 80), p=[0.6, 0.37, 0.03]).astype(np.int8)
+    at, other, out = np.array([2.1, 1.9, 0.4]), np.array([2.3, 2.2, -1.0]), np.empty(36)
+    kernels.read_distances(own, drawn, 0.05, at, tiles, 0.05, other, 0.1, gap_m, near_m, 1.5, 1, out)
+
+    def cell(cells: np.ndarray, x: float, y: float) -> int:
+        i, j = int(np.floor(y / 0.05)), int(np.floor(x / 0.05))
+        return int(cells[i, j]) if 0 <= i < 80 and 0 <= j < 80 else 0
+
+    kinds = set()
+    for s in range(36):
+        turn = s * 2 * np.pi / 36
+        states = []
+        for r in 0.1 + 0.025 * np.arange(68):
+            x, y = at[0] + np.cos(at[2] - turn) * r, at[1] + np.sin(at[2] - turn) * r
+            value = cell(own, x, y)
+            if not cell(drawn, x, y):
+                value = cell(tiles, other[0] + np.cos(other[2] - turn) * r, other[1] + np.sin(other[2] - turn) * r)
+            states.append((r, 1 if value >= kernels.OCCUPIED else 0 if value <= kernels.FREE else -1))
+        expected, longest, gap = np.inf, 0.0, 0.0
+        for k, (r, here) in enumerate(states):
+            if r >= 1.5:
+                break
+            if here > 0:
+                end = next((q for q, h in states[k + 1 :] if h <= 0 or q >= r + 0.3), r)
+                expected = 0.5 * (r + end)
+                break
+            gap = gap + 0.025 if here < 0 else 0.0
+            longest = max(longest, gap)
+        expected = expected if expected < 1.5 else np.inf
+        if longest > gap_m and expected > near_m:
+            expected = np.nan
+        assert out[s] == pytest.approx(expected, nan_ok=True, abs=1e-9), s
+        kinds.add("nan" if np.isnan(expected) else "inf" if np.isinf(expected) else "finite")
+    assert "finite" in kinds and ("nan" in kinds) == (gap_m < 1.0)
