@@ -20,6 +20,7 @@ from kiteline_hw.sources.open import open_source
 from kiteline_lab.flights.fly import fly
 from kiteline_lab.flights.plan import Options
 from kiteline_lab.replay.replay import main, replay_agent
+from tests.wall import PERIOD_S, STEP_M
 
 
 @pytest.fixture(scope="module")
@@ -94,10 +95,10 @@ def test_a_flight_with_odometry_replays_bit_for_bit(
             assert isinstance(item, Frame)
             if not done:
                 log.rig(item.t_ns, source.rig, None)
-            n = 3  # the camera slides to its right with 0.4 m/s
+            n = 3
             stamps = item.t_ns - np.array([40_000_000, 20_000_000, 0], np.int64)
             cov = np.tile(0.02**2 * np.eye(3), (n, 1, 1))
-            told = OdometryBatch(stamps, np.tile([0.4, 0.0, 0.0], (n, 1)), np.zeros((n, 3)), cov, cov)
+            told = OdometryBatch(stamps, np.tile([STEP_M / PERIOD_S, 0.0, 0.0], (n, 1)), np.zeros((n, 3)), cov, cov)
             log.odometer(ODOMETER, item.t_ns, told)
             log.frame(item)
             done += 1

@@ -11,22 +11,21 @@ import pytest
 
 from kiteline_agent.known_rig import KnownRigConfig
 from kiteline_agent.runtime.rig_file import RigFile
+from kiteline_hw.durable_files import write_atomically
 from kiteline_hw.mavlink.transport.signing import StampFile
 from kiteline_hw.system import key_store
-from kiteline_hw.system.process import write_atomically
 
-# What writes a file, and whether an older one may come back: what the rig file knew before does no harm.
-WRITERS: list[tuple[Callable[[Path], object], bool]] = [
-    (lambda path: RigFile(str(path)).save(KnownRigConfig(rows_px=(0.5, 0.0, 0.0, 0.0, 0.0))), True),
-    (lambda path: StampFile(path, lambda: 2e9), False),
-    (lambda path: key_store.new_key(path, 3), False),
-    (lambda path: write_atomically(path, b"7"), False),
-]
+WRITERS: dict[str, Callable[[Path], object]] = {
+    "rig": lambda path: RigFile(str(path)).save(KnownRigConfig(rows_px=(0.5, 0.0, 0.0, 0.0, 0.0))),
+    "stamp": lambda path: StampFile(path, lambda: 2e9),
+    "keys": lambda path: key_store.new_key(path, 3),
+    "number": lambda path: write_atomically(path, b"7"),
+}
 
 
-@pytest.mark.parametrize(("write", "may_come_back"), WRITERS, ids=["rig", "stamp", "keys", "number"])
+@pytest.mark.parametrize("write", WRITERS.values(), ids=WRITERS)
 def test_the_content_is_on_the_disk_before_the_name(
-    write: Callable[[Path], object], may_come_back: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    write: Callable[[Path], object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     done: list[str] = []
     fsync, replace = os.fsync, os.replace
@@ -45,4 +44,4 @@ def test_the_content_is_on_the_disk_before_the_name(
     write(path)
     content = f"{path.stat().st_size} bytes"
     assert content != "0 bytes"
-    assert done == [content, "name"] if may_come_back else done == [content, "name", "folder"]
+    assert done == [content, "name", "folder"]

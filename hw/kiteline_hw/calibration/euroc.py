@@ -26,7 +26,7 @@ def read_sensor(node: Node) -> FilePart:
 
 
 def read_imu(node: Node) -> FilePart:
-    """An IMU; noise that is not told has its default. Raises SourceError."""
+    """An IMU; noise that the file lacks has its default. Raises SourceError."""
     imu = ImuCalibration(**imu_numbers(node, _IMU_KEYS))
     where = str(node.path)
     return FilePart(where, ToldCalibration(where, imu=imu), T_s_i=_read_place(node))

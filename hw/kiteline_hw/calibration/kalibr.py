@@ -52,7 +52,7 @@ def read_chain(node: Node) -> FilePart:
 
 
 def read_imu(node: Node) -> FilePart:
-    """Noise densities of an IMU; those that are not told have their default. Raises SourceError."""
+    """Noise densities of an IMU; those that the file lacks have their default. Raises SourceError."""
     table = node.get("imu0") if "imu0" in node.keys else node
     if "T_i_b" in table.keys and not np.allclose(_rigid(table.get("T_i_b")), np.eye(4), atol=1e-9):
         raise table.get("T_i_b").error("the identity: the body frame is that of the first IMU")
@@ -62,7 +62,7 @@ def read_imu(node: Node) -> FilePart:
 
 
 def imu_numbers(table: Node, keys: dict[str, str]) -> dict[str, float]:
-    """Fields of an ImuCalibration that a table tells. keys: their names in the table, by field."""
+    """Fields of an ImuCalibration that a table holds. keys: their names in the table, by field."""
     return {
         field: table.get(key).positive("a number above zero: a noise density or a rate in Hz")
         for field, key in keys.items()

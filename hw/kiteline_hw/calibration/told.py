@@ -1,4 +1,4 @@
-"""What calibration files say, in one form whichever tool wrote them."""
+"""Content of calibration files, in one form whichever tool wrote them."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ UNCALIBRATED = ToldCalibration(
 
 @dataclass(frozen=True, slots=True)
 class FilePart:
-    """What one file says. T_s_c: camera in a frame that all files share; P: (3,4) of a rectified pair, with its R."""
+    """Content of one file. T_s_c: camera in a frame that all files share; P: (3,4) of a rectified pair, with its R."""
 
     where: str
     calibration: ToldCalibration
@@ -107,7 +107,7 @@ def joined(parts: Sequence[FilePart]) -> ToldCalibration:
 
 
 def _between(left: FilePart, right: FilePart) -> F64 | None:
-    """T_c_r by two files, None if they do not say it."""
+    """T_c_r by two files, None if they lack it."""
     if left.T_s_c is not None and right.T_s_c is not None:
         return se3.inverse(left.T_s_c) @ right.T_s_c
     if left.rectified is None or right.rectified is None:

@@ -1,4 +1,4 @@
-"""Watches one camera: each outage is told once, with its end; gaps in the driver's numbering are counted. No clock."""
+"""Watches one camera: reports each outage once, with its end; counts gaps in the driver's numbering. No clock."""
 
 from __future__ import annotations
 

@@ -16,8 +16,9 @@ from kiteline_hw.cameras.camera_watch import CameraWatch
 from kiteline_hw.cameras.live_pairs import Eye, LivePairs, Pair
 from kiteline_hw.ports import SourceReport
 from kiteline_hw.sensors.frames import PAIR_TOLERANCE_NS
-from kiteline_hw.sensors.images import U8, decode_grey
+from kiteline_hw.sensors.images import U8
 from kiteline_hw.sensors.raw_pixels import BadImage
+from kiteline_hw.sensors.sensor_bits import SensorBits
 from kiteline_hw.system.clock import MonotonicClock
 
 _READ_S = 0.05  # s that a camera's thread waits for an image at most
@@ -48,6 +49,7 @@ class CameraSource:
         self._period_ns = round(1e9 / fps)
         self._watches = [CameraWatch(camera.name, round(camera.start_s * 1e9)) for camera in cameras]
         self._pairs = LivePairs(min(PAIR_TOLERANCE_NS, self._period_ns // 2), self._tell)
+        self._grey = SensorBits()  # of all cameras: their threads only ever raise it
         self._clock = MonotonicClock()
         self._lock = threading.Condition()
         self._frames: deque[tuple[int, Frame]] = deque()  # with their arrival in ns
@@ -109,7 +111,7 @@ class CameraSource:
         return dropped
 
     def take_messages(self) -> list[str]:
-        """What is to be told since the last call."""
+        """Messages to the user since the last call."""
         if not self._messages:
             return []
         with self._lock:
@@ -167,7 +169,7 @@ class CameraSource:
         camera.close()
 
     def _check(self, watch: CameraWatch) -> bool:
-        """No image came: tell what is to be told, and give what waits. True if the device should be opened again."""
+        """Report outages and pass on unpaired images while no image comes. True if the device must be reopened."""
         now_ns = self._clock.now_ns()
         with self._lock:
             self._tell(watch.check(now_ns))
@@ -189,12 +191,13 @@ class CameraSource:
         """Decode one capture, pair it, and hand frames over. Raises BadImage."""
         now_ns = self._clock.now_ns()
         begin_ns = time.thread_time_ns()
-        pixels, encoded = decode_grey(capture.image)
+        pixels, encoded = self._grey.decode(capture.image)
         eyes = self._views(side, pixels, encoded, self._stamp(side, capture.t_ns, now_ns))
         spent_ns = time.thread_time_ns() - begin_ns
         watch = self._watches[side]
         with self._lock:
             self._decode_ns += spent_ns
+            self._tell(self._grey.take_note())
             missing = watch.missing
             self._tell(watch.image(now_ns, capture.sequence))
             for _ in range(min(1000, watch.missing - missing)):
@@ -218,7 +221,7 @@ class CameraSource:
         return [Eye(t_ns, np.ascontiguousarray(half), None) for half in kept]
 
     def _stamp(self, side: int, t_ns: int | None, now_ns: int) -> int:
-        """The stamp of an image; its arrival where the device tells none of our clock."""
+        """The stamp of an image; its arrival where the device has no stamp on our clock."""
         if t_ns is not None and now_ns - _OLDEST_NS <= t_ns <= now_ns:
             return t_ns
         if not self._arrival_stamps[side]:

@@ -190,7 +190,7 @@ class RosSource:
         return self._frames.take_dropped()
 
     def take_messages(self) -> list[str]:
-        """What is to be told since the last call."""
+        """Messages to the user since the last call."""
         return self._frames.take_messages()
 
     def close(self) -> None:

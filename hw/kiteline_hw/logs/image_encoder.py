@@ -30,7 +30,6 @@ class EncodingPolicy:
 
 ENCODE_ALL = EncodingPolicy()
 _LOOK_EVERY = 8  # messages that wait between two looks at what the other process has ready: each look is a system call
-_Then = Callable[[EncodedImage], None]
 
 
 class ImageEncoder:

@@ -76,6 +76,10 @@ class McapFile:
         self.indexed = False
         self.first_ns = self.last_ns = 0
         self._spans: list[_Span] = []
+        if path.is_dir():
+            first = min((file.name for file in path.glob("*.mcap")), key=len, default=None)
+            hint = f"such as {path / first}; later parts of a log are read with its first" if first else "it has none"
+            raise SourceError(f"{path}: a folder: expected one of its *.mcap files, {hint}")
         try:
             with path.open("rb") as file:
                 head = file.read(len(MAGIC))
@@ -184,6 +188,8 @@ class McapFile:
                     end_run()
                 continue
             end_run()
+            if opcode == Opcode.MESSAGE and end <= self._size and length > MOST_CHUNK_BYTES:
+                self._note(f"message of {length} bytes at byte {offset} left out, expected at most {MOST_CHUNK_BYTES}")
             if opcode in (Opcode.DATA_END, Opcode.FOOTER):
                 file.seek(-len(MAGIC), os.SEEK_END)
                 if file.read() != MAGIC:

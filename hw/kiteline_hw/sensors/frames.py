@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -11,16 +11,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_core.frame import EncodedImage, Frame, ImuBatch
-from kiteline_core.geometry.cameras import CameraRig
+from kiteline_core.geometry.cameras import CameraModel, CameraRig
 from kiteline_hw.ports import SourceError, SourceReport
-from kiteline_hw.sensors.images import ImageRef, decode_depth, decode_grey
+from kiteline_hw.sensors.images import ImageRef, decode_depth
 from kiteline_hw.sensors.imu_buffer import ImuSamples
 from kiteline_hw.sensors.raw_pixels import BadImage
+from kiteline_hw.sensors.sensor_bits import SensorBits
 
 PAIR_TOLERANCE_NS = 5_000_000  # ns; left and right image of a moving vehicle must not be further apart
 DEPTH_TOLERANCE_NS = 20_000_000  # ns; what the TUM tools use: free-running depth cameras lag by up to half a period
 
+_SKEWS = 100  # pairs over which the skew is measured
+_GOOD_SKEW_NS = 500_000  # ns; at a turn of 1 rad/s an image of 450 px focal length is a quarter of a pixel off
+
 T = TypeVar("T")
+P = TypeVar("P", bound=np.generic)
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +45,25 @@ def pair_tolerance_ns(stamps_ns: NDArray[np.int64], most_ns: int = PAIR_TOLERANC
     return min(most_ns, int(np.median(np.diff(stamps_ns))) // 2)
 
 
+class SkewNote:
+    """Notes how far apart the stamps of pairs are, where that makes depths wrong in motion."""
+
+    def __init__(self, report: SourceReport) -> None:
+        self._report = report
+        self._skews: list[int] = []
+
+    def add(self, skew_ns: int) -> None:
+        """Take the difference of a pair's stamps."""
+        if len(self._skews) == _SKEWS:
+            return
+        self._skews.append(skew_ns)
+        if len(self._skews) == _SKEWS and (middle := float(np.median(self._skews))) > _GOOD_SKEW_NS:
+            self._report.notes.append(
+                f"right and left images are {middle / 1e6:.1f} ms apart: while the cameras turn, stereo depths are "
+                "wrong by it; trigger both by one signal"
+            )
+
+
 def pair_by_time(
     items: Iterable[tuple[int, int, T]], tolerance_ns: int, names: tuple[str, str], report: SourceReport
 ) -> Iterator[tuple[int, T, T | None]]:
@@ -49,6 +73,7 @@ def pair_by_time(
     "missing <name>", and yielded alone if it is of side 0. Buffers the items of one tolerance at most.
     """
     waiting: tuple[deque[tuple[int, T]], deque[tuple[int, T]]] = (deque(), deque())
+    skew = SkewNote(report if names[1].startswith("right") else SourceReport())
 
     def pair_waiting(now_ns: int | None) -> Iterator[tuple[int, T, T | None]]:
         # An item can be paired once no nearer one can follow: after its own time plus the tolerance.
@@ -59,6 +84,7 @@ def pair_by_time(
             if other and other[0][0] == t:
                 mine.popleft()
                 _, partner = other.popleft()
+                skew.add(0)
                 yield (t, item, partner) if side == 0 else (t, partner, item)
                 continue
             gap = other[0][0] - t if other else None
@@ -83,6 +109,7 @@ def pair_by_time(
                 return
             mine.popleft()
             _, partner = other.popleft()
+            skew.add(t_other - t)
             yield (t, item, partner) if side == 0 else (t_other, partner, item)
 
     for t_ns, side, item in items:
@@ -92,66 +119,83 @@ def pair_by_time(
 
 
 def decode_frames(
-    frames: Iterable[EncodedFrame], imu: ImuSamples, rig: CameraRig, report: SourceReport, name: str
-) -> Iterator[Frame | ImuBatch]:
+    frames: Iterable[EncodedFrame], imu: ImuSamples, rig: CameraRig, report: SourceReport, name: str,
+    grey: SensorBits | None = None,
+) -> Iterator[Frame | ImuBatch]:  # fmt: skip
     """Decode images into Frames; each Frame comes after the ImuBatch of the samples up to its time.
 
     Unreadable images, images of another size and stamps that do not increase are skipped and counted; a left image is
-    delivered without its right one where that is missing. Raises SourceError if no frame, or of a stereo rig none with
-    both images, is usable.
+    delivered without its right one, or its depth, where that is missing. Raises SourceError if no frame, or none with
+    both images of a stereo or depth camera, is usable. grey: the bits of images of 16, where they are known.
     """
     last_ns = -(2**63)
     delivered = paired = 0
+    grey = SensorBits() if grey is None else grey
     for encoded in frames:
         if encoded.t_ns <= last_ns:
             report.skip("frame stamp not increasing", f"{encoded.t_ns} ns after {last_ns} ns")
             continue
         try:
-            frame = _decode(encoded, rig, report)
+            frame = _decode(encoded, rig, grey, report)
         except BadImage as error:
             report.skip("unreadable image", f"at {encoded.t_ns} ns: {error}")
             continue
         except _WrongSize as error:
             report.skip("image of another size", f"at {encoded.t_ns} ns: {error}")
             continue
+        if (note := grey.take_note()) is not None:
+            report.notes.append(note)
         last_ns = encoded.t_ns
         batch = imu.take_until(encoded.t_ns)
         if batch is not None:
             yield batch
         delivered += 1
-        paired += frame.right is not None
+        paired += frame.depth_m is not None if rig.right is None else frame.right is not None
         yield frame
-    if delivered == 0 or (rig.right is not None and paired == 0):
+    if delivered == 0 or ((rig.right is not None or rig.has_depth) and paired == 0):
         why = "; ".join(report.notes) or "it holds no images"
-        raise SourceError(f"{name}: not one usable {'frame' if delivered == 0 else 'pair of images'} ({why})")
+        pair = "pair of images" if rig.right is not None else "image with its depth"
+        raise SourceError(f"{name}: not one usable {'frame' if delivered == 0 else pair} ({why})")
 
 
 class _WrongSize(Exception):
     pass
 
 
-def _decode(encoded: EncodedFrame, rig: CameraRig, report: SourceReport) -> Frame:
-    left, left_bytes = decode_grey(encoded.left)
+def _decode(encoded: EncodedFrame, rig: CameraRig, grey: SensorBits, report: SourceReport) -> Frame:
+    left, left_bytes = grey.decode(encoded.left)
     _check_size("left", left.shape, rig.left.height, rig.left.width)
     kept = [left_bytes]
     right = depth = None
     if encoded.right is not None and rig.right is not None:
-        try:
-            decoded, right_bytes = decode_grey(encoded.right)
-            _check_size("right", decoded.shape, rig.right.height, rig.right.width)
-        except BadImage as error:
-            report.skip("unreadable image", f"right at {encoded.t_ns} ns: {error}")
-        except _WrongSize as error:
-            report.skip("image of another size", f"at {encoded.t_ns} ns: {error}")
-        else:
-            right = decoded
-            kept.append(right_bytes)
+        found = _partner(grey.decode, encoded.right, "right", rig.right, encoded.t_ns, report)
+        if found is not None:
+            right = found[0]
+            kept.append(found[1])
     if encoded.depth is not None and rig.has_depth:
-        depth, depth_bytes = decode_depth(encoded.depth)
-        _check_size("depth", depth.shape, rig.left.height, rig.left.width)
-        kept.append(depth_bytes)
+        of_depth = _partner(decode_depth, encoded.depth, "depth", rig.left, encoded.t_ns, report)
+        if of_depth is not None:
+            depth = of_depth[0]
+            kept.append(of_depth[1])
     images: tuple[EncodedImage, ...] = tuple(image for image in kept if image is not None)
     return Frame(encoded.t_ns, left, right, depth, images if len(images) == len(kept) else ())
+
+
+def _partner(
+    decode: Callable[[ImageRef], tuple[NDArray[P], EncodedImage | None]], image: ImageRef, what: str,
+    camera: CameraModel, t_ns: int, report: SourceReport,
+) -> tuple[NDArray[P], EncodedImage | None] | None:  # fmt: skip
+    """The image beside the left one and its bytes; None, and counted, if it is unusable."""
+    try:
+        pixels, data = decode(image)
+        _check_size(what, pixels.shape, camera.height, camera.width)
+    except BadImage as error:
+        report.skip("unreadable image", f"{what} at {t_ns} ns: {error}")
+    except _WrongSize as error:
+        report.skip("image of another size", f"at {t_ns} ns: {error}")
+    else:
+        return pixels, data
+    return None
 
 
 def _check_size(what: str, shape: tuple[int, ...], height: int, width: int) -> None:

@@ -26,6 +26,8 @@ DEPTH_FORMAT = "png/1000"  # millimetres: what our logs write if a source has no
 
 MOST_PIXELS = 1 << 25  # of an image: 33 million, which are decoded in a third of a second
 _PNG_GREY_16 = b"\x10\x00"  # bits and colour type in a PNG's head
+_PNG_16 = _PNG_GREY_16[:1]
+_FORMATS_OF_16 = ("png", "tiff", "pnm")
 
 _FAST_PNG = (
     cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_AVG
@@ -56,7 +58,8 @@ def detect_format(data: bytes) -> str:
     raise BadImage("empty file" if not data else f"starts with {data[:8]!r}, which is no PNG, JPEG, TIFF, BMP or PGM")
 
 
-def _encoded(ref: ImageFile | EncodedImage) -> EncodedImage:
+def read_encoded(ref: ImageFile | EncodedImage) -> EncodedImage:
+    """The bytes of an image, and their format. Raises BadImage."""
     if isinstance(ref, EncodedImage):
         detect_format(ref.data)
         return ref
@@ -74,16 +77,25 @@ def decode_grey(ref: ImageRef) -> tuple[U8, EncodedImage | None]:
     """Grey pixels (h, w) uint8 and the encoded image they were decoded from (None for raw pixels). Raises BadImage."""
     if isinstance(ref, RawPixels):
         return ref.grey(), None
-    image = _encoded(ref)
+    image = read_encoded(ref)
     pixels = _imdecode(image, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
     return np.asarray(pixels, np.uint8), image
+
+
+def decode_words(image: EncodedImage) -> NDArray[np.uint16] | None:
+    """Grey values (h, w) of an image of 16 bits; None for one of 8, which is not decoded. Raises BadImage."""
+    kind = detect_format(image.data)
+    if kind not in _FORMATS_OF_16 or (kind == "png" and image.data[24:25] != _PNG_16):
+        return None
+    pixels = _imdecode(image, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION)
+    return np.asarray(pixels, np.uint16) if pixels.dtype == np.uint16 else None
 
 
 def decode_depth(ref: ImageRef) -> tuple[F32, EncodedImage | None]:
     """Depth (h, w) float32 in metres, 0 unknown, and the encoded image. Raises BadImage."""
     if isinstance(ref, RawPixels):
         return ref.metres(), None
-    image = _encoded(ref)
+    image = read_encoded(ref)
     if image.data[:4] == b"\x89PNG" and image.data[24:26] != _PNG_GREY_16:
         raise BadImage("depth image is no 16-bit grey PNG")
     raw = _imdecode(image, cv2.IMREAD_UNCHANGED)

@@ -39,6 +39,11 @@ class BadImage(Exception):
     """An image that cannot be used; the text says why. Raised only in this package: sources count it as skipped."""
 
 
+def grey_of_words(words: NDArray[np.uint16], bits: int) -> U8:
+    """Grey values (h, w) of 8 bits from the lowest `bits` of words of 16; brighter ones are clipped."""
+    return np.asarray(np.minimum(words >> (bits - 8), 255), np.uint8)
+
+
 @dataclass(frozen=True, slots=True)
 class RawPixels:
     """Pixels in rows of `step` bytes. encoding: ROS's name of the pixel layout, such as mono8, bgr8, 16UC1.
@@ -65,8 +70,7 @@ class RawPixels:
         if name in _GREY:
             return np.ascontiguousarray(self._rows(np.uint8, 1))
         if name in _GREY16:
-            shift = (_GREY16[name] or self.bits) - 8
-            return np.asarray(np.minimum(self._rows(np.uint16, 1) >> shift, 255), np.uint8)
+            return grey_of_words(self._rows(np.uint16, 1), _GREY16[name] or self.bits)
         if name not in _TO_GREY:
             known = ", ".join((*_GREY, *_GREY16, *_TO_GREY))
             raise BadImage(f"pixel encoding {self.encoding!r} is not known: expected one of {known}")

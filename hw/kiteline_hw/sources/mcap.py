@@ -34,9 +34,9 @@ from kiteline_hw.sensors.images import ImageRef, decode_grey
 from kiteline_hw.sensors.imu_buffer import ImuStream, NoImu
 from kiteline_hw.sensors.odometry_buffer import OdometerStream, insert_before_frames
 from kiteline_hw.sensors.raw_pixels import BadImage, RawPixels
+from kiteline_hw.sensors.sensor_bits import SensorBits, bits_of_grey
 from kiteline_hw.sensors.split_imu import ImuJoiner, join_imu
 from kiteline_hw.sources.bags.bag_files import Bag, open_bag, unpacked
-from kiteline_hw.sources.bags.grey_bits import bits_of_grey
 from kiteline_hw.sources.bags.imu_topics import ImuChoice, ImuTopic, accelerations_in_g, choose_imu, what_is_measured
 from kiteline_hw.sources.mcap_messages import (
     KINDS,
@@ -82,7 +82,7 @@ class McapSource:
         self._file = file
         self._decoder = MessageDecoder()
         self._accel_in_g = False
-        self._bits = 16  # that mono16 images use
+        self._bits = 16  # that grey images of 16 bits use
         self._split_imu: ImuChoice | None = None
         self._notes: tuple[str, ...] = ()
         self._odometer_channel: int | None = None
@@ -123,7 +123,8 @@ class McapSource:
         stream = ImuStream(self.report) if self.imu is not None else None
         odometer = OdometerStream(self.report)
         frames = self._encoded_frames(stream, odometer)
-        items = decode_frames(frames, stream if stream is not None else NoImu(), self.rig, self.report, self.name)
+        samples, grey = stream if stream is not None else NoImu(), SensorBits(self._bits)
+        items = decode_frames(frames, samples, self.rig, self.report, self.name, grey)
         return insert_before_frames(items, odometer) if self._odometer_channel is not None else items
 
     # Opening
@@ -346,8 +347,7 @@ class McapSource:
         names = ("left image", "right image" if stereo else "depth image")
         for t, left, other in pair_by_time(images(), tolerance_ns, names, self.report):
             if not both:
-                if stereo or other is not None:
-                    yield EncodedFrame(t, left, other) if stereo else EncodedFrame(t, left, depth=other)
+                yield EncodedFrame(t, left, other) if stereo else EncodedFrame(t, left, depth=other)
                 continue
             while depths and depths[0][0] < t:
                 depths.popleft()
@@ -375,7 +375,7 @@ class McapSource:
                     items = [(int(batch.t_ns[-1]), batch)] if len(batch.t_ns) else []
                 else:
                     metadata = self._file.channels[raw.channel].metadata
-                    items = [(read_stamp(message, raw.log_ns), read_image(message, metadata, self._bits))]
+                    items = [(read_stamp(message, raw.log_ns), read_image(message, metadata))]
             except BadMessage as error:
                 self.report.skip("unreadable message", str(error))
                 continue

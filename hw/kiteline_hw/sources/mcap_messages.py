@@ -143,17 +143,14 @@ def read_frame_id(message: Any) -> str:
     return str(getattr(header, "frame_id", "")).lstrip("/")
 
 
-def read_image(message: Any, metadata: Mapping[str, str], bits: int = 16) -> EncodedImage | RawPixels:
-    """The image, still encoded. metadata: of the channel; holds the scale of a depth image in our logs.
-
-    bits: how many of the 16 of mono16 are used.
-    """
+def read_image(message: Any, metadata: Mapping[str, str]) -> EncodedImage | RawPixels:
+    """The image, still encoded. metadata: of the channel; holds the scale of a depth image in our logs."""
     with _reading("image"):
         data = message.data if isinstance(message.data, bytes) else _bytes(message.data)
         if hasattr(message, "encoding"):
             big_endian = bool(getattr(message, "is_bigendian", False))
             width, height, step = int(message.width), int(message.height), int(message.step)
-            return RawPixels(width, height, str(message.encoding), step, data, big_endian, bits)
+            return RawPixels(width, height, str(message.encoding), step, data, big_endian)
         scale, name = metadata.get("depth_scale"), str(message.format)
         if scale:
             return EncodedImage(data, f"png/{scale}")

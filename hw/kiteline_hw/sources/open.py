@@ -65,8 +65,7 @@ def recognise(spec: str) -> SourceKind:
         for layout in kinds.FOREIGN:
             if all(any(path.glob(mark)) for mark in layout.marks):
                 raise SourceError(f"{path}: the layout of {layout.name} is not read: {layout.mend}")
-        for entry in sorted(path.iterdir()):
-            refuse_unreadable(entry)
+        refuse_unreadable(path)
         *shown, last = [kind.shown for kind in kinds.SOURCES if kind.shown]
         raise SourceError(
             f"{path}: layout not recognised: expected {', '.join(shown)} or {last}; plain images are opened as "

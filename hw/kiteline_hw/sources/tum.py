@@ -53,8 +53,7 @@ def _read_frames(colour: Stamped, depth: Stamped, depth_format: str, report: Sou
     sides = [[(t, side, path) for t, path in images] for side, images in enumerate((colour, depth))]
     merged = heapq.merge(*sides, key=lambda item: item[0])
     for t, left, of_depth in pair_by_time(merged, DEPTH_TOLERANCE_NS, ("colour image", "depth image"), report):
-        if of_depth is not None:
-            yield EncodedFrame(t, ImageFile(left), depth=ImageFile(of_depth, depth_format))
+        yield EncodedFrame(t, ImageFile(left), depth=None if of_depth is None else ImageFile(of_depth, depth_format))
 
 
 def _list_stamped(folder: Path, kind: str) -> Stamped:

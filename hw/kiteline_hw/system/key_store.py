@@ -15,8 +15,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from kiteline_core.ids import MAX_AGENTS
+from kiteline_hw.durable_files import sync_folder
 from kiteline_hw.ports import LinkError
-from kiteline_hw.system.process import sync_folder
 
 KEY_BYTES = 32
 MAPS = "maps"

@@ -1,4 +1,4 @@
-"""Signals, systemd, the pipe to the parent process, and files that survive a crash."""
+"""Signals, systemd, the pipe to the parent process, and the folder for what survives a restart."""
 
 from __future__ import annotations
 
@@ -155,43 +155,6 @@ def print_lines(lines: Iterable[str]) -> None:
             print(line, file=sys.stderr, flush=True)
 
 
-def next_number(path: Path, least: int = 1) -> int:
-    """The number in a file, plus one, and at least `least`; the new number is stored. Survives a crash at any moment.
-
-    Raises OSError if the folder cannot be written, ValueError if the file holds no number.
-    """
-    try:
-        last = int(path.read_text())
-    except FileNotFoundError:
-        last = 0
-    except ValueError as error:
-        raise ValueError(f"{path} holds no number: write one there that is higher than any used before") from error
-    number = max(last + 1, least)
-    write_atomically(path, f"{number}\n".encode())
-    return number
-
-
 def kept_folder(name: str) -> Path:
     """The folder for files of `name` that outlive its logs."""
     return state_folder() / name
-
-
-def write_atomically(path: Path, content: bytes) -> None:
-    """Replace a file so that a reader, also after a crash, sees either the old or the new content in full."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    new = path.with_name(path.name + ".new")
-    with new.open("wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(new, path)
-    sync_folder(path.parent)
-
-
-def sync_folder(folder: Path) -> None:
-    """Wait until the names in a folder are on the disk: else a power cut may bring a replaced file back."""
-    fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(fd)
-    finally:
-        os.close(fd)

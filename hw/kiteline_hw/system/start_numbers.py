@@ -189,7 +189,7 @@ class DiskFolder:
 
 
 def machine_identity(root: Path = Path("/")) -> str:
-    """What tells this computer from one that runs a copy of its card: serial number and network cards, as a digest."""
+    """A digest of serial number and network cards: it differs on another computer that runs a copy of the card."""
     found = []
     for name in ("proc/device-tree/serial-number", "sys/class/dmi/id/product_uuid", "etc/machine-id"):
         with contextlib.suppress(OSError):

@@ -1,4 +1,4 @@
-"""What a guided motion has told of an IMU beside a camera: which motion is wanted next, and what the result is worth.
+"""State of a guided calibration of an IMU beside a camera: which motion is wanted next, and how certain the result is.
 
 Rotations of the images against the gyro tell its scales and axes, the camera's rotation and the time offset: turns
 about an axis tell the column of that axis. Gravity along an axis tells that column of the accelerometer.
@@ -50,7 +50,7 @@ class ImuProgress:
     config: GuideConfig = GuideConfig()
 
     def wanted(self) -> str:
-        """The motion that tells most now; "" if nothing is missing."""
+        """The motion that adds most information now; "" if nothing is missing."""
         c = self.config
         if self.frames >= 20 and self.tracked < 0.5 * self.frames:
             return "point it at something with texture, a metre or two away, and move it more slowly"

@@ -10,10 +10,10 @@ from kiteline_agent.runtime.options import AgentOptions, is_filter
 from kiteline_basestation.runtime.options import BaseOptions
 from kiteline_core.frame import Frame
 from kiteline_core.ids import MAX_BOOTS
+from kiteline_hw.durable_files import next_number
 from kiteline_hw.ports import FrameSource, SourceError, is_live
 from kiteline_hw.sim.links.link_model import link_seed
 from kiteline_hw.sources.open import open_source
-from kiteline_hw.system import process
 
 _BASE_PERCENT = 200.0  # of a core: the computer of a base beside agents with a limit, one core for steps, one for jobs
 
@@ -81,7 +81,7 @@ def plan(o: Options, quiet: bool = False) -> FlightPlan:
         made.close()
         raise
     counts = [source.frame_count for source in made.sources]
-    number = process.next_number(Path(o.store) / "session") if o.store else 0  # ids in a store stay unique
+    number = next_number(Path(o.store) / "session") if o.store else 0  # ids in a store stay unique
     made.frames = None if o.seconds > 0 or None in counts else sum(count or 0 for count in counts)
     for k, text in enumerate(o.sources):
         made.agents.append(

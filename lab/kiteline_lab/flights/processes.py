@@ -10,6 +10,7 @@ from pathlib import Path
 
 from kiteline_agent.runtime.options import AgentOptions
 from kiteline_basestation.runtime.options import BaseOptions
+from kiteline_hw.durable_files import next_number
 from kiteline_hw.links.kinds import is_link, link_forms
 from kiteline_hw.ports import LinkError
 from kiteline_hw.system import kernel_cache, process
@@ -204,7 +205,7 @@ class _Supervisor:
         if self._bases > 1:
             session = self._base.session + self._bases - 1
             if spec.store:
-                session = process.next_number(Path(spec.store) / "session")
+                session = next_number(Path(spec.store) / "session")
             spec = replace(spec, kill_at_s=None, session=session, log_name=f"log-{self._bases}.mcap")
         if self._kills:
             at_s, delay_s = self._kills.pop(0)

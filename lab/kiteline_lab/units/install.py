@@ -10,7 +10,7 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from kiteline_hw.system.process import write_atomically
+from kiteline_hw.durable_files import write_atomically
 from kiteline_lab.units.unit_files import (
     ROLES,
     Place,

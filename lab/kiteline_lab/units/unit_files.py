@@ -100,7 +100,7 @@ def _adapted(text: str, place: Place, programs: Path) -> str:
 
 
 def sealed(text: str) -> str:
-    """The text below a line that tells later whether somebody changed it."""
+    """The text below a line that shows later whether somebody changed it."""
     return f"{_SEAL}{_digest(text)}\n{text}"
 
 

@@ -15,7 +15,7 @@ from kiteline_hw.cameras.live_options import LiveOptions, read_rig
 from kiteline_hw.ports import SourceError
 from kiteline_hw.sources.open import open_source
 from tests.hw.calibration.test_calibration_files import CHAIN, IMU
-from tests.hw.sources.test_mcap import stereo_bag
+from tests.hw.sources.ros2_bags import stereo_bag
 
 T_ns = 1520530308199447626
 

@@ -159,6 +159,21 @@ def test_a_pair_of_topics_gives_frames_on_the_monotonic_clock(graph: Graph, tmp_
     assert graph.shut_down and not graph.subscriptions
 
 
+def test_mono16_of_ten_bits_is_not_dark(graph: Graph, tmp_path: Path) -> None:
+    path, topic = tmp_path / "camera.yaml", "/camera/image_raw"
+    path.write_text(CAMERA)
+    source = open_source(f"ros2:{topic}?calibration={path}")
+    assert isinstance(source, RosSource)
+    begun(source, graph, 1)
+    words = array("B", np.full((H, W), 800, "<u2").tobytes())
+    graph.publish(Image, topic, header=header(time.time_ns()), width=W, height=H, step=2 * W, encoding="mono16",
+                  is_bigendian=0, data=words)  # fmt: skip
+    frame = polled(source)
+    assert isinstance(frame, Frame) and frame.left[0, 0] == 200
+    assert any("hold 10 bits" in line for line in source.take_messages())
+    source.close()
+
+
 def test_compressed_images_and_damaged_ones(graph: Graph, tmp_path: Path) -> None:
     import cv2
 

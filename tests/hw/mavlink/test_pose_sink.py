@@ -7,7 +7,6 @@ import os
 import socket
 import threading
 import time
-from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -22,20 +21,11 @@ from kiteline_hw.ports import LinkError, PoseSample
 from kiteline_hw.sim.flight_controller import FlightController, UdpFlightController
 from kiteline_hw.sim.links.serial_pair import SerialPair
 from kiteline_hw.system.clock import MonotonicClock
+from tests.hw.mavlink.pushed_poses import push_while
 from tests.hw.processes import free_port
 
 CLOCK = MonotonicClock()
 FLU = mounting("flu")
-
-
-def push_while(sink: MavlinkPoseSink, condition: Callable[[], bool], timeout_s: float = 8.0) -> None:
-    """Feed poses at 100 Hz until the condition fails."""
-    deadline_s = time.monotonic() + timeout_s
-    while condition():
-        assert time.monotonic() < deadline_s, "nothing happened in time"
-        now_ns = CLOCK.now_ns()
-        sink.push(PoseSample(now_ns, np.eye(4), True, 90), now_ns)
-        time.sleep(0.01)
 
 
 def test_udp_out_to_a_controller_with_another_clock() -> None:

@@ -7,7 +7,6 @@ import os
 import socket
 import threading
 import time
-from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -24,18 +23,10 @@ from kiteline_hw.ports import LinkError, PoseSample, SourceReport
 from kiteline_hw.sim.flight_controller import FlightController
 from kiteline_hw.sim.links.serial_pair import SerialPair
 from kiteline_hw.system.clock import MonotonicClock
+from tests.hw.mavlink.pushed_poses import push_while
 from tests.hw.processes import free_port
 
 CLOCK, FLU = MonotonicClock(), mounting("flu")
-
-
-def push_while(sink: MavlinkPoseSink, condition: Callable[[], bool], timeout_s: float = 60.0) -> None:
-    deadline_s = time.monotonic() + timeout_s
-    while condition():
-        assert time.monotonic() < deadline_s, "nothing happened in time"
-        now_ns = CLOCK.now_ns()
-        sink.push(PoseSample(now_ns, np.eye(4), True, 90), now_ns)
-        time.sleep(0.01)
 
 
 def heard(s: socket.socket) -> int:

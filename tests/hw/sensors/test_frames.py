@@ -1,11 +1,12 @@
 """Pairing by time, and the checks of inertial samples."""
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from kiteline_hw.ports import SourceReport
-from kiteline_hw.sensors.frames import pair_by_time, pair_tolerance_ns
+from kiteline_hw.sensors.frames import PAIR_TOLERANCE_NS, pair_by_time, pair_tolerance_ns
 from kiteline_hw.sensors.imu_buffer import ImuStream, ImuTable
 
 STAMPS = st.lists(st.integers(0, 300), max_size=25, unique=True).map(sorted)
@@ -79,3 +80,13 @@ def test_one_stamp_far_ahead_is_dropped_alone() -> None:
     report = SourceReport()
     batch = ImuTable(times, np.zeros((10, 3)), np.zeros((10, 3)), report).take_until(10**12)
     assert batch is not None and len(batch.t_ns) == 9 and report.skipped == {"imu stamp not increasing": 1}
+
+
+@pytest.mark.parametrize(("skew_ns", "told"), [(0, False), (300_000, False), (2_000_000, True), (-2_000_000, True)])
+def test_pairs_that_are_not_taken_together_are_named(skew_ns: int, told: bool) -> None:
+    stamps = 50_000_000 * np.arange(1, 121)
+    items = sorted([(int(t), 0, "l") for t in stamps] + [(int(t) + skew_ns, 1, "r") for t in stamps])
+    report = SourceReport()
+    pairs = list(pair_by_time(items, PAIR_TOLERANCE_NS, ("left image", "right image"), report))
+    assert all(right is not None for _, _, right in pairs) and len(pairs) == 120
+    assert len(report.notes) == told and all("2.0 ms apart: while the cameras turn" in note for note in report.notes)

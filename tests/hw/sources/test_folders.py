@@ -6,37 +6,11 @@ import cv2
 import numpy as np
 import pytest
 
-from kiteline_core.frame import Frame, ImuBatch
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import Lens
-from kiteline_hw.ports import FrameSource, SourceError
+from kiteline_hw.ports import SourceError
 from kiteline_hw.sources.open import open_source
-
-BASELINE_M = 379.8145 / 707.0912
-
-
-def read(source: FrameSource) -> tuple[list[Frame], list[ImuBatch]]:
-    frames, batches, last_ns = [], [], -1
-    for item in source:
-        if isinstance(item, Frame):
-            assert item.t_ns > last_ns
-            assert not batches or batches[-1].t_ns[-1] <= item.t_ns
-            last_ns = item.t_ns
-            frames.append(item)
-        else:
-            assert item.t_ns[0] > (batches[-1].t_ns[-1] if batches else -1)
-            batches.append(item)
-    return frames, batches
-
-
-def picture(seed: int = 0, size: tuple[int, int] = (48, 64)) -> np.ndarray:
-    return np.random.default_rng(seed).integers(0, 255, size, np.uint8)
-
-
-def put(path: Path, image: np.ndarray) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    assert cv2.imwrite(str(path), image)
-
+from tests.hw.sources.folder_files import picture, put, read
 
 # --- the recordings
 
@@ -59,20 +33,6 @@ def test_euroc_recording(data_dir: Path) -> None:
     assert source.imu is not None and source.imu.gyro_noise == 1.6968e-4 and source.imu.rate_hz == 200
     assert source.ground_truth is not None and len(source.ground_truth.t_ns) == 64
     assert not source.report.skipped
-
-
-def test_kitti_recordings(data_dir: Path) -> None:
-    source = open_source(str(data_dir / "kitti_straight"))
-    frames, batches = read(source)
-    assert len(frames) == 51 and not batches and source.imu is None
-    assert (frames[0].t_ns, frames[-1].t_ns) == (0, 5_000_000_000)  # no times.txt: 10 Hz
-    assert source.rig.T_c_r is not None and source.rig.T_c_r[0, 3] == pytest.approx(BASELINE_M)
-    assert not source.rig.has_body and source.rig.left.lens is Lens.NONE
-    assert source.ground_truth is not None and len(source.ground_truth.t_ns) == 51
-    mono = open_source(f"kitti:{data_dir / 'kitti07_mono'}")
-    frames, _ = read(mono)
-    assert len(frames) == 80 and mono.rig.right is None
-    assert (frames[0].t_ns, frames[1].t_ns, frames[-1].t_ns) == (0, 103_875_200, 8_211_004_000)
 
 
 def test_tum_recording(data_dir: Path) -> None:
@@ -256,84 +216,6 @@ def test_euroc_errors(tmp_path: Path) -> None:
         open_source(str(broken))
 
 
-# --- KITTI
-
-ROW = "700 0 32 {x} 0 700 24 {y} 0 0 1 {z}"
-
-
-def kitti(root: Path, left: str, right: str | None, calib: str, n: int = 3, colour: bool = False) -> Path:
-    for side in filter(None, (left, right)):
-        for i in range(n):
-            image = picture(i)
-            put(root / side / f"{i:06d}.png", np.dstack([image] * 3) if colour else image)
-    (root / "calib.txt").write_text(calib)
-    return root
-
-
-NAMED = "\n".join(
-    f"P{i}: " + ROW.format(x=x, y=y, z=z)
-    for i, (x, y, z) in enumerate([(0, 0, 0), (-350, 0, 0), (47, 0.1, 0.006), (-303, 1.9, 0.003)])
-)
-
-
-@pytest.mark.parametrize(
-    ("left", "right", "calib", "baseline_m"),
-    [
-        ("image_0", "image_1", NAMED, 0.5),
-        ("image_2", "image_3", NAMED, (350 - 32 * 0.003) / 700),
-        ("image_l", "image_r", f"{ROW.format(x=0, y=0, z=0)}\n{ROW.format(x=-350, y=0, z=0)}", 0.5),
-        ("image_0", "image_1", f"{ROW.format(x=10, y=0, z=0)}\n{ROW.format(x=-340, y=0, z=0)}\n", 0.5),
-        ("image_0", None, NAMED, None),
-    ],
-)
-def test_kitti_layouts(tmp_path: Path, left: str, right: str | None, calib: str, baseline_m: float | None) -> None:
-    source = open_source(str(kitti(tmp_path, left, right, calib, colour=left == "image_2")))
-    frames, _ = read(source)
-    assert len(frames) == 3 and frames[0].left.shape == (48, 64)
-    assert (source.rig.right is not None) == (baseline_m is not None)
-    if baseline_m is not None:
-        assert source.rig.T_c_r is not None
-        assert source.rig.T_c_r[0, 3] == pytest.approx(baseline_m)
-        np.testing.assert_array_equal(source.rig.T_c_r[1:, 3], [0, 0, 1])
-
-
-RAW = "calib_time: 09-Jan-2012 13:57:47\n" + "\n".join(
-    f"S_0{i}: 80 60\nS_rect_0{i}: 64 48\nP_rect_0{i}: " + ROW.format(x=x, y=0, z=0)
-    for i, x in enumerate([0, -350, 35, -315])
-)
-
-
-def kitti_raw(day: Path, sides: tuple[str, ...], size: tuple[int, int] = (48, 64)) -> Path:
-    drive = day / "2011_09_26_drive_0001_sync"
-    for side in sides:
-        for i in range(3):
-            put(drive / f"image_{side}" / "data" / f"{i:010d}.png", picture(i, size))
-        times = [f"2011-09-26 13:02:25.{594360375 + 103_000_000 * i}" for i in range(3)]
-        (drive / f"image_{side}" / "timestamps.txt").write_text("\n".join(times) + "\n")
-    (day / "calib_cam_to_cam.txt").write_text(RAW)
-    return drive
-
-
-@pytest.mark.parametrize(("sides", "pair"), [(("00", "01", "02", "03"), True), (("02", "03"), True), (("02",), False)])
-def test_raw_drives_of_kitti(tmp_path: Path, sides: tuple[str, ...], pair: bool) -> None:
-    source = open_source(str(kitti_raw(tmp_path, sides)))
-    frames, _ = read(source)
-    assert len(frames) == 3 and (source.rig.right is not None) == pair
-    assert (frames[0].right is not None) == pair
-    assert frames[0].t_ns == 1_317_042_145_594_360_375 and frames[1].t_ns - frames[0].t_ns == 103_000_000
-    assert source.rig.left.fx == 700.0
-    if source.rig.T_c_r is not None:
-        assert source.rig.T_c_r[0, 3] == pytest.approx(0.5)
-
-
-def test_raw_drives_of_kitti_that_cannot_be_read(tmp_path: Path) -> None:
-    with pytest.raises(SourceError, match="_extract"):
-        open_source(str(kitti_raw(tmp_path, ("00", "01"), (60, 80))))
-    (tmp_path / "calib_cam_to_cam.txt").unlink()
-    with pytest.raises(SourceError, match=r"calibration of the same day"):
-        open_source(str(tmp_path / "2011_09_26_drive_0001_sync"))
-
-
 def test_layouts_that_are_not_read_say_what_helps(tmp_path: Path) -> None:
     fpv, seasons = tmp_path / "indoor_forward_3", tmp_path / "recording"
     fpv.mkdir()
@@ -344,40 +226,6 @@ def test_layouts_that_are_not_read_say_what_helps(tmp_path: Path) -> None:
         open_source(str(fpv))
     with pytest.raises(SourceError, match=r"4Seasons.*undistorted_images/cam0"):
         open_source(str(seasons))
-
-
-def test_kitti_missing_right_images_and_numbered_rows(tmp_path: Path) -> None:
-    root = kitti(tmp_path, "image_0", "image_1", NAMED, n=5)
-    (root / "image_1/000002.png").unlink()
-    (root / "image_0/000003.png").unlink()
-    (root / "times.txt").write_text("\n".join(str(0.1 * i) for i in range(5)))
-    source = open_source(str(root))
-    frames = read(source)[0]
-    assert [(f.t_ns, f.right is None) for f in frames] == [
-        (0, False), (100_000_000, False), (200_000_000, True), (400_000_000, False),
-    ]  # fmt: skip
-    assert source.report.skipped == {"missing right image": 1, "missing left image": 1}
-
-
-def test_kitti_errors(tmp_path: Path) -> None:
-    (tmp_path / "empty/image_0").mkdir(parents=True)
-    with pytest.raises(SourceError, match="no images: expected KITTI's layout"):
-        open_source(str(tmp_path / "empty"))
-    no_calib = kitti(tmp_path / "a", "image_0", "image_1", NAMED)
-    (no_calib / "calib.txt").unlink()
-    with pytest.raises(SourceError, match=r"calib\.txt"):
-        open_source(str(no_calib))
-    same = f"{ROW.format(x=0, y=0, z=0)}\n{ROW.format(x=0, y=0, z=0)}"
-    with pytest.raises(SourceError, match="baseline between left and right camera is 0 m"):
-        open_source(str(kitti(tmp_path / "b", "image_0", "image_1", same)))
-    assert open_source(str(tmp_path / "b"), mono=True).rig.right is None
-    with pytest.raises(SourceError, match="one row, but two image folders"):
-        open_source(str(kitti(tmp_path / "c", "image_0", "image_1", ROW.format(x=0, y=0, z=0))))
-    with pytest.raises(SourceError, match="12 numbers a row"):
-        open_source(str(kitti(tmp_path / "d", "image_0", "image_1", "1 2 3")))
-    (kitti(tmp_path / "e", "image_0", None, NAMED) / "times.txt").write_text("0\n0.1\n")
-    with pytest.raises(SourceError, match="2 times for 3 images"):
-        open_source(str(tmp_path / "e"))
 
 
 # --- TUM and plain images
@@ -403,7 +251,19 @@ def test_tum_association_and_scale(tmp_path: Path) -> None:
     assert frames[0].depth_m is not None and (frames[0].depth_m == 2.0).all()
     (tmp_path / "depth/1.png").write_text("no depth")
     put(tmp_path / "depth/2.png", picture())  # 8 bits are no depth
-    assert len(read(source)[0]) == 2 and source.report.skipped == {"unreadable image": 2}
+    (tmp_path / "depth/3.png").unlink()
+    frames, _ = read(source)
+    assert [f.depth_m is not None for f in frames] == [True, False, False, False], (
+        "a frame is tracked without its depth"
+    )
+    assert source.report.skipped == {"unreadable image": 3}
+    (tmp_path / "depth.txt").write_text("100.015 depth/0.png")
+    frames, _ = read(source := open_source(str(tmp_path)))
+    assert [f.depth_m is not None for f in frames] == [True, False, False, False]
+    assert source.report.skipped == {"missing depth image": 3}
+    (tmp_path / "depth.txt").write_text("110.0 depth/0.png")
+    with pytest.raises(SourceError, match="not one usable image with its depth"):
+        read(open_source(str(tmp_path)))
 
 
 def test_tum_defaults_by_name_else_an_error(tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from kiteline_hw.sources.bags.ros2_definitions import definition_of
 from kiteline_hw.sources.mcap_messages import KINDS
 from kiteline_hw.sources.open import open_source
 from tests.hw.sources.camera_messages import START_NS, quaternion, read, xyz
-from tests.hw.sources.test_mcap import Bag, check_stereo, stereo_bag
+from tests.hw.sources.ros2_bags import Bag, check_stereo, stereo_bag
 
 _TABLES = """
 CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT NOT NULL, type TEXT NOT NULL,

@@ -11,7 +11,7 @@ from kiteline_hw.ports import SourceReport
 from kiteline_hw.sensors.split_imu import ImuJoiner, join_imu
 from kiteline_hw.sources.open import open_source
 from tests.hw.sources.camera_messages import START_NS, STEP_NS, T_B_L, T_L_R, read, xyz
-from tests.hw.sources.test_mcap import Bag, check_stereo, stereo_bag
+from tests.hw.sources.ros2_bags import Bag, check_stereo, stereo_bag
 
 MS = 1_000_000
 GYRO, ACCEL = "/camera/gyro/sample", "/camera/accel/sample"

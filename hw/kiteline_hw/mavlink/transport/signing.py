@@ -11,8 +11,8 @@ from typing import Any
 
 from pymavlink.dialects.v20 import common
 
+from kiteline_hw.durable_files import write_atomically
 from kiteline_hw.ports import LinkError
-from kiteline_hw.system.process import write_atomically
 
 _EPOCH_S = 1420070400  # s: 1 January 2015, at which stamps begin
 _TICKS = 100_000  # stamps count 10 us

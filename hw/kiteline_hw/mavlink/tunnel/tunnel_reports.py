@@ -54,7 +54,7 @@ class Departures:
         self._log.append(((number, part), self._sent, now_ns))
 
     def factor(self, report: bytes, now_ns: int) -> float:
-        """The change of the rate by a report; 1 if it tells too little."""
+        """The change of the rate by a report; 1 if it covers too little."""
         if len(report) < _REPORT.size:
             return 1.0
         count, arrived_ms, *head, _ = _REPORT.unpack(report[: _REPORT.size])

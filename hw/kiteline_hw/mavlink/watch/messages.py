@@ -1,4 +1,4 @@
-"""The MAVLink messages by which a flight controller tells its state: estimator, version, parameters, texts."""
+"""The MAVLink messages by which a flight controller reports its state: estimator, version, parameters, texts."""
 
 from __future__ import annotations
 

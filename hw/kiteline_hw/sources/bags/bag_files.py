@@ -40,8 +40,7 @@ def _bag_in_folder(folder: Path) -> Bag:
         )
     if parts:
         return SqliteBag(parts)
-    for path in sorted(folder.iterdir()):
-        refuse_unreadable(path)
+    refuse_unreadable(folder)
     raise SourceError(f"{folder}: no *.mcap and no *.db3 in this folder: expected a recording")
 
 
@@ -54,6 +53,9 @@ def unpacked(message: bytes) -> bytes:
         return message
     try:
         with zstandard.ZstdDecompressor(max_window_size=MOST_CHUNK_BYTES).stream_reader(message) as stream:
-            return bytes(stream.read(MOST_CHUNK_BYTES))
+            data = bytes(stream.read(MOST_CHUNK_BYTES + 1))
     except zstandard.ZstdError as error:
         raise BadMessage(f"packed message cannot be unpacked ({error})") from error
+    if len(data) > MOST_CHUNK_BYTES:
+        raise BadMessage(f"packed message is larger than {MOST_CHUNK_BYTES} bytes, which is the most that is read")
+    return data

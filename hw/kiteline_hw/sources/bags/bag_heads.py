@@ -13,7 +13,15 @@ _ROS1_MAGIC = b"#ROSBAG"
 
 
 def refuse_unreadable(path: Path) -> None:
-    """Raise SourceError, with what helps, for a ROS 1 bag and for a file that was packed as a whole."""
+    """Raise SourceError, with what helps, for a ROS 1 bag and for a file that was packed as a whole.
+
+    Of a folder, its files are looked at.
+    """
+    if path.is_dir():
+        for entry in sorted(path.iterdir()):
+            if entry.is_file():
+                refuse_unreadable(entry)
+        return
     try:
         if not path.is_file():  # to open a named pipe waits for what writes to it
             return

@@ -1,4 +1,6 @@
-"""The parts of a ROS 2 bag in MCAP storage that was split by size or duration, BAG_0.mcap, BAG_1.mcap…, read as one."""
+"""The parts of a recording in MCAP files, read as one: of a ROS 2 bag that was split by size or duration, BAG_0.mcap,
+BAG_1.mcap…, or of a kiteline log that went on in further files, LOG.mcap, LOG_1.mcap…
+"""
 
 from __future__ import annotations
 
@@ -15,6 +17,7 @@ from kiteline_hw.ports import SourceError
 _OVERLAP_NS = 200_000_000  # ns; topics are written by threads of their own, so that stamps cross where a part ends
 _MOST_METADATA_BYTES = 1 << 20
 _NUMBERED = re.compile(r"(.*)_(\d+)")
+_LOG_PART = re.compile(r"(.*?)(_\d+)?")
 
 
 class McapParts:
@@ -28,9 +31,9 @@ class McapParts:
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
         self.counts: dict[int, int] = {}
-        if not are_parts(folder, paths):
-            raise self._strangers(len(paths), "no metadata.yaml lists them, and they are not named BAG_0, BAG_1…")
         parts = [McapFile(path) for path in paths]
+        if not are_parts(folder, paths) and not _are_of_log(parts):
+            raise self._strangers(len(paths), "no metadata.yaml lists them, and they are not named BAG_0, BAG_1…")
         self.cut = "; ".join(f"{part.path.name} is {part.cut}" for part in parts if part.cut) or None
         parts = sorted((part for part in parts if any(part.counts.values())), key=lambda part: part.first_ns)
         for before, after in pairwise(parts):
@@ -98,6 +101,12 @@ class McapParts:
 def are_parts(folder: Path, paths: list[Path]) -> bool:
     """True if the names of files in a folder, or its metadata.yaml, say that they are parts of one bag."""
     return _numbered(paths) or _listed(folder, paths)
+
+
+def _are_of_log(files: list[McapFile]) -> bool:
+    """True if files are named as a kiteline log and its later parts, and are logs."""
+    names = {match[1] for file in files if (match := _LOG_PART.fullmatch(file.path.stem))}
+    return len(names) == 1 and all(any(m.name == "kiteline" for m in file.metadata) for file in files)
 
 
 def _numbered(paths: list[Path]) -> bool:

@@ -54,15 +54,22 @@ class SqliteBag:
         for _, path, numbers in self._parts:
             wanted = [topic for topic, channel in numbers.items() if channels is None or channel in channels]
             marks = ",".join("?" * len(wanted))
-            rows = f"SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN ({marks}) ORDER BY timestamp, id"
+            # `length` reads no more than the head of a row, and one beyond SQLite's limit would end the query.
+            data_or_size = f"CASE WHEN length(data) <= {MOST_CHUNK_BYTES} THEN data ELSE length(data) END"
+            rows = f"SELECT topic_id, timestamp, {data_or_size} FROM messages WHERE topic_id IN ({marks})"
+            rows += " ORDER BY timestamp, id"
             try:
                 with closing(_connect(path)) as bag:
                     for topic, log_ns, data in bag.execute(rows, wanted):
-                        if isinstance(data, bytes) and len(data) <= MOST_CHUNK_BYTES and isinstance(log_ns, int):
+                        if isinstance(data, bytes) and isinstance(log_ns, int):
                             yield RawMessage(numbers[topic], 0, log_ns, log_ns, data)
+                        elif isinstance(data, int) and data > MOST_CHUNK_BYTES:
+                            self._note(f"{path.name}: messages left out that are larger than {MOST_CHUNK_BYTES} bytes")
             except sqlite3.Error as error:
-                note = f"{path.name}: damaged ({error})"
-                self.notes += [] if note in self.notes else [note]
+                self._note(f"{path.name}: damaged ({error})")
+
+    def _note(self, text: str) -> None:
+        self.notes += [] if text in self.notes else [text]
 
     def first(self, channel: int) -> RawMessage | None:
         """The first message of a channel."""

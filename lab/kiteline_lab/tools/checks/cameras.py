@@ -38,7 +38,7 @@ _CORNERS = 60  # tracking begins to fail below
 
 @dataclass
 class Watched:
-    """What was seen. said: what the cameras told.
+    """Images of cameras that were watched. said: messages of the cameras.
 
     Images are looked at when all have come: on a small computer it takes longer than the next one waits.
     """

@@ -1,0 +1,46 @@
+"""Files that are whole, and the newest, after a crash or a loss of power. It imports nothing but the system's calls."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Replace a file so that a reader, also after a crash, sees either the old or the new content in full.
+
+    Returns when content and name are on the disk. Makes the folder if need be. Raises OSError; the old file then stays.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    new = path.with_name(path.name + ".new")
+    with new.open("wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())  # else the name may be on the disk before the content: an empty file
+    os.replace(new, path)
+    sync_folder(path.parent)
+
+
+def sync_folder(folder: Path) -> None:
+    """Wait until the names in a folder are on the disk: else a power cut may bring a replaced file back."""
+    fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(fd)
+    finally:
+        os.close(fd)
+
+
+def next_number(path: Path, least: int = 1) -> int:
+    """The number in a file, plus one, and at least `least`; the new number is stored. Survives a crash at any moment.
+
+    Raises OSError if the folder cannot be written, ValueError if the file holds no number.
+    """
+    try:
+        last = int(path.read_text())
+    except FileNotFoundError:
+        last = 0
+    except ValueError as error:
+        raise ValueError(f"{path} holds no number: write one there that is higher than any used before") from error
+    number = max(last + 1, least)
+    write_atomically(path, f"{number}\n".encode())
+    return number

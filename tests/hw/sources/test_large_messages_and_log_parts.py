@@ -1,0 +1,99 @@
+"""Messages that are too large are named, not dropped silently; a kiteline log in several files is one recording."""
+
+from __future__ import annotations
+
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zstandard
+from mcap.writer import Writer
+
+from kiteline_core.frame import Frame
+from kiteline_core.geometry.cameras import CameraModel, CameraRig
+from kiteline_hw.logs import mcap_file
+from kiteline_hw.logs.log_budget import LogBudget
+from kiteline_hw.logs.mcap_file import McapFile
+from kiteline_hw.logs.mcap_log import LogWriter
+from kiteline_hw.ports import SourceError
+from kiteline_hw.sources.bags import bag_files, sqlite_bag
+from kiteline_hw.sources.bags.bag_files import unpacked
+from kiteline_hw.sources.bags.sqlite_bag import SqliteBag
+from kiteline_hw.sources.mcap_messages import BadMessage
+from kiteline_hw.sources.open import open_source
+
+MOST = 5000  # bytes, in place of 64 MiB
+
+
+def test_a_message_outside_of_chunks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mcap_file, "MOST_CHUNK_BYTES", MOST)
+    with (tmp_path / "a.mcap").open("wb") as stream:
+        writer = Writer(stream, use_chunking=False)
+        writer.start("", "test")
+        channel = writer.register_channel("/a", "json", writer.register_schema("a", "jsonschema", b"{}"))
+        for k, size in enumerate((10, MOST + 1, 20)):
+            writer.add_message(channel, k, bytes(size), k)
+        writer.finish()
+    file = McapFile(tmp_path / "a.mcap")
+    assert [len(message.data) for message in file.messages()] == [10, 20]
+    assert len(file.notes) == 1 and f"left out, expected at most {MOST}" in file.notes[0]
+
+
+def test_a_row_of_a_sqlite_bag(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sqlite_bag, "MOST_CHUNK_BYTES", MOST)
+    with closing(sqlite3.connect(tmp_path / "a.db3")) as file:
+        file.executescript(
+            "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT);"
+            "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB);"
+            "INSERT INTO topics VALUES(1, '/a', 'sensor_msgs/msg/Image', 'cdr');"
+        )
+        for k, size in enumerate((10, 4 * MOST, 20)):
+            file.execute("INSERT INTO messages(topic_id, timestamp, data) VALUES(1, ?, ?)", (k, bytes(size)))
+        file.commit()
+    bag = SqliteBag([tmp_path / "a.db3"])
+    assert [len(message.data) for message in bag.messages()] == [10, 20]
+    assert bag.notes == [f"a.db3: messages left out that are larger than {MOST} bytes"]
+
+
+def test_a_packed_message(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bag_files, "MOST_CHUNK_BYTES", MOST)
+    assert unpacked(zstandard.compress(bytes(MOST))) == bytes(MOST)
+    with pytest.raises(BadMessage, match=f"larger than {MOST} bytes"):
+        unpacked(zstandard.compress(bytes(MOST + 1)))
+
+
+def log_in_parts(folder: Path, name: str = "boot00003", first_ns: int = 0) -> int:
+    """Write a log that goes on in further files; returns their number."""
+    folder.mkdir(exist_ok=True)
+    camera = CameraModel(64, 48, 60.0, 60.0, 31.5, 23.5)
+    random = np.random.default_rng(2)
+    budget = LogBudget(folder, "boot", 160_000, 0)
+    with LogWriter(folder / f"{name}.mcap", {"role": "agent"}, budget=budget) as log:
+        log.rig(first_ns, CameraRig(camera, None, np.eye(4), None, has_body=False), None)
+        for k in range(20):
+            log.frame(Frame(first_ns + 50_000_000 * k, random.integers(0, 256, (48, 64), np.uint8)))
+    return len(list(folder.glob(f"{name}*.mcap")))
+
+
+def test_the_parts_of_a_log_are_one_recording(tmp_path: Path) -> None:
+    assert log_in_parts(tmp_path / "a") > 2
+    source = open_source(str(tmp_path / "a"))
+    frames = [item for item in source if isinstance(item, Frame)]
+    assert [frame.t_ns for frame in frames] == [50_000_000 * k for k in range(20)] and source.frame_count == 20
+    (tmp_path / "a" / "boot00003.mcap").unlink()  # the oldest part goes first
+    assert 0 < len([item for item in open_source(str(tmp_path / "a")) if isinstance(item, Frame)]) < 20
+
+
+def test_logs_of_two_flights_are_not_joined(tmp_path: Path) -> None:
+    log_in_parts(tmp_path / "a")
+    log_in_parts(tmp_path / "a", "boot00004", 10**12)
+    with pytest.raises(SourceError, match="no parts of one bag"):
+        open_source(str(tmp_path / "a"))
+
+
+def test_a_folder_where_one_log_is_expected_is_answered_with_its_first_part(tmp_path: Path) -> None:
+    log_in_parts(tmp_path / "a")
+    with pytest.raises(SourceError, match=r"a folder: expected one of its \*\.mcap files, such as .*/boot00003\.mcap;"):
+        McapFile(tmp_path / "a")
