@@ -88,8 +88,9 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from kiteline_core.frame import Frame, Trajectory
     from kiteline_core.geometry.cameras import CameraModel, CameraRig
     from kiteline_hw.logs.mcap_log import LogWriter
+    from tests.wall import STEP_M
 
-    frames, step_m, depth_m, baseline_m, focal = 30, 0.02, 2.0, 0.1, 200.0
+    frames, depth_m, baseline_m, focal = 30, 2.0, 0.1, 200.0
     random = np.random.default_rng(1)
     wall = cv2.GaussianBlur(random.integers(0, 256, (260, 480), np.uint8), (0, 0), 1.2)
     wall = cv2.normalize(wall, None, 20, 235, cv2.NORM_MINMAX).astype(np.uint8)
@@ -98,7 +99,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     T_c_r[0, 3] = baseline_m
     stamps = 1_000_000_000 + 50_000_000 * np.arange(frames, dtype=np.int64)
     poses = np.tile(np.eye(4), (frames, 1, 1))
-    poses[:, 0, 3] = step_m * np.arange(frames)
+    poses[:, 0, 3] = STEP_M * np.arange(frames)
 
     def seen_from(x_m: float) -> np.ndarray:
         shift = np.array([[1.0, 0.0, -focal * x_m / depth_m], [0.0, 1.0, -5.0]])

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import importlib.util
 import struct
 from collections.abc import Callable
 from math import floor
-from pathlib import Path
-from types import ModuleType
 from typing import Any
 from zlib import crc32
 
@@ -16,21 +13,10 @@ import pytest
 
 from kiteline_codec.residuals.residual_coding import ResidualCoder
 from kiteline_codec.schema import CameraIntrinsics, Key, KeyframeHeader, NewLandmarks, Observations, messages
+from tests.codec.residuals.coded_flights import coded, flight
+from tests.codec.second_reader import Source, residual_columns, varint
 
-
-def load(name: str) -> ModuleType:
-    """A test file beside this one as a module."""
-    spec = importlib.util.spec_from_file_location(name, Path(__file__).parent / f"{name}.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-SPEC, RESIDUALS = load("test_spec"), load("residuals/test_residual_coding")
 Rows = list[list[int]]
-residual_columns: Callable[[Any, int, int], Rows] = SPEC.residual_columns
 
 
 def ungap(gaps: list[int]) -> list[int]:
@@ -72,7 +58,7 @@ def predict(landmark: list[int], T: Any, camera: Any) -> list[int] | None:
 
 def read_observations(key: Key, form: bytes, values: Any) -> tuple[dict[str, list[int]], list[int], Any]:
     """Columns, versions used, and the source before its checksum."""
-    s = SPEC.Source(form)
+    s = Source(form)
     n, step = s.varint(), s.varint()
     records = {k: messages.decode(k, code) for k, (_, code) in values.items()}
     heads = {
@@ -92,7 +78,7 @@ def read_observations(key: Key, form: bytes, values: Any) -> tuple[dict[str, lis
         for part in range(mask.bit_length()):
             if mask >> part & 1:
                 version, code = values[Key(4, a, part)]
-                b = SPEC.Source(code)
+                b = Source(code)
                 columns = b.columns(6, b.varint())
                 known |= {i: [u, v, d, o] for i, u, v, d, o, _ in zip(*columns, strict=True)}
                 used.append(version)
@@ -147,7 +133,7 @@ def read_observations(key: Key, form: bytes, values: Any) -> tuple[dict[str, lis
 
 @pytest.mark.parametrize("held", [lambda key: True, lambda key: key.kind != KeyframeHeader.KIND or key.id % 64 < 5])
 def test_observations(held: Callable[[Key], bool]) -> None:
-    values = RESIDUALS.coded(RESIDUALS.flight(7, keyframes=6, landmarks=40))
+    values = coded(flight(7, keyframes=6, landmarks=40))
     compared = 0
     for key, (_, code) in values.items():
         if key.kind != Observations.KIND:
@@ -159,8 +145,8 @@ def test_observations(held: Callable[[Key], bool]) -> None:
         columns, used, s = read_observations(key, form, known)
         record = messages.decode(key, code)
         assert isinstance(record, Observations)
-        n = SPEC.Source(code).varint()
-        plain = SPEC.Source(code[len(SPEC.varint(n)) :]).columns(5, n)
+        n = Source(code).varint()
+        plain = Source(code[len(varint(n)) :]).columns(5, n)
         assert [columns[c] for c in ("index", "u", "v", "depth", "octave")] == plain
         assert columns["point"] == record.point.tolist()
         checksum = crc32(code + b"".join(struct.pack("<q", v) for v in used))
@@ -171,17 +157,17 @@ def test_observations(held: Callable[[Key], bool]) -> None:
 
 
 def test_new_landmarks() -> None:
-    values = RESIDUALS.coded(RESIDUALS.flight(7, keyframes=1, landmarks=40))
+    values = coded(flight(7, keyframes=1, landmarks=40))
     for key, (_, code) in values.items():
         if key.kind != NewLandmarks.KIND:
             continue
         form = ResidualCoder().compress(key, code, {}.get, {}.get)
         assert form is not None
-        s = SPEC.Source(form)
+        s = Source(form)
         head = s.varint()
         n, size = head // 4, (0, 16, 32)[head % 4]
         columns = residual_columns(s, 6, n)
-        plain = SPEC.Source(code)
+        plain = Source(code)
         assert plain.varint() == n
         assert [ungap(columns[0]), *columns[1:]] == plain.columns(6, n)
         assert s.raw(size * n) == plain.raw(size * n)

@@ -14,6 +14,7 @@ from kiteline_core.frame import Frame
 from kiteline_hw.sources.open import open_source
 from kiteline_lab.flights.fly import fly
 from kiteline_lab.flights.plan import Options
+from tests.wall import STEP_M
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -40,7 +41,7 @@ def test_images_become_poses(recording: Path, tmp_path: Path) -> None:
     lines = run("track_images.py", str(tmp_path))
     assert len(lines) == len(frames)
     y_m = [float(re.findall(r"y ([+-]\d+\.\d+)", line)[0]) for line in lines]
-    assert y_m[-1] == pytest.approx(-0.02 * (len(frames) - 1), abs=0.005)  # the camera slides 2 cm a frame to the right
+    assert y_m[-1] == pytest.approx(-STEP_M * (len(frames) - 1), abs=0.005)  # the camera slides to the right
 
 
 def test_a_flown_log_becomes_arrays(recording: Path, tmp_path: Path) -> None:
@@ -48,4 +49,5 @@ def test_a_flown_log_becomes_arrays(recording: Path, tmp_path: Path) -> None:
     lines = run("read_log.py", str(tmp_path / "agent0" / "log.mcap"))
     assert lines[0].startswith("left images    (30, 240, 320) uint8")
     assert lines[1] == "gyro, accel    (0, 3), (0, 3)"
-    assert lines[2].startswith("odometry       (30, 4, 4), path 0.58 m")
+    found = re.match(r"odometry       \(30, 4, 4\), path (\d\.\d+) m", lines[2])
+    assert found is not None and float(found[1]) == pytest.approx(29 * STEP_M, abs=0.01)

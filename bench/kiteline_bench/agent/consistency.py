@@ -113,7 +113,7 @@ def nees_bar(name: str, counts: Counts) -> Bar:
 
 
 def quality_bars(counts: list[Counts]) -> list[Bar]:
-    """Whether `quality` tells bad poses from good ones."""
+    """Whether `quality` separates bad poses from good ones."""
     bad, good = sum(c.bad for c in counts), sum(c.good for c in counts)
     flagged = sum(c.bad_flagged for c in counts) / bad if bad else 1.0
     wrongly = sum(c.good_flagged for c in counts) / max(good, 1)

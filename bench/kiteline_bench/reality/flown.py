@@ -30,6 +30,7 @@ F64 = NDArray[np.float64]
 Poses = list[tuple[int, F64]]
 
 _WINDOW_S, _STEP_S = 5.0, 1.0  # of the windows whose scale is compared with the truth
+_FALSE = 0.05  # error of a window's scale from which "metric" is wrong
 _LEAST_PATH_M = 1.0  # in a window: from less the scale is not known
 
 
@@ -156,6 +157,24 @@ def flown(
         result = Flown(agent.run, [], time.perf_counter() - begin_s, agent.box)
     bench.say(f"{what}: {len(recording.items)} frames in {result.seconds:.0f} s")
     return result
+
+
+StartRow = tuple[str, float, float, float]  # flight, start in s, metric after s, largest error of a metric window in %
+
+
+def start_of(bench: Bench, name: str, start_s: float, recording: Recording) -> StartRow:
+    """Fly a recording that begins at start_s, without a base, for when it says "metric" and how wrong that is."""
+    flight = flown(bench, f"{name} from {start_s:g} s", recording, base=False)
+    row = (name, start_s, flight.metric_after_s, 100.0 * flight.false_metric())
+    bench.say(f"  metric after {row[2]:.1f} s, scale off by up to {row[3]:.1f} %")
+    return row
+
+
+def wrong_metres(rows: Sequence[StartRow]) -> Bar:
+    """The bar on starts that say "metric" while lengths are wrong."""
+    wrong = sum(row[3] > 100.0 * _FALSE for row in rows)
+    name = f"metric said while the scale of 5 s is off by more than {100 * _FALSE:g} %, of {len(rows)} starts"
+    return at_most(name, wrong, 0, "", 0)
 
 
 def spread(

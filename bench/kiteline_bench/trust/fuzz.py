@@ -32,8 +32,8 @@ from kiteline_codec.sync.endpoint import Endpoint
 from kiteline_codec.transport.framing import Deframer, frame
 from kiteline_codec.transport.packet import parse
 from kiteline_codec.transport.seal import Direction, Opener, Sealer, Suite
+from kiteline_hw.durable_files import write_atomically
 from kiteline_hw.ports import SourceError
-from kiteline_hw.system import process
 
 TITLE = "Fuzzing"
 INPUTS = 200_000  # some minutes
@@ -299,7 +299,7 @@ def run(bench: Bench) -> list[Bar]:
         )  # fmt: skip
         grown_mib += found.grown_mib  # in this process
         total = total.with_round(found, grown_mib)
-        process.write_atomically(state, json.dumps(asdict(total)).encode())
+        write_atomically(state, json.dumps(asdict(total)).encode())
     for failure in total.failures:
         bench.say(failure)
     fed = {door.name: TURNS.get(door.name, 1) for door in others} | {n: TURNS[n] for n in TURNS}

@@ -19,8 +19,6 @@ F64 = NDArray[np.float64]
 _Number = TypeVar("_Number", float, F64)
 
 _SMALL_RAD = 1e-7  # below this angle the series is exact to double precision
-
-_EYE = np.eye(3)
 _NEARLY = 1e-7  # deviation from orthonormal whose square is below double precision
 
 

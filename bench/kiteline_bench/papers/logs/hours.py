@@ -64,7 +64,6 @@ class SteadyAgent:
 
     def __init__(self) -> None:
         self.work = Work()
-        self.map_grid = None
         self._packet = np.random.default_rng(4).bytes(_PACKET_BYTES)
 
     def step(self, step_input: StepInput, now_ns: int) -> StepOutput:

@@ -115,7 +115,7 @@ def run(bench: Bench) -> list[Bar]:
         rows.append(_reference_row(scene, source, flight))
         bench.say("; ".join(f"{d.cell_m:g} m: {d.whole.precision:.2f} / {d.whole.recall:.2f} %" for d in drawn))
         draw_comparison(picture_path(bench, scene.name), drawn[1].grid, truth(source, _COARSE_M).seen, flight.T_plane)
-        bars += _cost_bars(bench, scene, recording, drawn)
+        bars += _cost_bars(scene, recording, drawn)
     columns = (
         "scene", "method", "cell m", "precision %", "recall %", "recall of what was in sight %", "theirs",
         "free m2", "keyframes with a scan",
@@ -188,7 +188,7 @@ def _table_bars(scene: Scene, d: Drawn) -> list[Bar]:
     ]  # fmt: skip
 
 
-def _cost_bars(bench: Bench, scene: Scene, recording: Recording, drawn: Sequence[Drawn]) -> list[Bar]:
+def _cost_bars(scene: Scene, recording: Recording, drawn: Sequence[Drawn]) -> list[Bar]:
     """Time and memory of an update: the scan on the agent and the drawing on the base."""
     scanner, scan_ms = Scanner(recording.rig), []
     for item in recording.items[5::10]:
