@@ -53,7 +53,7 @@ def test_another_image_is_found_at_its_frame() -> None:
     images[stamps[6]] = images[stamps[7]]
     found = kept()
     found.halves[0] = replay_agent(KEPT, RGBD, 0, images)
-    lines = differences(kept(), found, None if kept().machine == found.machine else TOLERANCE)
+    lines = differences(replay(KEPT, RGBD), found, None)  # both computed here: processors differ in the last digits
     assert any("frame 6 (0.300 s)" in line for line in lines), lines
     assert differences(kept(), found, TOLERANCE)  # and on any other machine
 
