@@ -29,11 +29,17 @@ def open_link(
     logins: Mapping[str, str] | None = None,
 ) -> ByteLink | LinkHub:  # fmt: skip
     """Open one end of a link: a ByteLink for an agent, a LinkHub for a base. See LinkOptions. Raises LinkError."""
+    module = import_module(kind_of(spec).module)
+    address = spec.partition(":")[2]
+    options = LinkOptions(agent, group, framer, required, logins or {})
+    end: ByteLink | LinkHub = (module.open_agent_end if role == "agent" else module.open_base_end)(address, options)
+    return end
+
+
+def kind_of(spec: str) -> kinds.LinkKind:
+    """The kind of a LINK. Raises LinkError if it is of none, or its address is missing or not wanted."""
     scheme, _, address = spec.partition(":")
     kind = next((kind for kind in kinds.LINKS if kind.scheme == scheme), None)
     if kind is None or bool(address) != bool(kind.address):
         raise LinkError(f"unknown link {spec!r}: expected {kinds.link_forms()}")
-    module = import_module(kind.module)
-    options = LinkOptions(agent, group, framer, required, logins or {})
-    end: ByteLink | LinkHub = (module.open_agent_end if role == "agent" else module.open_base_end)(address, options)
-    return end
+    return kind
