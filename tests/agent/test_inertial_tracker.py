@@ -223,9 +223,13 @@ def in_unit(points: VisualPoints, unit: float) -> VisualPoints:
     )
 
 
+@pytest.mark.parametrize("corrected_every", [1000, 20])
 @pytest.mark.parametrize("unit", [1.0, 0.94, 1.06])
-def test_a_wrong_scale_is_found_and_corrected(unit: float) -> None:
-    """A monocular map that is 6 % off is found within seconds, a right one is left alone."""
+def test_a_wrong_scale_is_found_and_corrected(unit: float, corrected_every: int) -> None:
+    """A monocular map that is 6 % off is found within seconds, a right one is left alone.
+
+    It makes no difference that the base moves the map every second and leaves its lengths as they are.
+    """
     steps = flight(260, 7)
     tracker = InertialTracker(CAMERA, CALIBRATION, InertialConfig(), metric=False)
     tracker.predict(steps[10].imu, steps[10].t_ns)
@@ -233,10 +237,12 @@ def test_a_wrong_scale_is_found_and_corrected(unit: float) -> None:
     mono_start(tracker, steps[10], velocity, unit)
     total = unit
     corrections = []
-    for step in steps[11:]:
+    for k, step in enumerate(steps[11:], 1):
         tracker.predict(step.imu, step.t_ns)
         visual = camera_scaled(step.visual, 1.0 / total, T_B_C[:3, 3])
         tracker.update(step.t_ns, visual, in_unit(step.points, total))
+        if k % corrected_every == 0:
+            tracker.scale_map(1.0)
         found = tracker.scale_correction()
         if found is not None:
             factor, sigma = found

@@ -264,7 +264,7 @@ class InertialTracker:
             return
         camera = self._last[1][:3, 3] + self._last[1][:3, :3] @ self._p_b_c
         self._smoother.scale_map(factor, camera)
-        self._scale.rescale(factor)
+        self._scale.scale_map(factor)
         if self._scale_from is not None:
             self._scale_from = self._scale_from[0], camera_scaled(self._scale_from[1], factor, self._p_b_c, camera)
 
@@ -315,7 +315,7 @@ class InertialTracker:
             return
         self._last = (self._last[0], camera_scaled(self._last[1], scale, self._p_b_c))
         self._scale_from = None
-        self._scale.rescale(scale)
+        self._scale.correct(scale)
         if self._smoother.running:
             state, gravity = self._smoother.state, self._smoother.gravity
             velocity = scale * state.velocity

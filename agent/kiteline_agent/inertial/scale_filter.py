@@ -36,7 +36,7 @@ class ScaleFilter:
         self._cov = np.eye(10)
         self._inflation = config.imu_inflation
         self.running = False
-        self.age_s = 0.0  # since the start or the last correction
+        self.age_s = 0.0  # since the start or the last correction of its own
 
     @property
     def scale(self) -> tuple[float, float]:
@@ -114,9 +114,13 @@ class ScaleFilter:
         cov = (cov - gain @ h @ cov)[:10, :10]
         self._cov = 0.5 * (cov + cov.T)
 
-    def rescale(self, factor: float) -> None:
-        """The map was scaled by `factor`."""
+    def correct(self, factor: float) -> None:
+        """The map was scaled by `factor`, which was found here: the next correction waits."""
         self.age_s = 0.0
+        self.scale_map(factor)
+
+    def scale_map(self, factor: float) -> None:
+        """The map was scaled by `factor`."""
         self._x[_UNITS] *= factor
         self._cov[_UNITS] *= factor
         self._cov[:, _UNITS] *= factor
