@@ -214,10 +214,38 @@ def test_an_estimate_here_replaces_one_of_the_base_once_more_is_known() -> None:
     assert not np.array_equal(flight.map.disparity_offset, 0.5 * WORN)
 
 
-def test_forward_motion_alone_changes_nothing() -> None:
+def test_forward_motion_alone_never_tells_of_a_worn_rig() -> None:
     flight = Flight(WORN, 1, AHEAD)
-    assert flight.fly(60) == []
-    assert flight.map.disparity_offset.tolist() == [0.0] * 5
+    assert flight.fly(60)  # as far off as good calibrations may be
+    assert flight.alignment.is_good_offset and flight.alignment.applied_sigma_px is None
+    good_px = np.full(TERMS, DisparityConfig().good_px)
+    assert np.sqrt(np.mean((flight.map.disparity_offset / good_px) ** 2)) < 3.0
+
+
+@pytest.mark.parametrize(("way", "share"), [(SIDEWAYS, 0.5), (AHEAD, 0.7)])
+@pytest.mark.parametrize("seed", range(3))
+def test_an_offset_that_a_good_calibration_may_have_is_reduced(seed: int, way: F64, share: float) -> None:
+    off = np.array([-0.15, -0.1, 0.1, -0.15, 0.0])
+    flight = Flight(off, seed, way)
+    assert flight.fly(80)
+    assert flight.alignment.is_good_offset and not flight.alignment.applied
+    grid = terms(normalised(np.array([[x, y] for x in (60.0, 376.0, 690.0) for y in (60.0, 240.0, 420.0)])))
+    left = np.sqrt(np.mean((grid @ (off - flight.map.disparity_offset)) ** 2))
+    assert left < share * np.sqrt(np.mean((grid @ off) ** 2))
+
+
+def test_a_good_calibration_s_offset_begins_at_what_the_base_tells() -> None:
+    off = np.array([-0.15, -0.1, 0.1, -0.15, 0.0])
+    flight = Flight(off, 0, AHEAD)
+    assert flight.alignment.take_base(off, None)
+    assert flight.fly(80) == []
+    assert np.array_equal(flight.map.disparity_offset, off)
+    wrong = Flight(off, 0, AHEAD)
+    assert wrong.alignment.take_base(-off, None)
+    assert wrong.fly(80) and wrong.alignment.is_good_offset
+    worn = Flight(off, 0, AHEAD)
+    assert worn.alignment.take_base(-off, 0.05)  # a worn rig's, which the base is sure of
+    assert worn.fly(80) == []
 
 
 def test_forward_motion_is_believed_where_rows_are_those_of_a_worn_rig() -> None:
@@ -225,12 +253,14 @@ def test_forward_motion_is_believed_where_rows_are_those_of_a_worn_rig() -> None
     for evidence, corrected in ((4.0, False), (9.0, True)):
         flight = Flight(WORN, 1, AHEAD)
         flight.alignment.add_row_evidence(evidence)
-        assert bool(flight.fly(60)) == corrected
+        flight.fly(60)
+        assert flight.alignment.applied == corrected
         left = np.sqrt(np.mean((grid @ (WORN - flight.map.disparity_offset)) ** 2))
         assert (left < 0.3 * np.sqrt(np.mean((grid @ WORN) ** 2))) == corrected
     good = Flight(NOTHING, 1, AHEAD)
     good.alignment.add_row_evidence(9.0)
-    assert good.fly(60) == []  # disparities have to tell, too
+    good.fly(60)
+    assert not good.alignment.applied  # disparities have to tell, too
 
 
 def test_the_base_s_map_is_left_to_the_base() -> None:
@@ -293,8 +323,8 @@ def begun(offset: F64, seed: int, way: F64) -> Flight:
 def test_a_rig_that_was_repaired_is_found_anew() -> None:
     good = begun(NOTHING, 2, SIDEWAYS)
     good.fly(80)
-    assert not good.map.disparity_offset.any()
-    assert good.alignment.applied_sigma_px is None
+    assert np.abs(good.map.disparity_offset).max() < 0.05
+    assert good.alignment.applied_sigma_px is None and good.alignment.is_good_offset
     assert good.alignment.worn < 0.2
     bent = begun(-WORN, 2, SIDEWAYS)
     bent.fly(80)

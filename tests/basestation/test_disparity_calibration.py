@@ -138,6 +138,28 @@ def test_what_an_agent_found_counts_until_the_base_knows_more(make_flight: MakeF
     assert not np.array_equal(mapper.map.disparity_offset_px[flight.agent], close)
 
 
+def test_the_offset_of_a_good_calibration_is_the_agent_s_while_it_flies(make_flight: MakeFlight, words: Any) -> None:
+    flight = make_flight(keyframes=30, points=1200, memory=8, drift_m=0.001, noise_px=0.2)
+    good, later, worn = (np.array([-0.1, 0.05, -0.1, -0.15, 0.0]) * k for k in (1.0, 1.3, 6.0))
+
+    def said(offset: F64) -> StereoAlignment:
+        return StereoAlignment(flight.agent, NONE, False, offset, None, good_calibration=True)
+
+    mapper = Mapper(WITHOUT_GRID, words)
+    fly(mapper, flight, good, (said(good),))
+    of = mapper.map
+    assert np.array_equal(of.disparity_offset_px[flight.agent], good) and flight.agent not in of.disparity_sigma_px
+    assert np.array_equal(of.offset_measured_with(of.submaps[next(iter(of.submaps))][-1]), good)
+    of.set_stereo_alignment(said(later))
+    assert np.array_equal(of.disparity_offset_px[flight.agent], later) and not prior_mean(of, flight.agent).any()
+    sent = [r for _, records in mapper.step(MapperInput(()), 10**11).publish for r in records]
+    assert not any(isinstance(r, DisparityCalibration) for r in sent)
+    of.set_stereo_alignment(StereoAlignment(flight.agent, NONE, False, worn, 0.1))
+    assert np.array_equal(of.disparity_offset_px[flight.agent], worn) and of.disparity_sigma_px[flight.agent] == 0.1
+    of.set_stereo_alignment(said(good))  # it was no worn rig, or one that was repaired
+    assert np.array_equal(of.disparity_offset_px[flight.agent], good) and not of.disparity_sigma_px
+
+
 def test_a_rig_that_was_repaired_is_not_held_to_earlier_flights(make_flight: MakeFlight, words: Any) -> None:
     flight = make_flight(keyframes=4, points=200, memory=4, drift_m=0.001, noise_px=0.2)
     known = np.array([-0.6, 0.1, -0.2, -0.5, 0.8])

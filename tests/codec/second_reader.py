@@ -272,7 +272,8 @@ def read_code(kind: int, id_: int, data: bytes, part: int = 0) -> dict[str, Any]
         out["turn"], out["moved"], out["velocity"] = c[:, 1:4] / 2**14, c[:, 4:7] / 2**13, v
         out["position"] = c[:, 10:] / 2**15 + v * out["dt_s"][:, None] / 2
     elif kind == 9:
-        out["rows_read"] = s.u8() == 1
+        flags = s.u8()
+        out["rows_read"], out["good_calibration"] = bool(flags & 1), bool(flags & 2)
         out["rows_px"], out["disparity_px"] = ([s.signed() / 1024 for _ in range(5)] for _ in range(2))
         out["sigma_px"] = s.varint() / 1024 or None
     elif kind == 10:

@@ -47,6 +47,8 @@ class RightCamera:
         self._map.set_disparity_offset(known.disparity)
         if self.disparities is not None and known.disparity_sigma_px > 0.0:
             self.disparities.begin_with(known.disparity, known.disparity_sigma_px)
+        elif self.disparities is not None:
+            self.disparities.expected_px = known.disparity
         self._found_px = known.disparity
         self._put(known.rows)
 
@@ -63,10 +65,11 @@ class RightCamera:
             covariance.set_disparity_error(disparities.expected_cov, disparities.rig_worn)
             return False, []
         # the odometry frame keeps the error that the map had until now
-        covariance.set_disparity_error(disparities.cov + np.outer(change, change), disparities.rig_worn)
+        covariance.set_disparity_error(disparities.expected_cov + np.outer(change, change), disparities.rig_worn)
         self._camera.correct_disparities(change)
         covariance.set_disparity_error(disparities.expected_cov, disparities.rig_worn)
-        self._found_px, self._sigma_px = self._map.disparity_offset, self.disparities.sigma_px
+        self._found_px = self._map.disparity_offset
+        self._sigma_px = disparities.sigma_px if disparities.applied else None
         self._put(self.rows.estimate_px)
         return True, self.disparities.take_events()
 
@@ -96,7 +99,8 @@ class RightCamera:
         return [f"disparities in the middle are {record.disparity_px[0]:+.3f} px too large"]
 
     def _put(self, rows_px: F64) -> None:
-        self._channel.put(StereoAlignment(self._agent, rows_px, self.rows.read, self._found_px, self._sigma_px))
+        good = self.disparities is not None and self.disparities.is_good_offset
+        self._channel.put(StereoAlignment(self._agent, rows_px, self.rows.read, self._found_px, self._sigma_px, good))
 
     def known(self) -> KnownRigConfig | None:
         """What is known now, for the next flight; None before anything was measured."""
@@ -104,4 +108,8 @@ class RightCamera:
             return None
         sigma_px = None if self.disparities is None else self.disparities.applied_sigma_px
         offset_px = self._map.disparity_offset
+        if self.disparities is not None and self.disparities.is_good_offset:
+            offset_px = (
+                self.disparities.expected_px
+            )  # the rest may be hardly determined: each flight finds it for itself
         return known_rig(self._map.camera, self.rows.estimate_px, offset_px, sigma_px, rows_read=self.rows.read)

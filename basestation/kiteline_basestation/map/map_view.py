@@ -90,6 +90,7 @@ class MapView:
         self.disparity_calibrated: set[AgentId] = set()  # agents with an accurate disparity offset
         self.disparity_sigma_px: dict[AgentId, float] = {}  # its deviation, rms over the image, if the rig is worn
         self.known_offset_px: dict[AgentId, F64] = {}  # (5,) by agent: that of earlier flights, or found on board
+        self.good_offset_px: dict[AgentId, F64] = {}  # (5,) by agent: a good calibration's, found on board
         self.onboard_sigma_px: dict[AgentId, float] = {}  # deviation of a known offset that was found on board
         self.measured_with_px: dict[
             KeyframeId, F64
@@ -352,7 +353,14 @@ class MapView:
 
     def is_onboard_offset(self, agent: AgentId) -> bool:
         """True if the disparity offset of an agent is the one that it found on board, unchanged."""
-        return agent in self.onboard_sigma_px and self.disparity_offset_px[agent] is self.known_offset_px[agent]
+        offset = self.disparity_offset_px[agent]
+        if agent in self.onboard_sigma_px:
+            return offset is self.known_offset_px[agent]
+        return self.is_good_offset(agent)
+
+    def is_good_offset(self, agent: AgentId) -> bool:
+        """True if the disparity offset of an agent is a good calibration's that it found on board, unchanged."""
+        return self.disparity_offset_px[agent] is self.good_offset_px.get(agent)
 
     def offset_measured_with(self, keyframe: KeyframeId) -> F64:
         """Disparity offset (5,) px that an agent corrected for when it measured the motion to a keyframe.

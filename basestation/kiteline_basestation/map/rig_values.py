@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from kiteline_basestation.map.map_view import MapView
 from kiteline_codec.schema import StereoAlignment
 from kiteline_core.geometry import disparity_offset
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import AgentId, agent_of_keyframe
+
+F64 = NDArray[np.float64]
 
 _REPAIRED_PX = 0.5  # difference of a number of a disparity offset; flights of one rig differ by a tenth
 
@@ -26,6 +29,7 @@ class RigValues(MapView):
             self.rows_px.pop(agent, None)
             self.rows_read.discard(agent)
             self.known_offset_px.pop(agent, None)
+            self.good_offset_px.pop(agent, None)
             self.onboard_sigma_px.pop(agent, None)
             self.disparity_sigma_px.pop(agent, None)
             if agent in self.disparity_offset_px:
@@ -39,13 +43,16 @@ class RigValues(MapView):
     def set_stereo_alignment(self, record: StereoAlignment) -> None:
         """Set what an agent knows of its right camera. A disparity offset of earlier flights that was estimated here
         counts more, unless the rig was repaired since; one that the agent finds in this flight counts until the offset
-        is better known here.
+        is better known here. A good calibration's counts unless a worn rig's is known here.
         """
         agent = record.agent
         self.rows_px[agent] = record.rows_px
         self.rows_read.discard(agent)
         if record.rows_read:
             self.rows_read.add(agent)
+        if record.good_calibration:
+            self._set_good_offset(agent, record.disparity_px)
+            return
         if record.sigma_px is None and not np.any(record.disparity_px != 0.0):
             return
         if agent not in self.disparity_offset_px and record.sigma_px is None:
@@ -61,6 +68,21 @@ class RigValues(MapView):
         if self.disparity_sigma_px.get(agent, np.inf) > record.sigma_px:
             self.disparity_offset_px[agent], self.disparity_sigma_px[agent] = record.disparity_px, record.sigma_px
             self.disparity_calibrated.discard(agent)
+
+    def _set_good_offset(self, agent: AgentId, offset: F64) -> None:
+        """Set a good calibration's offset (5,) px that the agent found, in place of a worn rig's that was repaired."""
+        known = self.known_offset_px.get(agent)
+        if known is not None and np.abs(offset - known).max() >= _REPAIRED_PX:
+            for values in (
+                self.known_offset_px,
+                self.onboard_sigma_px,
+                self.disparity_sigma_px,
+                self.disparity_offset_px,
+            ):
+                values.pop(agent, None)
+            self.disparity_calibrated.discard(agent)
+        if agent not in self.disparity_sigma_px:
+            self.disparity_offset_px[agent] = self.good_offset_px[agent] = offset
 
 
 def parameters(camera: RectifiedCamera) -> tuple[float, float, float, float, float]:

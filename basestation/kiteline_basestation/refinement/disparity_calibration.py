@@ -47,14 +47,16 @@ def offsets(sparse_map: SparseMap, slots: I32) -> F64:
 def with_border(
     sparse_map: SparseMap, slots: I32, problem: BundleProblem, config: DisparityConfig
 ) -> tuple[BundleProblem, tuple[AgentId, ...]]:  # fmt: skip
-    """Add the disparity offsets of all agents of a problem as unknowns. Returns it and these agents, in order.
+    """Add the disparity offsets of a problem's agents as unknowns. Returns it and these agents, in order.
 
+    Without those who found a good calibration's themselves: pairs of frames tell it sooner and better than keyframes.
     slots: (m,) of the problem's observations.
     """
     table = sparse_map.keypoints
     rows = table.row[slots]
-    ranged = problem.measured[:, 2] >= 0
     of = _agents(sparse_map, slots)
+    told = [a for a in sparse_map.disparity_offset_px if sparse_map.is_good_offset(a)]
+    ranged = (problem.measured[:, 2] >= 0) & ~np.isin(of, told)
     agents = tuple(AgentId(a) for a in np.unique(of[ranged]).tolist())
     if not agents:
         return problem, ()
@@ -63,13 +65,13 @@ def with_border(
     measured[ranged, 2] = (sparse_map.keyframes.camera[rows, 4] * table.inv_depth[slots])[ranged]
     focal = float(np.median(sparse_map.keyframes.camera[rows, 0]))
     prior = _prior_px(focal)
-    told = [sparse_map.onboard_sigma_px.get(a) for a in agents]
-    sigma = np.stack([prior if s is None else np.full(TERMS, s) for s in told])
+    onboard = [sparse_map.onboard_sigma_px.get(a) for a in agents]
+    sigma = np.stack([prior if s is None else np.full(TERMS, s) for s in onboard])
     start = np.stack([sparse_map.disparity_offset_px.get(a, none()) for a in agents])
     mean = np.stack([prior_mean(sparse_map, a) for a in agents])
     tells = sideways_share(problem.T_c_m) >= config.min_sideways
     # What was found on board rests on this flight: data that contradict it are the fewer ones.
-    believed = np.array([s is None and (tells or has_bent(sparse_map, a)) for a, s in zip(agents, told)])
+    believed = np.array([s is None and (tells or has_bent(sparse_map, a)) for a, s in zip(agents, onboard)])
     border = Border(
         group, at_keypoints(sparse_map, slots), start, sigma / config.inflation, config.tail, config.determined,
         config.worn, np.where(believed, config.inflation**2 * config.contradicts, np.inf), mean,

@@ -110,6 +110,7 @@ def some_records(seed: int, n: int) -> list[Record]:
             np.array([0.0, 1.0, -9.0, 64.0, 2.0]) / 1024.0,
         ),
         StereoAlignment(AgentId(6), np.zeros(5), False, np.array([0.0, 1.0, -9.0, 64.0, 2.0]) / 1024.0, 0.25),
+        StereoAlignment(AgentId(7), np.zeros(5), True, np.array([0.0, 1.0, -9.0, 64.0, 2.0]) / 1024.0, None, True),
         KeyframePose(keyframe, pose),
         RefinedLandmarks(keyframe, index, inv_depth, rng.normal(0, 1, (n, 2)).astype(np.float32)),
         FusedLandmarks(keyframe, index, point),
