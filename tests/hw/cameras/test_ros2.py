@@ -224,7 +224,8 @@ def test_rates_and_accelerations_of_two_topics_are_joined(graph: Graph, calibrat
     assert isinstance(source, RosSource)
     begun(source, graph, 3)
     t_ns = time.time_ns() - 100_000_000
-    inertial(graph, "/accel/sample", t_ns, 0.0, 8.0)
+    # Before the first rate by more than the two clocks' difference is uncertain by.
+    inertial(graph, "/accel/sample", t_ns - 5_000_000, 0.0, 7.0)
     for k in range(4):
         inertial(graph, "/gyro/sample", t_ns + 5_000_000 * k, 0.1 * k, 0.0)
     inertial(graph, "/accel/sample", t_ns + 20_000_000, 0.0, 12.0)
