@@ -31,10 +31,12 @@ from kiteline_lab.flights.plan import Options, plan
 F64 = NDArray[np.float64]
 
 FOLDER = Path("tests/references/kept")
-IMAGES = "images.mcap"  # of all kept flights but one
+IMAGES = "images.mcap"  # of most kept flights
 LEFT_IMAGES = "images-left.mcap"  # one camera takes 3 s to find its scale: fewer and longer
+STREET_IMAGES = "images-street.mcap"  # a car's: keyframes come fast, and it is seen far
 FRAMES, DEPTH_FRAMES = 32, 14  # frames of it, and of them those with depth
 LEFT_FRAMES = 35  # of the latter, every second one of the simulation
+STREET_FRAMES, _STREET_HZ = 36, 10.0
 _RATE_HZ = 20.0
 _QUALITY = 40  # of WebP: 4 kB an image
 _DEPTH_STEPS = 50.0  # per metre: steps of 2 cm, which a depth camera has, and which compress well
@@ -69,8 +71,8 @@ FLIGHTS = (
                options={"imu": False}),
     KeptFlight("lossy", "a stereo pair with an IMU, a base on a slow link that loses a fifth of the packets",
                options={"profile": "radio", "up_bytes_s": 6000, "down_bytes_s": 3000, "loss": 0.2, "delay_s": 0.05}),
-    KeptFlight("two-agents", "two stereo pairs without IMU on one path, whose maps are merged",
-               ((0, 20), (10, 30)), options={"imu": False}),
+    KeptFlight("two-agents", "two stereo pairs without IMU on one street, whose maps are merged",
+               ((0, 30), (6, STREET_FRAMES)), options={"imu": False}, images=STREET_IMAGES),
     KeptFlight("ekf", "one camera with an odometer and the Kalman tracker, a base on a wide link",
                odometer=True, options={"mono": True, "imu": False, "tracker": "ekf"}),
 )  # fmt: skip
@@ -150,7 +152,7 @@ def _depth_images(file: Path) -> dict[int, EncodedImage]:
 
 def _write_images(path: Path) -> None:
     """Simulate the flight and encode its images small."""
-    few = path.name == LEFT_IMAGES
+    few, street = path.name == LEFT_IMAGES, path.name == STREET_IMAGES
     with tempfile.TemporaryDirectory(prefix="kiteline-references-") as scratch:
         trajectory = Path(scratch) / "path.txt"
         _write_path(trajectory)
@@ -158,8 +160,11 @@ def _write_images(path: Path) -> None:
         workers = os.cpu_count() or 1
         if few:
             options |= {"mono": True, "odometry": 0.0, "seconds": 2 * LEFT_FRAMES / _RATE_HZ}
-        source = open_sim("room", workers, **options)
-        depths = {} if few else _simulated_depths(options, workers)
+        if street:
+            options |= {"trajectory": "", "rate": _STREET_HZ, "imu": False, "odometry": 0.0}
+            options["seconds"] = STREET_FRAMES / _STREET_HZ
+        source = open_sim("street" if street else "room", workers, **options)
+        depths = {} if few or street else _simulated_depths(options, workers)
     truth, number = source.ground_truth, 0
     assert truth is not None
     samples: list[ImuBatch] = []
