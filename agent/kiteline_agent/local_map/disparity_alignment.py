@@ -69,9 +69,9 @@ class DisparityAlignment:
         self._grid = terms(np.stack([(x.ravel() - camera.cx) / camera.fx, (y.ravel() - camera.cy) / camera.fy], 1))
         self._frames = 0
         self._estimate, self.cov = none(), np.linalg.inv(self._prior)
-        # If the rig is not worn: what was expected of it, its most probable offset, and the logarithm of the likelihood
-        # of another offset than the expected one over that of this.
-        self.expected_px, self._good_estimate, self._good_evidence = none(), none(), 0.0
+        # If the rig is not worn: what was expected of it, its most probable offset, and whether another one than the
+        # expected is likelier and is known better than it differs.
+        self.expected_px, self._good_estimate, self._good_is_known = none(), none(), False
         self._prior_log_odds = math.log(config.worn_share / (1.0 - config.worn_share))  # of a worn rig
         self._log_odds = self._prior_log_odds  # by disparities alone
         self.worn = self.rig_worn = config.worn_share  # probability of it: by disparities alone, and with rows
@@ -128,7 +128,7 @@ class DisparityAlignment:
     @property
     def sigma_px(self) -> float:
         """Standard deviation of the estimate, rms over the image."""
-        return float(np.sqrt(np.mean(np.einsum("ni,ij,nj->n", self._grid, self.cov, self._grid))))
+        return self._rms_px(np.asarray(self.cov))
 
     @property
     def applied_sigma_px(self) -> float | None:
@@ -137,6 +137,13 @@ class DisparityAlignment:
         if base is not None:
             return base if np.isfinite(base) else None
         return self.sigma_px if self.applied else None
+
+    def moves_map(self, change: F64) -> bool:
+        """True if keyframes and camera move by the effect of a change (5,) px of the offset.
+
+        Not by the small ones of a good calibration: their effect on poses is less than what it is known to.
+        """
+        return self.applied or self._rms_px(np.outer(change, change)) >= _LEAST_PX
 
     def take_base(self, offset: F64, sigma_px: float | None) -> bool:
         """Set the map's offset to the base's (5,), unless more is known here. Returns whether it was set.
@@ -231,8 +238,10 @@ class DisparityAlignment:
         good = self._good
         h, b = self._evicted_h + self._pair_h.sum(0), self._evicted_b + self._pair_b.sum(0)
         beyond = b - h @ self.expected_px
-        self._good_estimate = self.expected_px + np.linalg.solve(h + good, beyond)
-        self._good_evidence = _log_evidence(h, beyond, good)
+        good_cov = np.linalg.inv(h + good)
+        self._good_estimate = self.expected_px + good_cov @ beyond
+        is_larger = self._rms_px(np.outer(good_cov @ beyond, good_cov @ beyond)) > self._rms_px(good_cov)
+        self._good_is_known = is_larger and _log_evidence(h, beyond, good) > 0.0
         log_odds = self._prior_log_odds
         if self._earlier_h.any() and self._moves_sideways():
             worn, usual = _log_evidence(h, b, self._prior), _log_evidence(h, b, good)
@@ -299,13 +308,17 @@ class DisparityAlignment:
         return change
 
     def _apply_good(self) -> F64 | None:
-        """Set the most probable offset of a good calibration, if one is likelier than the expected one."""
-        if not self._refuted and self._good_evidence < 0.0:
+        """Set the most probable offset of a good calibration, if it is known."""
+        if not (self._good_is_known or self._refuted):
             return None
         change = self._set(self._good_estimate, _LEAST_CHANGE_PX)
         if change is not None:
             self.is_good_offset, self._refuted, self._base_sigma_px = True, False, None
         return change
+
+    def _rms_px(self, square: F64) -> float:
+        """Root of the mean over the image of an offset's square, told as the mean square (5,5) of its terms."""
+        return float(np.sqrt(np.mean(np.einsum("ni,ij,nj->n", self._grid, square, self._grid))))
 
     def _set(self, offset: F64, least_px: float) -> F64 | None:
         """Set the map's offset (5,); the change, None if it is less than least_px, rms over the image."""

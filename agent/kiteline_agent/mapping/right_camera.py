@@ -64,14 +64,16 @@ class RightCamera:
         if change is None:
             covariance.set_disparity_error(disparities.expected_cov, disparities.rig_worn)
             return False, []
-        # the odometry frame keeps the error that the map had until now
-        covariance.set_disparity_error(disparities.expected_cov + np.outer(change, change), disparities.rig_worn)
-        self._camera.correct_disparities(change)
+        moves = disparities.moves_map(change)
+        if moves:
+            # the odometry frame keeps the error that the map had until now
+            covariance.set_disparity_error(disparities.expected_cov + np.outer(change, change), disparities.rig_worn)
+            self._camera.correct_disparities(change)
         covariance.set_disparity_error(disparities.expected_cov, disparities.rig_worn)
         self._found_px = self._map.disparity_offset
         self._sigma_px = disparities.sigma_px if disparities.applied else None
         self._put(self.rows.estimate_px)
-        return True, self.disparities.take_events()
+        return moves, disparities.take_events()
 
     @property
     def disparity_cov(self) -> F64:
