@@ -243,6 +243,11 @@ def test_a_good_calibration_s_offset_begins_at_what_the_base_tells() -> None:
     wrong = Flight(off, 0, AHEAD)
     assert wrong.alignment.take_base(-off, None)
     assert wrong.fly(80) and wrong.alignment.is_good_offset
+    late = Flight(off, 0, AHEAD)
+    late.fly(40)
+    before = late.alignment.expected_px.copy()
+    assert late.alignment.take_base(-off, None)
+    assert np.array_equal(late.alignment.expected_px, before)  # the same flight tells both
     worn = Flight(off, 0, AHEAD)
     assert worn.alignment.take_base(-off, 0.05)  # a worn rig's, which the base is sure of
     assert worn.fly(80) == []

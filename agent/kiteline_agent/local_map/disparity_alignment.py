@@ -153,7 +153,8 @@ class DisparityAlignment:
         if self.applied and (sigma_px is None or sigma_px > self.sigma_px):
             return False
         self._base_sigma_px, self.is_good_offset = np.inf if sigma_px is None else sigma_px, False
-        self.expected_px = np.array(offset)
+        if not (self._pair_h.any() or self._evicted_h.any()):
+            self.expected_px = np.array(offset)  # of earlier flights: what this one tells would count twice
         self._map.set_disparity_offset(offset)
         self._map.held.offsets.base_knows_all()
         self.expected_cov = self._expected_cov()
