@@ -5,8 +5,8 @@ far landmarks, and of different parts of the image, contradict it. Each keyframe
 tells most: disparities of one keyframe have the same errors in all frames.
 
 A worn rig gets the estimate of a wide prior once it is sure to be worn. A good calibration is off by a tenth of a pixel
-all the same, 3 % of lengths at 20 m: it gets the most probable offset under the prior of good calibrations, as long as
-neither the base nor earlier flights know one.
+all the same, 3 % of lengths at 20 m: unless the rig is worn, it gets the most probable offset under the prior of good
+calibrations, about what earlier flights found.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class DisparityAlignment:
         self._frames = 0
         self._estimate, self.cov = none(), np.linalg.inv(self._prior)
         # If the rig is not worn: what was expected of it, its most probable offset, and whether another one than the
-        # expected is likelier and is known better than it differs.
+        # expected is likelier, and differs from that by more than its deviation.
         self.expected_px, self._good_estimate, self._good_is_known = none(), none(), False
         self._prior_log_odds = math.log(config.worn_share / (1.0 - config.worn_share))  # of a worn rig
         self._log_odds = self._prior_log_odds  # by disparities alone
@@ -283,8 +283,8 @@ class DisparityAlignment:
     def _expected_cov(self) -> F64:
         """(5,5) px^2: mean square of what the map's offset is off by, beside the error of a good calibration."""
         offset = self._map.disparity_offset
-        left = none() if self._base_sigma_px is not None else self._estimate - offset
         known = offset.any() and not self.is_good_offset
+        left = none() if known and self._base_sigma_px is not None else self._estimate - offset
         return np.asarray((1.0 if known else self.rig_worn) * (self.cov + np.outer(left, left)))
 
     def _apply(self) -> F64 | None:

@@ -111,7 +111,6 @@ class RightCamera:
         sigma_px = None if self.disparities is None else self.disparities.applied_sigma_px
         offset_px = self._map.disparity_offset
         if self.disparities is not None and self.disparities.is_good_offset:
-            offset_px = (
-                self.disparities.expected_px
-            )  # the rest may be hardly determined: each flight finds it for itself
+            # What this flight found beside it may be hardly determined: each flight finds that for itself.
+            offset_px = self.disparities.expected_px
         return known_rig(self._map.camera, self.rows.estimate_px, offset_px, sigma_px, rows_read=self.rows.read)

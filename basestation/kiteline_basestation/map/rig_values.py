@@ -73,13 +73,9 @@ class RigValues(MapView):
         """Set a good calibration's offset (5,) px that the agent found, in place of a worn rig's that was repaired."""
         known = self.known_offset_px.get(agent)
         if known is not None and np.abs(offset - known).max() >= _REPAIRED_PX:
-            for values in (
-                self.known_offset_px,
-                self.onboard_sigma_px,
-                self.disparity_sigma_px,
-                self.disparity_offset_px,
-            ):
-                values.pop(agent, None)
+            self.known_offset_px.pop(agent)
+            self.onboard_sigma_px.pop(agent, None)
+            self.disparity_sigma_px.pop(agent, None)
             self.disparity_calibrated.discard(agent)
         if agent not in self.disparity_sigma_px:
             self.disparity_offset_px[agent] = self.good_offset_px[agent] = offset
