@@ -214,7 +214,28 @@ def test_an_estimate_here_replaces_one_of_the_base_once_more_is_known() -> None:
     assert not np.array_equal(flight.map.disparity_offset, 0.5 * WORN)
 
 
-def test_forward_motion_alone_never_tells_of_a_worn_rig() -> None:
+@pytest.mark.parametrize("seed", range(3))
+def test_forward_motion_tells_of_a_worn_rig_that_is_far_off(seed: int) -> None:
+    flight = Flight(2.0 * WORN, seed, AHEAD)
+    flight.fly(80)
+    assert flight.alignment.applied and not flight.alignment.is_good_offset
+    grid = terms(normalised(np.array([[x, y] for x in (60.0, 376.0, 690.0) for y in (60.0, 240.0, 420.0)])))
+    left = np.sqrt(np.mean((grid @ (2.0 * WORN - flight.map.disparity_offset)) ** 2))
+    assert left < 0.3 * np.sqrt(np.mean((grid @ (2.0 * WORN)) ** 2))
+
+
+def test_forward_motion_leaves_what_sideways_motion_told() -> None:
+    flight = Flight(2.0 * WORN, 0, SIDEWAYS)
+    flight.fly(60)
+    before = flight.map.disparity_offset.copy()
+    assert flight.alignment.applied
+    flight.alignment._evicted_moved += [0.0, 0.0, 1e6]  # a long way ahead
+    flight.step = AHEAD
+    assert flight.fly(60) == []
+    assert np.array_equal(flight.map.disparity_offset, before)
+
+
+def test_forward_motion_does_not_tell_of_a_rig_that_is_worn_a_little() -> None:
     flight = Flight(WORN, 1, AHEAD)
     assert flight.fly(60)  # as far off as good calibrations may be
     assert flight.alignment.is_good_offset and flight.alignment.applied_sigma_px is None

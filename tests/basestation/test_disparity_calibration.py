@@ -267,3 +267,15 @@ def test_bent_rows_let_a_large_offset_be_found_whatever_the_motion(make_flight: 
         left.append(float(np.sqrt(np.mean(np.square(terms(CORNERS) @ error)))))
     assert left[1] < 0.1
     assert left[1] < 0.6 * left[0]
+
+
+def test_what_forward_motion_told_an_agent_does_not_bound_the_base(make_flight: MakeFlight, words: Any) -> None:
+    flight = make_flight(keyframes=14, points=1500, memory=8, drift_m=0.001, noise_px=0.2)
+    left = []
+    for min_sideways, sigma_px in ((2.0, 0.25), (2.0, 0.05), (0.0, 0.25)):
+        config = replace(BaseConfig().disparity, min_sideways=min_sideways)
+        mapper = Mapper(replace(WITHOUT_GRID, disparity=config), words)
+        fly(mapper, flight, 2.0 * WORN, (StereoAlignment(flight.agent, NONE, False, 0.8 * WORN, sigma_px),))
+        error = 2.0 * WORN - mapper.map.disparity_offset_px.get(AgentId(0), NONE)
+        left.append(float(np.sqrt(np.mean(np.square(terms(CORNERS) @ error)))))
+    assert left[0] < 0.5 * min(left[1:])  # known well, or told in sideways motion: as the agent told

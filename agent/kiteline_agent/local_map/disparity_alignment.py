@@ -33,7 +33,7 @@ _MIN_POINTS = 30  # landmarks of a pair; eleven numbers are estimated from them
 _USUAL_SQUARE = 0.45  # mean squared error above which a pair counts less before an offset is applied
 _KNOWN_PX = 0.1  # px; by which each number of an offset changes between two flights: mounts and temperature
 _PRIOR_PX = 0.9  # px; standard deviation of a constant offset of a worn rig: both centres moved
-_PRIOR_SLOPE_PX = 0.5  # px where x or y is 1; the same of the other terms
+_PRIOR_SLOPE_RAD = 1.1e-3  # rad; the same of the other terms: a right camera that is turned by 0.06 degrees
 _LEAST_CHANGE_PX = 0.04  # px, rms over the image; of a later change that is applied
 _ROWS_SURE = 0.99  # probability of a worn rig by rows alone, above which it is applied in any motion
 _INFLATION = 2.0  # factor on variances: templates and lens errors are common to neighbouring points
@@ -41,6 +41,7 @@ _ITERATIONS = 3  # Gauss-Newton steps; two converge from a scale that is off by 
 _REFUTED = 5.0  # log likelihood without earlier flights over that with them, from which those are dropped
 _LEAST_PX = 0.2  # px, rms over the image; of an offset that is applied: good calibrations have a tenth
 _MIN_SIDEWAYS = 0.2  # share of the motion across the optical axis below which errors of a lens pass for such
+_FORWARD_SHARE = 1.0 / 9.0  # of the information about a worn rig that is believed then: errors were three deviations
 
 
 class DisparityAlignment:
@@ -64,7 +65,7 @@ class DisparityAlignment:
         self._evicted_sure_h, self._evicted_sure_b = np.zeros((TERMS, TERMS)), np.zeros(TERMS)
         self._refuted = False  # earlier flights were of another rig; the map still has their offset
         self._good = np.eye(TERMS) / config.good_px**2
-        self._prior = np.diag(np.array([_PRIOR_PX, *[_PRIOR_SLOPE_PX] * (TERMS - 1)]) ** -2.0)
+        self._prior = np.diag(np.array([_PRIOR_PX, *[_PRIOR_SLOPE_RAD * camera.fx] * (TERMS - 1)]) ** -2.0)
         x, y = np.meshgrid(np.linspace(0.0, camera.width, 7), np.linspace(0.0, camera.height, 5))
         self._grid = terms(np.stack([(x.ravel() - camera.cx) / camera.fx, (y.ravel() - camera.cy) / camera.fy], 1))
         self._frames = 0
@@ -77,6 +78,7 @@ class DisparityAlignment:
         self.worn = self.rig_worn = config.worn_share  # probability of it: by disparities alone, and with rows
         self._row_evidence = 0.0  # see add_row_evidence
         self.applied = False  # the rig is worn: an offset found here was applied
+        self._applied_sigma_px = np.inf  # of the estimate that was applied
         self.is_good_offset = False  # the map's offset is a good calibration's, found here
         self._base_sigma_px: float | None = None  # of the map's offset, if the base found it; inf for a good rig's
         self.expected_cov = self._expected_cov()  # beside the error of a good calibration
@@ -251,7 +253,8 @@ class DisparityAlignment:
                 self._earlier_h, self._earlier_b = np.zeros_like(self._earlier_h), none()
                 self._refuted, self.applied = True, False
                 self._events.append("disparities are not those of the rig file: estimated anew")
-        h, b = h + self._earlier_h, b + self._earlier_b
+        share = self._believed_share()
+        h, b = share * h + self._earlier_h, share * b + self._earlier_b
         self.cov = np.linalg.inv(h + self._prior)
         self._estimate = self.cov @ b
         log_odds += _log_evidence(h, b, self._prior) - _log_evidence(h, b, good)
@@ -260,13 +263,26 @@ class DisparityAlignment:
         self._set_rig_worn()
 
     def _is_sure(self) -> bool:
-        """True if the rig is worn though pairs tell less whose landmarks fit badly: some may be on people who walk."""
-        if self.worn < self._config.sure:
+        """True if the rig is worn though pairs tell less whose landmarks fit badly: some may be on people who walk.
+
+        In forward motion, where disparities tell little, the rows of the right image count as well.
+        """
+        rows = 0.0 if self._moves_sideways() else self._row_evidence
+        if _probability(self._log_odds + rows) < self._config.sure:
             return False
-        h = self._evicted_sure_h + np.einsum("s,sij->ij", self._share, self._pair_h) + self._earlier_h
-        b = self._evicted_sure_b + self._share @ self._pair_b + self._earlier_b
+        share = self._believed_share()
+        h = share * (self._evicted_sure_h + np.einsum("s,sij->ij", self._share, self._pair_h)) + self._earlier_h
+        b = share * (self._evicted_sure_b + self._share @ self._pair_b) + self._earlier_b
         odds = self._prior_log_odds + _log_evidence(h, b, self._prior) - _log_evidence(h, b, self._good)
-        return _probability(odds) >= self._config.sure
+        return _probability(odds + rows) >= self._config.sure
+
+    def _believed_share(self) -> float:
+        """Share of the pairs' information that counts where a worn rig is told from a good one."""
+        return 1.0 if self._moves_sideways() else _FORWARD_SHARE
+
+    def _nothing_better_known(self) -> bool:
+        """True if neither earlier flights nor sideways motion told an offset that forward motion may not replace."""
+        return not self._earlier_h.any() and self.sigma_px <= self._applied_sigma_px
 
     def _set_rig_worn(self) -> None:
         self.rig_worn = _probability(self._log_odds + self._row_evidence)
@@ -292,9 +308,9 @@ class DisparityAlignment:
         if self._base_sigma_px is not None and self._base_sigma_px <= self.sigma_px:
             return None
         tells = self._moves_sideways() or self._rows_are_worn()
-        if tells and (self.applied or self._is_sure()):
+        if (tells and self.applied) or ((tells or self._nothing_better_known()) and self._is_sure()):
             return self._apply_worn()
-        # Forward motion never tells a worn rig from a good one: there the good one's offset is the better guess.
+        # Forward motion hardly tells a worn rig from a good one: until then the good one's offset is the better guess.
         doubtful = self.rig_worn > 0.5 if tells else self._refuted
         worn = self.applied or self._earlier_h.any() or np.isfinite(self._base_sigma_px or np.inf)
         return None if worn or doubtful else self._apply_good()
@@ -305,6 +321,7 @@ class DisparityAlignment:
         change = self._set(self._estimate, _LEAST_CHANGE_PX if found_here else _LEAST_PX)
         if change is not None:
             self.applied, self._refuted, self.is_good_offset, self._base_sigma_px = True, False, False, None
+            self._applied_sigma_px = self.sigma_px
             self._events.append(f"disparities in the middle are {self._estimate[0]:+.2f} px too large, by parallax")
         return change
 

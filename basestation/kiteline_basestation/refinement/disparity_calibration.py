@@ -66,10 +66,13 @@ def with_border(
     focal = float(np.median(sparse_map.keyframes.camera[rows, 0]))
     prior = _prior_px(focal)
     onboard = [sparse_map.onboard_sigma_px.get(a) for a in agents]
-    sigma = np.stack([prior if s is None else np.full(TERMS, s) for s in onboard])
+    tells = sideways_share(problem.T_c_m) >= config.min_sideways
+    worn = prior * config.worn  # where forward motion told an agent no more than that its rig is worn
+    sigma = np.stack([
+        prior if s is None else worn if s > _PRIOR_PX and not tells else np.full(TERMS, s) for s in onboard
+    ])  # fmt: skip
     start = np.stack([sparse_map.disparity_offset_px.get(a, none()) for a in agents])
     mean = np.stack([prior_mean(sparse_map, a) for a in agents])
-    tells = sideways_share(problem.T_c_m) >= config.min_sideways
     # What was found on board rests on this flight: data that contradict it are the fewer ones.
     believed = np.array([s is None and (tells or has_bent(sparse_map, a)) for a, s in zip(agents, onboard)])
     border = Border(
