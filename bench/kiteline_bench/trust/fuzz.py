@@ -13,9 +13,11 @@ import resource
 import shutil
 import time
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
-from functools import partial
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass, replace
+from functools import cache
+from multiprocessing import get_context
 from pathlib import Path
 from zlib import crc32
 
@@ -37,7 +39,7 @@ from kiteline_hw.ports import SourceError
 
 TITLE = "Fuzzing"
 INPUTS = 200_000  # some minutes
-ROUND = 200_000  # inputs after which the doors begin anew, and a run that is stopped can go on
+ROUND = 100_000  # inputs after which the doors begin anew; rounds run on all cores, and a run that is stopped goes on
 _TESTS = Path(__file__).resolve().parents[3] / "tests" / "codec"
 
 # Inputs of a door for each one of a door that opens files, which takes a millisecond: about the same time each.
@@ -67,15 +69,6 @@ class FuzzResult:
     slowest_s: float
     grown_mib: float
     slowest: str = ""  # the door of the slowest input
-
-    def with_round(self, found: FuzzResult, grown_mib: float) -> FuzzResult:
-        """This and a further round. grown_mib: of all rounds of this process."""
-        slower = found.slowest_s > self.slowest_s
-        return FuzzResult(
-            self.inputs + found.inputs, self.accepted + found.accepted, self.refused + found.refused,
-            self.failures + found.failures, max(self.slowest_s, found.slowest_s), max(self.grown_mib, grown_mib),
-            found.slowest if slower else self.slowest,
-        )  # fmt: skip
 
 
 def read_corpus(folder: Path) -> list[bytes]:
@@ -180,7 +173,7 @@ def mutate(data: bytes, draw: random.Random, most_bytes: int = _MAX_BYTES) -> by
 
 def fuzz(
     corpus: Sequence[bytes], values: Sequence[tuple[Key, bytes]], inputs: int, seed: int,
-    say: Callable[[int], None] | None = None, others: Sequence[Door] = (), turns: Mapping[str, int] | None = None,
+    others: Sequence[Door] = (), turns: Mapping[str, int] | None = None,
 ) -> FuzzResult:  # fmt: skip
     """Feed inputs drawn from a corpus to each decoder in turn, and to the other doors mutations of their samples.
 
@@ -233,8 +226,6 @@ def fuzz(
                     break
             elif n >= len(todo) - len(others):
                 targets.accepted += 1
-            if say is not None and i % 10_000 == 0:
-                say(i)
     grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
     return FuzzResult(inputs, targets.accepted, refused, failures, slowest, grown, slowest_door)
 
@@ -263,52 +254,92 @@ def _one(target: Target, data: bytes, draw: random.Random) -> str:
     return ""
 
 
-def read_state(path: Path) -> FuzzResult:
-    """What an earlier run has left; nothing where there is none. Raises SourceError."""
+def joined(rounds: Collection[FuzzResult]) -> FuzzResult:
+    """All rounds as one run."""
+    slowest = max(rounds, key=lambda r: r.slowest_s, default=FuzzResult(0, 0, 0, [], 0.0, 0.0))
+    return FuzzResult(
+        sum(r.inputs for r in rounds), sum(r.accepted for r in rounds), sum(r.refused for r in rounds),
+        [failure for r in rounds for failure in r.failures], slowest.slowest_s,
+        max((r.grown_mib for r in rounds), default=0.0), slowest.slowest,
+    )  # fmt: skip
+
+
+def read_rounds(path: Path) -> dict[int, FuzzResult]:
+    """The rounds that an earlier run has flown, by number; none where there is no such file. Raises SourceError."""
     try:
-        return FuzzResult(**json.loads(path.read_text())) if path.exists() else FuzzResult(0, 0, 0, [], 0.0, 0.0)
-    except (ValueError, TypeError) as error:
-        raise SourceError(f"{path}: no state of a fuzzing run; delete it to begin anew") from error
+        kept = json.loads(path.read_text()) if path.exists() else {}
+        return {int(number): FuzzResult(**found) for number, found in kept.items()}
+    except (ValueError, TypeError, AttributeError) as error:
+        raise SourceError(f"{path}: no rounds of a fuzzing run; delete it to begin anew") from error
 
 
-def _say(bench: Bench, done: int, inputs: int, in_round: int) -> None:
-    bench.say(f"fuzz: {done + in_round:,} of {inputs:,}")
+class _Worker:
+    """A process that fuzzes rounds, one after another."""
+
+    def __init__(self, folder: Path) -> None:
+        codec_warm.warm()  # a kernel that is compiled within a call would pass for a slow input
+        warm()
+        entries = json.loads((_TESTS / "golden" / "records.json").read_text())
+        self._values = [(Key(*e["key"]), bytes.fromhex(e["code"])) for e in entries]
+        self._corpus = read_corpus(_TESTS / "corpus")
+        own = folder / str(os.getpid())
+        own.mkdir()
+        self.doors = doors(own)
+        self._grown_mib = 0.0
+
+    def round(self, number: int, inputs: int) -> FuzzResult:
+        """Fuzz all doors with the seed of this round. grown_mib: in all rounds of this process."""
+        found = fuzz(self._corpus, self._values, inputs, seed=1 + number, others=self.doors, turns=TURNS)
+        self._grown_mib += found.grown_mib
+        return replace(found, grown_mib=self._grown_mib)
+
+
+@cache
+def _worker(folder: Path) -> _Worker:
+    """The one of this process: its memory is watched over all of its rounds."""
+    return _Worker(folder)
+
+
+def _round(folder: Path, number: int, inputs: int) -> tuple[int, FuzzResult, float]:
+    """Number and result of a round, and its CPU time in s."""
+    worker, begin_s = _worker(folder), time.process_time()
+    return number, worker.round(number, inputs), time.process_time() - begin_s
 
 
 def run(bench: Bench) -> list[Bar]:
-    """Feed all doors in turn; the corpus of packets and codes is that of the tests. With `--keep DIR` a run that was
-    stopped goes on where it was, in rounds with seeds of their own.
+    """Feed all doors in turn, on all cores; the corpus of packets and codes is that of the tests. With `--keep DIR` a
+    run that was stopped goes on where it was: rounds have seeds of their own.
     """
     if not _TESTS.is_dir():
         raise SourceError(f"no corpus in {_TESTS}: run this benchmark in a checkout of the sources")
-    entries = json.loads((_TESTS / "golden" / "records.json").read_text())
-    values = [(Key(*e["key"]), bytes.fromhex(e["code"])) for e in entries]
-    codec_warm.warm()  # a kernel that is compiled within a call would pass for a slow input
-    warm()
-    inputs, folder = bench.inputs or INPUTS, bench.folder / "fuzz"
+    inputs, folder, state = bench.inputs or INPUTS, bench.folder / "fuzz", bench.folder / "fuzz.json"
     shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir()
-    state, corpus, others = bench.folder / "fuzz.json", read_corpus(_TESTS / "corpus"), doors(folder)
-    total, grown_mib, begin_s = read_state(state), 0.0, time.process_time()
-    before = total.inputs
-    while total.inputs < inputs and len(total.failures) < _MOST_FAILURES:
-        done = total.inputs
-        found = fuzz(
-            corpus, values, min(ROUND, inputs - done), seed=1 + done // ROUND, others=others,
-            say=partial(_say, bench, done, inputs), turns=TURNS,
-        )  # fmt: skip
-        grown_mib += found.grown_mib  # in this process
-        total = total.with_round(found, grown_mib)
-        write_atomically(state, json.dumps(asdict(total)).encode())
+    folder.mkdir(parents=True)
+    sizes = {n: min(ROUND, inputs - n * ROUND) for n in range(-(-inputs // ROUND))}
+    rounds = {n: found for n, found in read_rounds(state).items() if sizes.get(n) == found.inputs}
+    todo = [n for n in sizes if n not in rounds]
+    flown, cpu_s = 0, 0.0
+    bench.say(f"fuzz: {inputs:,} inputs in {len(sizes)} rounds, {len(rounds)} of them done before")
+    with ProcessPoolExecutor(max(1, min(os.cpu_count() or 1, len(todo))), get_context("spawn")) as pool:
+        for done in as_completed([pool.submit(_round, folder, n, sizes[n]) for n in todo]):
+            number, found, took_s = done.result()
+            rounds[number], flown, cpu_s = found, flown + found.inputs, cpu_s + took_s
+            write_atomically(state, json.dumps({n: asdict(r) for n, r in rounds.items()}).encode())
+            bench.say(f"fuzz: {sum(r.inputs for r in rounds.values()):,} of {inputs:,}")
+            if len(joined(rounds.values()).failures) >= _MOST_FAILURES:
+                pool.shutdown(wait=True, cancel_futures=True)
+                break
+    total = joined([rounds[n] for n in sorted(rounds)])
     for failure in total.failures:
         bench.say(failure)
-    fed = {door.name: TURNS.get(door.name, 1) for door in others} | {n: TURNS[n] for n in TURNS}
-    each = ", ".join(f"{name} {total.inputs * n // sum(fed.values()):,}" for name, n in sorted(fed.items()))
-    rate = (total.inputs - before) / max(time.process_time() - begin_s, 1e-9)
-    bench.more.append(f"Inputs of each door, about: {each}. {rate:,.0f} a second of CPU.")
+    names = [target.__name__ for target in Targets([]).all()] + [door.name for door in doors(folder)]
+    turns = {name: TURNS.get(name, 1) for name in names}
+    each = ", ".join(f"{name} {total.inputs * n // sum(turns.values()):,}" for name, n in sorted(turns.items()))
+    rate = f" {flown / cpu_s:,.0f} a second of CPU." if cpu_s else ""
+    bench.more.append(f"Inputs of each door, about: {each}.{rate}")
     return [
         at_most("inputs that were neither read nor refused", len(total.failures), 0, "", 0),
-        at_most("memory grown", total.grown_mib, 64, "MiB", 1),
+        at_most("memory of a process, grown", total.grown_mib, 64, "MiB", 1),
         at_most(f"slowest input ({total.slowest}), CPU", total.slowest_s * 1e3, 1000, "ms", 1),
         Bar("read and refused", f"{inputs:,} inputs",
             f"{total.inputs:,}: {total.accepted:,} read, {total.refused:,} refused", total.inputs >= inputs),
