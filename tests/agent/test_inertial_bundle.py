@@ -281,3 +281,13 @@ def test_landmarks_are_placed_with_known_poses() -> None:
         good = corners.seen[k] & known
         off.append(np.linalg.norm(p[good, :2] / p[good, 2:] - corners.xy[k][good], axis=1) * FOCAL)
     assert np.median(np.concatenate(off)) < 6.0
+
+
+def test_a_landmark_that_diverges_is_not_computed_with_beyond_all_bounds() -> None:
+    corners, samples, _ = window(0)
+    problem = bundle(corners, samples)
+    found = problem.solve()
+    assert found is not None
+    system = problem._linearise(found.state, inertial=True)
+    far = problem._moved(found.state, np.zeros(len(system.b)), replace(system, bp=np.full_like(system.bp, 1e200)))
+    assert np.isfinite(problem._cost(far, inertial=True))

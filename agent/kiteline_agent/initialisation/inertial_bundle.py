@@ -31,6 +31,7 @@ I64 = NDArray[np.int64]
 
 _MAX_DAMPING = 1e4
 _PLACE_ITERATIONS = 4  # of landmarks alone
+_MOST_TANGENT, _MOST_RHO = 1e3, 1e6  # of a landmark that diverges, as people's do: it is left out, not computed with
 _MOST_GROWTH = 0.5  # of all lengths in one step
 _ROUNDS = 2  # in which corners are left out, each followed by another solution
 
@@ -347,7 +348,8 @@ class InertialBundle:
         return WindowState(
             R, p, v, state.accel_bias + x[:, 9:],
             state.gyro_bias + shared[:3], gravity,
-            state.m + landmark[:, :2], np.maximum((state.rho + landmark[:, 2]) / (1.0 + share), 1e-4), origin,
+            np.clip(state.m + landmark[:, :2], -_MOST_TANGENT, _MOST_TANGENT),
+            np.clip((state.rho + landmark[:, 2]) / (1.0 + share), 1e-4, _MOST_RHO), origin,
             state.lens + lens,
         )  # fmt: skip
 
