@@ -224,6 +224,21 @@ def test_forward_motion_tells_of_a_worn_rig_that_is_far_off(seed: int) -> None:
     assert left < 0.3 * np.sqrt(np.mean((grid @ (2.0 * WORN)) ** 2))
 
 
+def test_in_forward_motion_many_keyframes_tell_no_more_than_a_dozen() -> None:
+    found = {}
+    for name, way in (("ahead", AHEAD), ("sideways", SIDEWAYS)):
+        flight = Flight(NOTHING, 0, way)
+        flight.fly(40)
+        sigmas = []
+        for n in range(1, 49):  # keyframes that tell the same
+            flight.alignment._begin(0)
+            flight.alignment._keyframe[0] = -1 - n
+            flight.fly(40)
+            sigmas.append(flight.alignment.sigma_px)
+        found[name] = sigmas[-1] / sigmas[11]
+    assert found["ahead"] > 0.9 and found["sideways"] < 0.6
+
+
 def test_forward_motion_leaves_what_sideways_motion_told() -> None:
     flight = Flight(2.0 * WORN, 0, SIDEWAYS)
     flight.fly(60)

@@ -42,6 +42,7 @@ _REFUTED = 5.0  # log likelihood without earlier flights over that with them, fr
 _LEAST_PX = 0.2  # px, rms over the image; of an offset that is applied: good calibrations have a tenth
 _MIN_SIDEWAYS = 0.2  # share of the motion across the optical axis below which errors of a lens pass for such
 _FORWARD_SHARE = 1.0 / 9.0  # of the information about a worn rig that is believed then: errors were three deviations
+_FORWARD_KEYFRAMES = 12  # that tell something of their own then; more of them repeat errors of lens and tracks
 
 
 class DisparityAlignment:
@@ -59,6 +60,7 @@ class DisparityAlignment:
         # keyframes that were evicted, and of earlier flights.
         self._pair_h, self._pair_b = np.zeros((slots, TERMS, TERMS)), np.zeros((slots, TERMS))
         self._evicted_h, self._evicted_b, self._evicted_moved = np.zeros((TERMS, TERMS)), np.zeros(TERMS), np.zeros(3)
+        self._evicted = 0  # keyframes
         self._earlier_h, self._earlier_b = np.zeros((TERMS, TERMS)), np.zeros(TERMS)
         # Share of a pair's information that counts before an offset is applied; and what counted of those evicted.
         self._share = np.ones(slots)
@@ -174,6 +176,7 @@ class DisparityAlignment:
         self._evicted_sure_h += self._share[slot] * self._pair_h[slot]
         self._evicted_sure_b += self._share[slot] * self._pair_b[slot]
         self._evicted_moved += self._moved[slot]
+        self._evicted += int(self._score[slot] != 0.0)
         self._pair_h[slot], self._pair_b[slot], self._moved[slot] = 0.0, 0.0, 0.0
         self._keyframe[slot], self._parallax[slot], self._score[slot] = self._map.keyframe[slot], 0.0, 0.0
 
@@ -239,7 +242,8 @@ class DisparityAlignment:
         What earlier flights found is dropped if the flight is likelier without it: the rig was repaired.
         """
         good = self._good
-        h, b = self._evicted_h + self._pair_h.sum(0), self._evicted_b + self._pair_b.sum(0)
+        own = self._own_share()
+        h, b = own * (self._evicted_h + self._pair_h.sum(0)), own * (self._evicted_b + self._pair_b.sum(0))
         beyond = b - h @ self.expected_px
         good_cov = np.linalg.inv(h + good)
         self._good_estimate = self.expected_px + good_cov @ beyond
@@ -270,11 +274,16 @@ class DisparityAlignment:
         rows = 0.0 if self._moves_sideways() else self._row_evidence
         if _probability(self._log_odds + rows) < self._config.sure:
             return False
-        share = self._believed_share()
+        share = self._own_share() * self._believed_share()
         h = share * (self._evicted_sure_h + np.einsum("s,sij->ij", self._share, self._pair_h)) + self._earlier_h
         b = share * (self._evicted_sure_b + self._share @ self._pair_b) + self._earlier_b
         odds = self._prior_log_odds + _log_evidence(h, b, self._prior) - _log_evidence(h, b, self._good)
         return _probability(odds + rows) >= self._config.sure
+
+    def _own_share(self) -> float:
+        """Share of the pairs' information that does not repeat the errors of other keyframes."""
+        keyframes = self._evicted + np.count_nonzero(self._score)
+        return 1.0 if self._moves_sideways() else min(1.0, _FORWARD_KEYFRAMES / max(keyframes, 1))
 
     def _believed_share(self) -> float:
         """Share of the pairs' information that counts where a worn rig is told from a good one."""
