@@ -11,10 +11,14 @@ import signal
 import socket
 import sys
 import threading
+import weakref
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from types import FrameType
 from typing import Any, NoReturn
+
+_LLVM = f"{os.sep}llvmlite{os.sep}"  # in the paths of frames that hold native objects
+_AGAIN_S = 0.01  # s until a handler that could not raise is called again
 
 
 class StopSignal:
@@ -30,10 +34,14 @@ class StopSignal:
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, self._on_signal)
 
-    def _on_signal(self, number: int, frame: FrameType | None) -> None:
+    def set(self) -> None:
+        """Set the flag, as a signal does."""
         self._received = True
         with contextlib.suppress(BlockingIOError):
             os.write(self._waker, b"!")
+
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:
+        self.set()
 
     def __bool__(self) -> bool:
         return self._received
@@ -45,10 +53,31 @@ class StopSignal:
         return self._received
 
 
+def can_raise(frame: FrameType | None) -> bool:
+    """True if an exception raised by a signal handler in this frame reaches its callers and breaks nothing.
+
+    A callback of a native library and a finaliser swallow it, and an object of LLVM that is half freed is freed twice.
+    """
+    while frame is not None:
+        code = frame.f_code
+        if code.co_name == "__del__" or _LLVM in code.co_filename or code.co_filename == weakref.__file__:
+            return False
+        frame = frame.f_back
+    return True
+
+
+def deliver_again(number: int, handler: Callable[[int, FrameType | None], None]) -> None:
+    """Call a signal's handler again a moment later, by SIGALRM: where it was called it could not raise."""
+    signal.signal(signal.SIGALRM, lambda _, frame: handler(number, frame))
+    signal.setitimer(signal.ITIMER_REAL, _AGAIN_S)
+
+
 def exit_on_sigterm() -> None:
     """Turn SIGTERM into SystemExit in the main thread, so that `with` and `finally` close logs and sessions."""
 
     def on_signal(number: int, frame: FrameType | None) -> None:
+        if not can_raise(frame):
+            return deliver_again(number, on_signal)
         sys.exit(128 + number)
 
     signal.signal(signal.SIGTERM, on_signal)
