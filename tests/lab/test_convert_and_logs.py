@@ -126,6 +126,9 @@ def test_cut_takes_the_stretch_and_its_calibration(tmp_path: Path) -> None:
         logs.main(["cut", str(path), str(out), "--from", "7", "--force"])
     with pytest.raises(SourceError, match="expected --from before --to"):
         logs.main(["cut", str(path), str(out), "--from", "2", "--to", "1", "--force"])
+    for begin in ("-1e308", "1e308", "inf", "nan"):
+        with pytest.raises(SourceError, match="nothing"):
+            logs.main(["cut", str(path), str(out), f"--from={begin}", "--to=1e308", "--force"])
     with pytest.raises(SourceError, match="exists already"):
         logs.main(["cut", str(path), str(out)])
     assert numbers(out) == list(range(10, 21))

@@ -17,6 +17,8 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, NoReturn
 
+from kiteline_core.errors import KitelineError
+
 _LLVM = f"{os.sep}llvmlite{os.sep}"  # in the paths of frames that hold native objects
 _AGAIN_S = 0.01  # s until a handler that could not raise is called again
 
@@ -170,11 +172,25 @@ def is_stopped(pid: int | None) -> bool:
 
 
 def state_folder() -> Path:
-    """Folder for what survives a restart: a service's $STATE_DIRECTORY, else $XDG_STATE_HOME/kiteline."""
+    """Folder for what survives a restart: a service's $STATE_DIRECTORY, else that of the user. Raises KitelineError."""
     of_service = os.environ.get("STATE_DIRECTORY", "").split(":")[0]
-    if of_service:
-        return Path(of_service)
-    return Path(os.environ.get("XDG_STATE_HOME") or "~/.local/state").expanduser() / "kiteline"
+    return Path(of_service) if of_service else user_folder("XDG_STATE_HOME", "~/.local/state")
+
+
+def user_folder(variable: str, default: str) -> Path:
+    """kiteline's folder in the one that a variable names, else in the usual one of a user. Raises KitelineError."""
+    folder = home_path(os.environ.get(variable) or default)
+    if str(folder).startswith("~"):
+        raise KitelineError(f"this user has no home folder for {default}/kiteline: set HOME, or {variable}")
+    return folder / "kiteline"
+
+
+def home_path(text: str) -> Path:
+    """A path whose ~ or ~USER at the beginning is a home folder; as it stands where there is no such user."""
+    try:
+        return Path(text).expanduser()
+    except RuntimeError:
+        return Path(text)
 
 
 def print_lines(lines: Iterable[str]) -> None:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from kiteline_core.errors import KitelineError
 from kiteline_hw.system import process
 
 
@@ -32,6 +33,17 @@ def run(code: str, **options: object) -> subprocess.Popen[bytes]:
         [sys.executable, "-c", "from kiteline_hw.system import process\n" + code],
         env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
     )  # fmt: skip
+
+
+def test_a_user_without_a_home_is_told_what_to_set(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("STATE_DIRECTORY", "XDG_STATE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr("os.path.expanduser", lambda path: path)
+    with pytest.raises(KitelineError, match=r"no home folder .*: set HOME, or XDG_STATE_HOME"):
+        process.state_folder()
+    assert process.home_path("~nobody/flight.mcap") == Path("~nobody/flight.mcap")
+    monkeypatch.setenv("XDG_STATE_HOME", "/var/own")
+    assert process.state_folder() == Path("/var/own/kiteline")
 
 
 def test_a_signal_sets_the_flag_and_ends_a_wait() -> None:
