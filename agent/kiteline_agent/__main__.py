@@ -10,9 +10,9 @@ from kiteline_agent.runtime.live import fly_live
 from kiteline_agent.runtime.lockstep import fly_lockstep
 from kiteline_agent.runtime.options import AgentOptions, check, options_of, parser
 from kiteline_core import config as configuration
+from kiteline_core.errors import KitelineError
 from kiteline_hw.links.kinds import MAVLINK_FORMS, link_forms
 from kiteline_hw.links.sealing import sealing_of
-from kiteline_hw.ports import LinkError, SourceError
 from kiteline_hw.sources.kinds import source_forms
 from kiteline_hw.system import process
 from kiteline_hw.system.start_numbers import numbers_in
@@ -24,7 +24,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     a = p.parse_args(argv)
     if a.spec:
         options = configuration.from_json(AgentOptions, a.spec)
-        expected = (SourceError, LinkError, ValueError)
+        expected = (KitelineError, ValueError)
         process.exit_now(
             process.run_child(options.link, partial(fly_lockstep, options), partial(fly_live, options), expected)
         )

@@ -10,12 +10,10 @@ from functools import partial
 from kiteline_basestation.runtime.live import fly_live
 from kiteline_basestation.runtime.lockstep import fly_lockstep
 from kiteline_basestation.runtime.options import BaseOptions, options_of, parser
-from kiteline_basestation.store.checksums import StoreError
-from kiteline_codec.schema import WireError
 from kiteline_core import config as configuration
+from kiteline_core.errors import KitelineError
 from kiteline_hw.links.kinds import link_forms
 from kiteline_hw.links.sealing import sealing_of
-from kiteline_hw.ports import LinkError, SourceError
 from kiteline_hw.system import process
 from kiteline_hw.system.start_numbers import numbers_in
 
@@ -30,7 +28,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     a = p.parse_args(argv)
     if a.spec:
         options = configuration.from_json(BaseOptions, a.spec)
-        expected = (LinkError, SourceError, StoreError, WireError, ValueError)
+        expected = (KitelineError, ValueError)
         process.exit_now(
             process.run_child(options.link, partial(fly_lockstep, options), partial(fly_live, options), expected)
         )

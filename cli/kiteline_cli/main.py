@@ -9,6 +9,7 @@ import argparse
 import difflib
 import errno
 import importlib
+import io
 import os
 import pkgutil
 import signal
@@ -16,14 +17,17 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from types import FrameType, ModuleType
+from typing import NoReturn
 
 from kiteline_cli import commands
 from kiteline_core.errors import KitelineError
 from kiteline_hw.links.kinds import link_table
 from kiteline_hw.sources.kinds import source_table
+from kiteline_hw.system import process
 
 EXIT_ERROR = 2  # as argparse uses for a wrong command line
-EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells report it
+EXIT_SIGNAL = 128  # plus the number of the signal, as shells report it
+_TERMINATED = EXIT_SIGNAL + signal.SIGTERM
 _WHILE_WRITING = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)  # such errors of a disk name no file
 _IMPORTER = "<frozen importlib._bootstrap>"  # the file of frames that load a module
 
@@ -109,21 +113,41 @@ def main(argv: Sequence[str]) -> int:
         try:
             return _run(list(argv))
         finally:
-            sys.stdout.flush()  # here, where a closed pipe can be caught
+            if sys.stdout is not None:  # as it is where the caller has closed it
+                sys.stdout.flush()  # here, where a closed pipe can be caught
     except KeyboardInterrupt:
-        return EXIT_INTERRUPTED
+        return EXIT_SIGNAL + signal.SIGINT
+    except _Terminated:
+        return _TERMINATED
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python complains again at exit
         return EXIT_ERROR
 
 
-def _on_interrupt(number: int, frame: FrameType | None) -> None:
-    """Raise KeyboardInterrupt; while modules load, end at once: libraries swallow it there, or end with a traceback."""
+class _Terminated(BaseException):
+    """SIGTERM came."""
+
+
+def _on_signal(number: int, frame: FrameType | None) -> None:
+    """Raise KeyboardInterrupt, or _Terminated for SIGTERM: what is half written is removed on the way out.
+
+    While modules load, end at once: libraries swallow it there, or end with a traceback.
+    """
+    if not process.can_raise(frame):
+        return process.deliver_again(number, _on_signal)
     while frame is not None:
         if frame.f_code.co_filename == _IMPORTER:
-            os._exit(EXIT_INTERRUPTED)
+            _end(EXIT_SIGNAL + number)
         frame = frame.f_back
-    raise KeyboardInterrupt
+    raise KeyboardInterrupt if number == signal.SIGINT else _Terminated
+
+
+def _end(status: int) -> NoReturn:
+    """End the process at once; after SIGTERM by that signal, which systemd takes for an end in order."""
+    if status == _TERMINATED:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        os.kill(os.getpid(), signal.SIGTERM)
+    os._exit(status)
 
 
 def _run(rest: list[str]) -> int:
@@ -182,5 +206,12 @@ def _without_command(rest: list[str], names: list[str]) -> int:
 
 def run() -> None:
     """The command line of this process."""
-    signal.signal(signal.SIGINT, _on_interrupt)
-    sys.exit(main(sys.argv[1:]))
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, _on_signal)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # a terminal in ASCII, a file name in another encoding
+            stream.reconfigure(errors="backslashreplace")
+    status = main(sys.argv[1:])
+    if status == _TERMINATED:
+        _end(status)
+    sys.exit(status)

@@ -6,13 +6,13 @@ import argparse
 
 
 def limit(text: str) -> float:
-    """A number, 0 for no limit. Raises ArgumentTypeError for a negative one, for "nan" and for other text."""
+    """A number, 0 for no limit. Raises ArgumentTypeError for a negative one, "nan" and "inf", and for other text."""
     try:
         value = float(text)
     except ValueError:
         value = -1.0
-    if not value >= 0.0:
-        raise argparse.ArgumentTypeError(f"{text}: expected 0 (no limit) or more")
+    if not 0.0 <= value < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text[:40]}: expected 0 (no limit) or more")
     return value
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import difflib
 import json
 import math
+import re
 import tomllib
 import types
 from collections.abc import Mapping
@@ -15,10 +16,13 @@ from dataclasses import fields, is_dataclass, replace
 from enum import Enum
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from kiteline_core.errors import KitelineError
+from kiteline_core.errors import INPUT_FAULTS, KitelineError
 
 T = TypeVar("T")
 
+_MAX_LENGTH = 1 << 20  # of a file of options: all of them with their comments are a twentieth
+_MAX_DEPTH = 16  # of tables in tables; sections are four deep
+_MAX_DOTS = 256  # in a name: tomllib takes the square of their number
 ROOTS = frozenset({"agent", "base"})  # tables that a configuration file may have
 
 
@@ -67,16 +71,42 @@ def apply(config: T, table: Mapping[str, object], path: str = "") -> T:
         raise ConfigError(f"{_section(path)}: {error}") from error
 
 
-def load(config: T, text: str, root: str, name: str) -> T:
+def parse(content: str | bytes, name: str = "") -> dict[str, Any]:
+    """The tables of a TOML file, whatever it holds. name: of the file, for error texts. Raises ConfigError."""
+    where = f"{name}: " if name else ""
+    if len(content) > _MAX_LENGTH:
+        raise ConfigError(f"{where}no file of options is longer than {_MAX_LENGTH >> 20} MiB")
+    try:
+        text = content if isinstance(content, str) else content.decode()
+        if any(part.count(".") > _MAX_DOTS for part in re.split(r"[=,{}\n]", text)):
+            raise ConfigError(f"{where}no valid TOML: more than {_MAX_DOTS} dots in a name")
+        table = tomllib.loads(text)
+        _check_depth(table)
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{where}not a text file: {error}") from error
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{where}no valid TOML: {error}") from error
+    except (ValueError, *INPUT_FAULTS) as error:
+        raise ConfigError(f"{where}no valid TOML: tables too deep, or a number too long ({error})") from error
+    return table
+
+
+def _check_depth(table: dict[str, Any]) -> None:
+    """Raise ValueError where tables are in tables beyond any section's: dotted names make them as deep as one likes."""
+    level: list[Any] = [table]
+    for _ in range(_MAX_DEPTH):
+        level = [inner for outer in level if isinstance(outer, dict) for inner in outer.values()]
+    if any(isinstance(inner, dict) for inner in level):
+        raise ValueError(f"more than {_MAX_DEPTH} tables in each other")
+
+
+def load(config: T, text: str | bytes, root: str, name: str) -> T:
     """`config` with the values of the table [root] of a TOML text, as people write it.
 
     The text may have the tables [agent] and [base]. name: of the file, for error texts. Raises ConfigError as `apply`
     does, and for a number that is not finite, or negative where the default is not.
     """
-    try:
-        table = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{name}: no valid TOML: {error}") from error
+    table = parse(text, name)
     if unknown := set(table) - ROOTS:
         raise ConfigError(f"{name}: unknown table {sorted(unknown)}; known are: {', '.join(sorted(ROOTS))}")
     section = table.get(root, {})
@@ -91,7 +121,7 @@ def load(config: T, text: str, root: str, name: str) -> T:
 def of_log(config: T, text: str) -> T:
     """`config` with the values that a log holds as TOML. Raises ConfigError if a build with other options wrote it."""
     try:
-        return apply(config, tomllib.loads(text))
+        return apply(config, parse(text))
     except ConfigError as error:
         raise ConfigError(
             f"another build wrote this log ({error}): replay or import it with that build; the images of an agent's "

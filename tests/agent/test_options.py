@@ -28,6 +28,8 @@ def test_what_the_filter_has_no_use_for_is_refused(given: list[str], capsys: pyt
     [
         (["--cpu", "-5"], "--cpu: -5: expected 0"),
         (["--cpu", "nan"], "--cpu: nan: expected 0"),
+        (["--cpu", "inf"], "--cpu: inf: expected 0"),
+        (["--cpu", "1e999"], "--cpu: 1e999: expected 0"),
         (["--cpu", "half"], "--cpu: half: expected 0 (no limit) or more"),
         (["--up-bytes", "-1"], "--up-bytes: -1: expected 0"),
         (["--up-bytes", "1.5"], "--up-bytes: 1.5: expected a whole number, 0 (no limit) or more"),

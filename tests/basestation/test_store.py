@@ -93,6 +93,13 @@ def test_a_store_serves_one_base_and_any_number_of_readers(tmp_path: Path) -> No
     Store(tmp_path).close()
 
 
+@pytest.mark.parametrize("name", ["two words", "a?b#c%20", "two\nlines", "\udcff"])
+def test_a_store_in_a_folder_of_any_name(name: str, tmp_path: Path) -> None:
+    Store(tmp_path / name).close()
+    assert read(tmp_path / name) == SavedMap()
+    assert backup(tmp_path / name, tmp_path / f"{name}2") == SavedMap()
+
+
 def test_file_that_is_no_store_is_refused(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match="no such file"):
         read(tmp_path)

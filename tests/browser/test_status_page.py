@@ -19,7 +19,7 @@ from websockets.sync.client import ClientConnection, connect
 
 from kiteline_basestation.grid.grid_view import CodedTile, GridView
 from kiteline_basestation.grid.tile_store import Place
-from kiteline_basestation.web.server import Handle, address, serve
+from kiteline_basestation.web.server import MAX_UNANSWERED, Handle, address, serve
 from kiteline_basestation.web.snapshot import AgentStatus, PageSnapshot
 from kiteline_codec.schema import GridTile, messages
 from kiteline_core.ids import AgentId
@@ -141,6 +141,31 @@ def test_noise_on_the_port_does_no_harm(page: Handle) -> None:
         with socket.create_connection(("127.0.0.1", port), timeout=5) as s:
             s.sendall(noise)
     assert get(page, "/")[0] == 200
+
+
+def test_connections_that_ask_nothing_take_up_no_files(page: Handle, capfd: pytest.CaptureFixture[str]) -> None:
+    port = int(page.url.rsplit(":", 1)[1].rstrip("/"))
+    with ExitStack() as opened:
+        viewer = opened.enter_context(live(page))
+        many = [opened.enter_context(socket.create_connection(("127.0.0.1", port), timeout=5)) for _ in range(300)]
+        assert get(page, "/")[0] == 200
+        deadline = time.monotonic() + 3.0
+        while (n := sum(map(_is_open, many))) > MAX_UNANSWERED and time.monotonic() < deadline:
+            time.sleep(0.05)
+        assert n <= MAX_UNANSWERED
+        viewer.recv(5)
+    assert capfd.readouterr().err == ""
+
+
+def _is_open(connection: socket.socket) -> bool:
+    """True if the other side has not closed a connection that it sends nothing on."""
+    connection.setblocking(False)
+    try:
+        return connection.recv(1) != b""
+    except BlockingIOError:
+        return True
+    except ConnectionResetError:
+        return False
 
 
 def test_closing_ends_viewers_and_thread_and_may_be_repeated(base: Base) -> None:

@@ -2,10 +2,12 @@ from __future__ import annotations
 
 import os
 import re
+import signal
 import subprocess
 import sys
 import types
 from pathlib import Path
+from textwrap import dedent, indent
 
 import pytest
 
@@ -147,3 +149,73 @@ def test_ctrl_c_is_not_swallowed_by_what_loads() -> None:
     """A library that does so while it is imported let the command go on."""
     done = subprocess.run([sys.executable, "-c", LOADS], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
+
+
+# A process whose command `fly` runs the text that follows.
+STAND_IN = """\
+import os, signal, sys, types
+
+from kiteline_cli import main as cli
+
+def run(argv):
+{text}
+
+fly = types.ModuleType("kiteline_cli.commands.flights.fly")
+fly.run, fly.EXAMPLES, sys.argv = run, (), ["kiteline", "fly"]
+sys.modules[fly.__name__] = fly
+cli.run()
+"""
+
+
+def _run_stand_in(text: str, **options: object) -> subprocess.CompletedProcess[bytes]:
+    code = STAND_IN.format(text=indent(dedent(text), "    "))
+    return subprocess.run([sys.executable, "-c", code], stderr=subprocess.PIPE, timeout=60, check=False, **options)
+
+
+@pytest.mark.parametrize(("name", "status"), [("SIGINT", 130), ("SIGTERM", -signal.SIGTERM)])
+def test_a_signal_leaves_nothing_half_written(name: str, status: int, tmp_path: Path) -> None:
+    done = _run_stand_in(
+        f"""
+        try:
+            open("part", "w").close()
+            os.kill(os.getpid(), signal.{name})
+            print("ignored")
+        finally:
+            os.unlink("part")
+        """,
+        cwd=tmp_path, stdout=subprocess.PIPE,
+    )  # fmt: skip
+    assert (done.returncode, done.stdout, done.stderr) == (status, b"", b"")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_signal_in_a_finaliser_is_not_lost() -> None:
+    done = _run_stand_in(
+        """
+        import time
+        class Native:
+            def __del__(self):
+                os.kill(os.getpid(), signal.SIGINT)
+                sum(range(100))
+        Native()
+        time.sleep(30)
+        """,
+        stdout=subprocess.PIPE,
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (130, b"", b"")
+
+
+def test_a_terminal_that_lacks_letters_is_no_fault() -> None:
+    done = _run_stand_in(
+        r'print("9.5 m\N{SUPERSCRIPT TWO}", "\udcff.mcap")',
+        stdout=subprocess.PIPE, env={**os.environ, "PYTHONIOENCODING": "ascii"},
+    )  # fmt: skip
+    assert (done.returncode, done.stdout, done.stderr) == (0, rb"9.5 m\xb2 \udcff.mcap" + b"\n", b"")
+
+
+def test_output_that_is_closed_is_no_fault() -> None:
+    code = STAND_IN.format(text="    print('into the void')")
+    done = subprocess.run(
+        ["sh", "-c", '"$0" -c "$1" >&-', sys.executable, code], capture_output=True, check=False, timeout=60
+    )
+    assert (done.returncode, done.stderr) == (0, b"")

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kiteline_core.config import ConfigError, apply, describe, of_log
+from kiteline_core.config import ConfigError, apply, describe, load, of_log
 
 
 class Mode(Enum):
@@ -113,3 +113,22 @@ def test_the_log_of_another_build_is_told_from_a_wrong_file() -> None:
     assert of_log(Config(), describe(Config(9.0))) == Config(9.0)
     with pytest.raises(ConfigError, match=r"another build wrote this log \(unknown key 'points'.*kiteline fly LOG"):
         of_log(Config(), "points = 3")
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"[agent]\n# \xff\n", "not a text file"),
+        (b"gain = " + b"9" * 5000, "a number too long"),
+        (b"gain = " + b"[" * 100_000, "tables too deep"),
+        (b"gain = " + b"{a=" * 5000, "tables too deep"),
+        (b".".join([b"a"] * 200) + b" = 1", "tables in each other"),
+        (b".".join([b"a"] * 100_000) + b" = 1", "dots in a name"),
+        (b"# long\n" * 200_000, "longer than 1 MiB"),
+        (b"\0" * 100, "no valid TOML"),
+        (b"a = 1\na = 2\n", "no valid TOML"),
+    ],
+)
+def test_a_file_of_any_content_is_refused_by_name(content: bytes, words: str) -> None:
+    with pytest.raises(ConfigError, match=f"mine.toml: .*{words}"):
+        load(Config(), content, "agent", "mine.toml")

@@ -76,6 +76,10 @@ def test_text_that_is_no_toml_is_a_problem_with_its_line(text: str) -> None:
     assert "no valid TOML" in problem.text
 
 
+def test_a_root_that_is_no_section_is_a_problem() -> None:
+    assert [p.line for p in command.check("agent = 3\nbase = []\n")] == [1, 2]
+
+
 def test_a_sound_file_passes_and_its_changes_are_listed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "rig.toml"
     path.write_text("[agent.keyframe]\nmax_gap_s = 2\nmin_share = 0.65\n[base]\n")

@@ -1,6 +1,8 @@
 """`kiteline convert` and `kiteline log`: nothing half-written, nothing lost."""
 
+import errno
 import json
+import os
 from pathlib import Path
 
 import cv2
@@ -12,6 +14,7 @@ from kiteline_core.geometry.cameras import CameraModel, CameraRig
 from kiteline_hw.logs.mcap_log import IMU, LogReader, LogWriter
 from kiteline_hw.ports import SourceError
 from kiteline_hw.sources.open import open_source
+from kiteline_lab.flights.progress import Progress
 from kiteline_lab.tools import convert, logs
 
 T0 = 10_000_000_000
@@ -114,6 +117,23 @@ def test_recover_makes_a_cut_file_whole(tmp_path: Path) -> None:
     assert numbers(out) == before == list(range(len(before))) and len(before) > 10
 
 
+def test_a_full_disk_is_told_before_the_rest_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    source = open_source(str(flight(tmp_path / "a.mcap", frames=200)))
+    write, room, shown = os.pwrite, [20_000], list[int]()
+
+    def small(fd: int, data: bytes, offset: int) -> int:
+        room[0] -= len(data)
+        if room[0] < 0:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return write(fd, data, offset)
+
+    monkeypatch.setattr(os, "pwrite", small)
+    monkeypatch.setattr(Progress, "update", lambda _, frames: shown.append(frames))
+    with pytest.raises(SourceError, match="No space left on device: free some room"):
+        convert.record(source, tmp_path / "b.mcap")
+    assert len(shown) < 190
+
+
 def test_cut_takes_the_stretch_and_its_calibration(tmp_path: Path) -> None:
     path, out = flight(tmp_path / "a.mcap"), tmp_path / "b.mcap"
     assert logs.main(["cut", str(path), str(out), "--from", "0.5", "--to", "1.0"]) == 0
@@ -126,6 +146,9 @@ def test_cut_takes_the_stretch_and_its_calibration(tmp_path: Path) -> None:
         logs.main(["cut", str(path), str(out), "--from", "7", "--force"])
     with pytest.raises(SourceError, match="expected --from before --to"):
         logs.main(["cut", str(path), str(out), "--from", "2", "--to", "1", "--force"])
+    for begin in ("-1e308", "1e308", "inf", "nan"):
+        with pytest.raises(SourceError, match="nothing"):
+            logs.main(["cut", str(path), str(out), f"--from={begin}", "--to=1e308", "--force"])
     with pytest.raises(SourceError, match="exists already"):
         logs.main(["cut", str(path), str(out)])
     assert numbers(out) == list(range(10, 21))

@@ -141,6 +141,13 @@ def test_plot_without_truth_and_of_an_empty_line(tmp_path: Path) -> None:
     assert (tmp_path / "c.png").stat().st_size > 10_000
 
 
+@pytest.mark.parametrize("name", ["a$b_{$.mcap", "$", "\udcff\n.mcap", "\\frac"])
+def test_a_plot_of_a_file_of_any_name(name: str, tmp_path: Path) -> None:
+    line = Trajectory(np.arange(3), np.tile(np.eye(4), (3, 1, 1)))
+    plot.plot_trajectories(tmp_path / "a.png", [plot.Line(name, line)], line, name)
+    assert (tmp_path / "a.png").stat().st_size > 0
+
+
 def test_errors_at_the_ends_of_a_line_are_against_the_truth_beyond_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import gtsam
@@ -102,6 +104,43 @@ def test_command_reads_a_store(mapper: Mapper, tmp_path: Path, capsys: pytest.Ca
     np.testing.assert_allclose(found, [[0, 0, 0], [0.5, 0, 0], [1.0, 0, 0]], atol=2e-3)  # as coarse as codes are
     assert main([str(tmp_path / FILE), "--format", "pgm", "--out", str(tmp_path / "plan.pgm")]) == 0
     assert read_grid(tmp_path / "plan.yaml").cell_m > 0
+
+
+@pytest.mark.parametrize(
+    "name", ["my plan.pgm", "a: b #c.pgm", "two\nlines.pgm", "-.pgm", "Höhe.pgm", "\udcff.pgm", "no suffix"]
+)
+def test_a_picture_of_any_name_is_found_again(name: str, mapper: Mapper, tmp_path: Path) -> None:
+    for file, content in files(mapper, "pgm", name).items():
+        (tmp_path / file).write_bytes(content)
+    assert read_grid((tmp_path / name).with_suffix(".yaml")).cell_m > 0
+    with pytest.raises(ExportError, match=r"ends in \.pgm"):
+        files(mapper, "pgm", "plan.yaml")
+
+
+def test_what_no_disk_takes_leaves_the_file_as_it_was(
+    mapper: Mapper, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = Store(tmp_path)
+    store.write(batch_of(SavedMap({AgentId(0): SavedValues({}, {})}, texts_of(MapperState())), SavedMap()))
+    store.close()
+    out = tmp_path / "out" / "map.ply"
+    assert main([str(tmp_path), "--format", "ply", "--out", str(out)]) == 0
+    before = out.read_bytes()
+    out.write_bytes(b"older")
+
+    def full(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "fsync", full)
+        with pytest.raises(OSError, match="No space"):
+            main([str(tmp_path), "--format", "ply", "--out", str(out)])
+    assert [(path.name, path.read_bytes()) for path in out.parent.iterdir()] == [("map.ply", b"older")]
+    os.mkfifo(pipe := tmp_path / "pipe")
+    with ThreadPoolExecutor(1) as pool:
+        read = pool.submit(pipe.read_bytes)
+        assert main([str(tmp_path), "--format", "ply", "--out", str(pipe)]) == 0
+        assert read.result(10) == before
 
 
 def test_files_that_are_no_store_are_named(tmp_path: Path) -> None:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
 from kiteline_core.ids import MAX_AGENTS
-from kiteline_hw.system.key_store import read_file
+from kiteline_hw.system.key_store import new_key, read_file
 from kiteline_lab.tools import keys
 
 
@@ -30,3 +31,18 @@ def test_no_file_is_made_for_an_agent_that_cannot_be(tmp_path: Path) -> None:
     with pytest.raises(SystemExit):
         keys.main(["pair", str(MAX_AGENTS), "--file", str(tmp_path / "keys")])
     assert not list(tmp_path.iterdir())
+
+
+def test_keys_made_at_one_time_are_all_kept(tmp_path: Path) -> None:
+    file = tmp_path / "new" / "keys"
+    with ThreadPoolExecutor(16) as pool:
+        made = list(pool.map(lambda agent: new_key(file, agent), range(64)))
+    assert read_file(file).agents == dict(enumerate(made))
+    assert [path.name for path in file.parent.iterdir()] == ["keys"]
+
+
+@pytest.mark.parametrize("agent", ["9" * 5000, "-1", "٣", "1.5", ""])
+def test_what_is_no_number_of_an_agent(agent: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        keys.main(["--file", str(tmp_path / "keys"), "pair", "--", agent])
+    assert "no agent's number" in capsys.readouterr().err

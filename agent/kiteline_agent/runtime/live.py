@@ -60,6 +60,8 @@ def fly_live(
     with ExitStack() as stack:
         stack.callback(source.close)
         source = with_controller_imu(options, source)
+        # made before kernels and numbers are: a limit that cannot be set is told at once
+        quota = stack.enter_context(CpuQuota(options.cpu_percent)) if options.cpu_percent > 0.0 else None
         if not kernel_cache.filled():
             with starting():
                 kernel_cache.fill(WARMING, stop, parent)
@@ -82,8 +84,8 @@ def fly_live(
         )  # fmt: skip
         stack.callback(end.close)
         base = _BaseEnd(options, end, key, numbers)
-        if options.cpu_percent > 0.0:
-            stack.enter_context(CpuQuota(options.cpu_percent)).add(os.getpid())
+        if quota is not None:
+            quota.add(os.getpid())
         if parent is not None:
             parent.send_event("ready", frames=source.frame_count)
         process.notify("READY=1")

@@ -96,7 +96,7 @@ def agent_config(
     """
     config = AgentConfig()
     if path:
-        config = configuration.load(config, Path(path).read_text(encoding="utf-8"), "agent", path)
+        config = configuration.load(config, Path(path).read_bytes(), "agent", path)
     if rig:
         config = replace(config, known_rig=rig_file.load(rig))
     if grid == "off":

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -33,10 +32,10 @@ def text_of(known: KnownRigConfig) -> str:
 def load(path: str) -> KnownRigConfig:
     """What a rig file says; nothing if there is no such file yet. Raises ConfigError for any other content."""
     try:
-        table = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+        table = configuration.parse(Path(path).read_bytes())
     except FileNotFoundError:
         return KnownRigConfig()
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+    except (OSError, ConfigError) as error:
         raise ConfigError(f"{path}: no readable rig file ({error})") from error
     section = table.get(_TABLE)
     if set(table) != {_TABLE} or not isinstance(section, dict):

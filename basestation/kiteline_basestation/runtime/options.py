@@ -58,7 +58,7 @@ def base_config(path: str) -> BaseConfig:
     """The configuration, with the [base] table of a TOML file in place of the defaults. Raises ConfigError."""
     if not path:
         return BaseConfig()
-    return configuration.load(BaseConfig(), Path(path).read_text(encoding="utf-8"), "base", path)
+    return configuration.load(BaseConfig(), Path(path).read_bytes(), "base", path)
 
 
 def parser(link_forms: str = "") -> argparse.ArgumentParser:

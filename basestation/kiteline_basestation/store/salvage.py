@@ -9,7 +9,6 @@ import sqlite3
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
-from urllib.parse import quote
 
 from kiteline_basestation.store import checksums
 from kiteline_basestation.store.saved_map import SavedMap
@@ -42,7 +41,7 @@ def reader(file: Path, busy_s: float) -> Iterator[sqlite3.Connection]:
 
 
 def _connected(file: Path, how: str, busy_s: float) -> sqlite3.Connection:
-    db = sqlite3.connect(f"file:{quote(str(file.absolute()))}?{how}", uri=True, timeout=busy_s, isolation_level=None)
+    db = sqlite3.connect(f"{file.absolute().as_uri()}?{how}", uri=True, timeout=busy_s, isolation_level=None)
     try:
         db.execute("SELECT count(*) FROM sqlite_master").fetchone()
     except BaseException:

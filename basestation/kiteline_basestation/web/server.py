@@ -1,7 +1,8 @@
 """The status page's server: static files, /status.json and a websocket, in a thread of its own.
 
 It listens on the loopback address by default, serves only the files beside this module, and refuses pages of other
-sites (Origin) and, on loopback, other host names (DNS rebinding).
+sites (Origin) and, on loopback, other host names (DNS rebinding). Who only opens connections takes up neither files of
+the process nor the places of viewers.
 """
 
 from __future__ import annotations
@@ -13,8 +14,10 @@ import logging
 import threading
 import time
 from collections.abc import AsyncIterator, Callable
+from functools import partial
 from http import HTTPStatus
 from pathlib import Path
+from typing import Any
 
 from websockets.asyncio.server import ServerConnection
 from websockets.asyncio.server import serve as websocket_serve
@@ -30,6 +33,7 @@ STATUS_PERIOD_S = 0.5  # s between two status messages: numbers that change fast
 MAP_PERIOD_S = 1.0  # s between two maps at least: they are a hundred times larger
 RATE_SPAN_S = 2.0  # s over which byte rates are taken: two heartbeats
 MAX_VIEWERS = 16  # browsers at a time; each costs up to 100 kB/s
+MAX_UNANSWERED = 64  # connections without an answer yet; of more the oldest is closed, as each takes a file of the base
 TILES_A_MESSAGE = 64  # tiles of 4 kB
 LIVE_PATH = "/live"
 
@@ -77,6 +81,32 @@ def serve(host: str, port: int, snapshot: Callable[[], PageSnapshot]) -> Handle:
     return Handle(page, thread, f"http://{shown}:{page.port}/")
 
 
+class _Connection(ServerConnection):
+    """A connection to the page. unanswered: all those without an answer yet, of this page, in order of arrival."""
+
+    def __init__(self, unanswered: dict[_Connection, None], *args: Any, **options: Any) -> None:
+        self._unanswered = unanswered
+        super().__init__(*args, **options)
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Take the place of the oldest one if there are too many."""
+        super().connection_made(transport)
+        self._unanswered[self] = None
+        if len(self._unanswered) > MAX_UNANSWERED:
+            oldest = next(iter(self._unanswered))
+            oldest.was_answered()
+            oldest.transport.abort()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Leave the place to others."""
+        self.was_answered()
+        super().connection_lost(exc)
+
+    def was_answered(self) -> None:
+        """Count no more among those without an answer. May be called twice."""
+        self._unanswered.pop(self, None)
+
+
 class _Page:
     def __init__(self, snapshot: Callable[[], PageSnapshot]) -> None:
         self.started = threading.Event()
@@ -103,10 +133,12 @@ class _Page:
         self._end = asyncio.Event()
         self._local = host == "localhost" or _is_loopback(host)
         log = logging.Logger("kiteline.web", logging.CRITICAL)  # no traceback for a port scan
+        self._loop.set_exception_handler(lambda loop, context: None)  # nor one a connection, where files are used up
+        connection: Any = partial(_Connection, {})
         try:
             server = await websocket_serve(
                 self._view, host, port, process_request=self._answer, compression=None, max_size=1024, logger=log,
-                close_timeout=1.0,
+                close_timeout=1.0, create_connection=connection,
             )  # fmt: skip
         except OSError as e:
             self.error = e
@@ -143,6 +175,8 @@ class _Page:
     # -- websocket ---------------------------------------------------------------------------------------------------
 
     async def _view(self, viewer: ServerConnection) -> None:
+        if isinstance(viewer, _Connection):
+            viewer.was_answered()
         self._viewers += 1
         try:
             await self._show(viewer)

@@ -9,6 +9,7 @@ from kiteline_hw.calibration import euroc, kalibr, opencv, own
 from kiteline_hw.calibration.nodes import Node, read_nodes
 from kiteline_hw.calibration.told import FilePart, ToldCalibration, joined
 from kiteline_hw.ports import SourceError
+from kiteline_hw.system.process import home_path
 
 # How each form is recognised, and its reader. An IMU of Kalibr's has the keys of EuRoC's without T_BS, so it is last.
 _READERS: tuple[tuple[Callable[[Node], bool], Callable[[Node], FilePart]], ...] = (
@@ -34,7 +35,7 @@ def read_calibration(text: str) -> ToldCalibration:
     names = [name for name in text.split(",") if name]
     if not names:
         raise SourceError(f"{text!r} names no calibration: expected FILE, or several with commas between")
-    return joined([_read(Path(name).expanduser()) for name in names])
+    return joined([_read(home_path(name)) for name in names])
 
 
 def _read(path: Path) -> FilePart:

@@ -17,6 +17,7 @@ from kiteline_hw.ports import SourceError
 from kiteline_hw.sources.calibration import camera_from_yaml
 from kiteline_hw.sources.open import open_source
 from kiteline_hw.sources.text_files import read_yaml, yaml_number
+from kiteline_hw.system.process import home_path
 
 CALIBRATIONS = ("camera.yaml", "/etc/kiteline/camera.yaml")  # looked for where no calibration is named
 
@@ -81,7 +82,7 @@ def read_rig(scheme: str, options: LiveOptions, *, stereo: bool, told: ToldCalib
             f"fx, fy, cx, cy, width, height, for a pair baseline_m; or a recording of this camera), or "
             f"{' or '.join(CALIBRATIONS)}"
         )
-    path = Path(name).expanduser()
+    path = home_path(name)
     if path.suffix not in (".yaml", ".yml"):
         recorded = open_source(name if ":" in name else str(path), mono=not stereo)
         try:

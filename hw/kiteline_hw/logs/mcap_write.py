@@ -55,8 +55,9 @@ class McapWriter:
         self._put_head(_MAGIC + _packed(records.Header("", library)))
 
     def add_metadata(self, name: str, data: Mapping[str, str]) -> None:
-        """Add a metadata record, before the first message."""
-        packed = _packed(records.Metadata(name, dict(data)))
+        """Add a metadata record, before the first message. Bytes of a file name that are no UTF-8 stand as \\udcXX."""
+        texts = {key: text.encode(errors="backslashreplace").decode() for key, text in data.items()}
+        packed = _packed(records.Metadata(name, texts))
         self._metadata.append(records.MetadataIndex(self._at, len(packed), name))
         self._put_head(packed)
 

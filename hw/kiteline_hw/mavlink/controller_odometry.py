@@ -7,6 +7,7 @@ is odometry only if it rests on other sensors (optical flow, GNSS, wheels), whic
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
@@ -83,6 +84,23 @@ class StampClock:
         return stamp_ns + self._offset_ns
 
 
+def _is_finite(message: MavlinkMessage) -> bool:
+    """False if a number of a message that is computed with is none, or infinite; `usable` refuses the others."""
+    match message:
+        case Odometry():
+            rotated = message.child_frame_id in _LOCAL
+            used: tuple[float, ...] = (*message.velocity_m_s, *message.q) if rotated else ()
+        case Attitude():
+            used = (*message.angles_rad, *message.rate_rad_s)
+        case LocalPosition():
+            used = tuple(message.velocity_m_s)
+        case WheelDistance():
+            used = message.distance_m
+        case _:
+            used = ()
+    return all(map(math.isfinite, used))
+
+
 class ControllerOdometry:
     """Converts messages to samples. T_b_f: (4,4) flight controller (FRD) in the body frame."""
 
@@ -116,6 +134,9 @@ class ControllerOdometry:
     def receive(self, message: MavlinkMessage, now_ns: int) -> None:
         """Add a message; those of other kinds are ignored."""
         handler = self._handlers.get(type(message))
+        if handler is not None and not _is_finite(message):
+            self.unusable += 1
+            return
         batch = handler(message, now_ns) if handler is not None else None
         if batch is not None:
             self._received_ns = now_ns

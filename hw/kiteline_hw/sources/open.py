@@ -13,6 +13,7 @@ from kiteline_hw.sources import kinds
 from kiteline_hw.sources.bags.bag_heads import MCAP_MAGIC, SQLITE_MAGIC, refuse_unreadable
 from kiteline_hw.sources.kinds import SourceKind
 from kiteline_hw.sources.overrides import with_calibration
+from kiteline_hw.system.process import home_path
 
 
 def open_source(
@@ -31,7 +32,7 @@ def open_source(
     if not argument:
         raise SourceError(f"{spec!r} names nothing: expected {kind.scheme}:{kind.argument}")
     if kind.argument in ("DIR", "FILE"):
-        path = Path(argument).expanduser()
+        path = home_path(argument)
         if not path.exists():
             raise SourceError(f"{path}: no such file or folder")
         if kind.argument == "DIR" and not path.is_dir():
@@ -48,7 +49,7 @@ def open_source(
 
 def recognise(spec: str) -> SourceKind:
     """The kind of a plain path, by its layout. Raises SourceError if no kind fits."""
-    path = Path(spec).expanduser()
+    path = home_path(spec)
     if path.is_file():
         with path.open("rb") as file:
             head = file.read(16)

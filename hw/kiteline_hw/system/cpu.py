@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from kiteline_core.errors import KitelineError
 from kiteline_hw.system.closing import Closing
 
 _PERIOD_US = 50_000  # us; a twentieth of the one-second window over which the limit must hold
@@ -22,7 +23,7 @@ def process_cpu_ns() -> int:
     return time.process_time_ns()
 
 
-class QuotaError(OSError):
+class QuotaError(KitelineError):
     """A CPU limit that cannot be set on this machine. The text says why."""
 
 
@@ -51,14 +52,14 @@ _CONTROLLERS = (
 class CpuQuota(Closing):
     """Limits a group of processes to `percent` of one core with the kernel's CFS bandwidth control.
 
-    Raises QuotaError if the limit cannot be set, ValueError if the percentage is out of range.
+    Raises QuotaError if the limit cannot be set, or is out of range.
     """
 
     def __init__(self, percent: float, *, root: Path | None = None) -> None:
         """root: of the cgroups, v1's cpu controller or v2's; None: where Linux has them."""
         min_percent = 100.0 * _MIN_QUOTA_US / _MAX_PERIOD_US
         if not min_percent <= percent <= 100.0 * (os.cpu_count() or 1):
-            raise ValueError(
+            raise QuotaError(
                 f"CPU limit of {percent:g} percent: expected {min_percent:g} to 100 per core of this machine"
             )
         period_us = max(_PERIOD_US, math.ceil(100.0 * _MIN_QUOTA_US / percent))

@@ -7,16 +7,19 @@ letters and digits (Crockford's base 32), for a person to type on the agent; key
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import hashlib
 import os
 import secrets
 import stat
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from kiteline_core.ids import MAX_AGENTS
 from kiteline_hw.durable_files import sync_folder
 from kiteline_hw.ports import LinkError
+from kiteline_hw.system.process import user_folder
 
 KEY_BYTES = 32
 MAPS = "maps"
@@ -40,8 +43,8 @@ class Keys:
 
 
 def default_path() -> Path:
-    """The default path of the key file."""
-    return Path(os.environ.get("XDG_CONFIG_HOME") or "~/.config").expanduser() / "kiteline" / "keys"
+    """The default path of the key file. Raises KitelineError if the user has no home."""
+    return user_folder("XDG_CONFIG_HOME", "~/.config") / "keys"
 
 
 def read_keys(path: Path) -> dict[int, bytes]:
@@ -123,29 +126,30 @@ class WatchedKeys:
 
 def first_keys(path: Path) -> bool:
     """Make a file with a key for each agent and for maps, unless there is one. Returns whether it was made."""
-    if path.exists():
-        return False
-    agents = {agent: secrets.token_bytes(KEY_BYTES) for agent in range(_MAX_AGENT + 1)}
-    _write(path, Keys(agents, secrets.token_bytes(KEY_BYTES)))
-    return True
+    with _changing(path):
+        if path.exists():
+            return False
+        agents = {agent: secrets.token_bytes(KEY_BYTES) for agent in range(_MAX_AGENT + 1)}
+        _write(path, Keys(agents, secrets.token_bytes(KEY_BYTES)))
+        return True
 
 
 def new_key(path: Path, agent: int, *, replace: bool = False) -> bytes:
     """Create a key for an agent and store it. Raises LinkError if it has one and `replace` is not set."""
-    keys = read_file(path) if path.exists() else Keys()
-    if agent in keys.agents and not replace:
-        raise LinkError(f"agent {agent} has a key in {path} already; --replace makes a new one")
-    return _store(path, agent, secrets.token_bytes(KEY_BYTES), keys)
+    with _changing(path) as keys:
+        if agent in keys.agents and not replace:
+            raise LinkError(f"agent {agent} has a key in {path} already; --replace makes a new one")
+        return _store(path, agent, secrets.token_bytes(KEY_BYTES), keys)
 
 
 def new_maps_key(path: Path, *, replace: bool = False) -> bytes:
     """Create the key of the right to change maps. Raises LinkError if there is one and `replace` is not set."""
-    keys = read_file(path) if path.exists() else Keys()
-    if keys.maps is not None and not replace:
-        raise LinkError(f"{path} has a key for {MAPS} already; --replace makes a new one")
-    keys.maps = secrets.token_bytes(KEY_BYTES)
-    _write(path, keys)
-    return keys.maps
+    with _changing(path) as keys:
+        if keys.maps is not None and not replace:
+            raise LinkError(f"{path} has a key for {MAPS} already; --replace makes a new one")
+        keys.maps = secrets.token_bytes(KEY_BYTES)
+        _write(path, keys)
+        return keys.maps
 
 
 def new_code() -> str:
@@ -164,7 +168,8 @@ def pair(path: Path, agent: int, code: str) -> bytes:
         digits.encode(), salt=f"kiteline-pair {agent}".encode(), n=_SCRYPT_COST, r=8, p=1,
         maxmem=2 * 128 * 8 * _SCRYPT_COST, dklen=KEY_BYTES,
     )  # fmt: skip
-    return _store(path, agent, key, read_file(path) if path.exists() else Keys())
+    with _changing(path) as keys:
+        return _store(path, agent, key, keys)
 
 
 def _check_digit(digits: str) -> str:
@@ -180,6 +185,25 @@ def _store(path: Path, agent: int, key: bytes, keys: Keys) -> bytes:
     return key
 
 
+@contextlib.contextmanager
+def _changing(path: Path) -> Iterator[Keys]:
+    """The keys of a file, none if there is none yet, which no other process changes meanwhile. Raises LinkError."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+        folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    except OSError as error:
+        raise _unwritable(path, error) from error
+    try:
+        fcntl.flock(folder, fcntl.LOCK_EX)
+        yield read_file(path) if path.exists() else Keys()
+    finally:
+        os.close(folder)
+
+
+def _unwritable(path: Path, error: OSError) -> LinkError:
+    return LinkError(f"cannot write keys to {path}: {error.strerror or error}; name another file")
+
+
 def _write(path: Path, keys: Keys) -> None:
     """Replace the file atomically; it never exists with another mode or half written, and keeps its owner.
 
@@ -190,7 +214,6 @@ def _write(path: Path, keys: Keys) -> None:
         lines.append(f"{MAPS} {keys.maps.hex()}\n")
     new = path.with_name(path.name + ".new")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
         new.unlink(missing_ok=True)
         fd = os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
         with os.fdopen(fd, "w", encoding="ascii") as out:
@@ -201,7 +224,9 @@ def _write(path: Path, keys: Keys) -> None:
         os.replace(new, path)
         sync_folder(path.parent)  # agents are paired with these keys from now on
     except OSError as error:
-        raise LinkError(f"cannot write keys to {path}: {error.strerror or error}; name another file") from error
+        with contextlib.suppress(OSError):
+            new.unlink(missing_ok=True)
+        raise _unwritable(path, error) from error
 
 
 def _keep_owner(path: Path, fd: int) -> None:

@@ -9,20 +9,20 @@ import threading
 from collections.abc import Iterator
 from types import FrameType
 
-from kiteline_hw.system.process import StopSignal, notify
+from kiteline_hw.system.process import StopSignal, can_raise, deliver_again, notify
 
 _LIMIT_S = 3600  # s after which even such work counts as hung
 _EXTEND_S = 1.0  # s between two requests for more time to start
 _EXTENSION_S = 10.0  # s that each of them asks for
 
 
-class StoppedError(Exception):
-    """SIGTERM or SIGINT came during long work."""
+class StoppedError(BaseException):
+    """SIGTERM or SIGINT came during long work. No Exception: libraries that try several ways go on after one."""
 
 
 @contextlib.contextmanager
 def long_work(stop: StopSignal, what: str) -> Iterator[None]:
-    """Do long work after READY=1, in the main thread. Raises StoppedError out of it when a signal comes.
+    """Do long work after READY=1, in the main thread. Raises StoppedError out of it when a signal comes; `stop` is set.
 
     what: shown by `systemctl status`. The watchdog, whose pings pause meanwhile, is set to an hour.
     """
@@ -31,7 +31,10 @@ def long_work(stop: StopSignal, what: str) -> Iterator[None]:
 
     def on_signal(number: int, frame: FrameType | None) -> None:
         nonlocal stopped
-        if not stopped:  # a second one would interrupt what the first one ends
+        stop.set()
+        if not can_raise(frame):
+            deliver_again(number, on_signal)
+        elif not stopped:  # a second one would interrupt what the first one ends
             stopped = True
             raise StoppedError
 
@@ -43,6 +46,7 @@ def long_work(stop: StopSignal, what: str) -> Iterator[None]:
             raise StoppedError
         yield
     finally:
+        stopped = True  # from here on nothing is left to interrupt
         for number, handler in before.items():
             signal.signal(number, handler)
         notify("STATUS=" + (f"\nWATCHDOG_USEC={watchdog_us}\nWATCHDOG=1" if watchdog_us else ""))

@@ -11,10 +11,16 @@ import signal
 import socket
 import sys
 import threading
+import weakref
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from types import FrameType
 from typing import Any, NoReturn
+
+from kiteline_core.errors import KitelineError
+
+_LLVM = f"{os.sep}llvmlite{os.sep}"  # in the paths of frames that hold native objects
+_AGAIN_S = 0.01  # s until a handler that could not raise is called again
 
 
 class StopSignal:
@@ -30,10 +36,14 @@ class StopSignal:
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, self._on_signal)
 
-    def _on_signal(self, number: int, frame: FrameType | None) -> None:
+    def set(self) -> None:
+        """Set the flag, as a signal does."""
         self._received = True
         with contextlib.suppress(BlockingIOError):
             os.write(self._waker, b"!")
+
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:
+        self.set()
 
     def __bool__(self) -> bool:
         return self._received
@@ -45,10 +55,31 @@ class StopSignal:
         return self._received
 
 
+def can_raise(frame: FrameType | None) -> bool:
+    """True if an exception raised by a signal handler in this frame reaches its callers and breaks nothing.
+
+    A callback of a native library and a finaliser swallow it, and an object of LLVM that is half freed is freed twice.
+    """
+    while frame is not None:
+        code = frame.f_code
+        if code.co_name == "__del__" or _LLVM in code.co_filename or code.co_filename == weakref.__file__:
+            return False
+        frame = frame.f_back
+    return True
+
+
+def deliver_again(number: int, handler: Callable[[int, FrameType | None], None]) -> None:
+    """Call a signal's handler again a moment later, by SIGALRM: where it was called it could not raise."""
+    signal.signal(signal.SIGALRM, lambda _, frame: handler(number, frame))
+    signal.setitimer(signal.ITIMER_REAL, _AGAIN_S)
+
+
 def exit_on_sigterm() -> None:
     """Turn SIGTERM into SystemExit in the main thread, so that `with` and `finally` close logs and sessions."""
 
     def on_signal(number: int, frame: FrameType | None) -> None:
+        if not can_raise(frame):
+            return deliver_again(number, on_signal)
         sys.exit(128 + number)
 
     signal.signal(signal.SIGTERM, on_signal)
@@ -141,11 +172,25 @@ def is_stopped(pid: int | None) -> bool:
 
 
 def state_folder() -> Path:
-    """Folder for what survives a restart: a service's $STATE_DIRECTORY, else $XDG_STATE_HOME/kiteline."""
+    """Folder for what survives a restart: a service's $STATE_DIRECTORY, else that of the user. Raises KitelineError."""
     of_service = os.environ.get("STATE_DIRECTORY", "").split(":")[0]
-    if of_service:
-        return Path(of_service)
-    return Path(os.environ.get("XDG_STATE_HOME") or "~/.local/state").expanduser() / "kiteline"
+    return Path(of_service) if of_service else user_folder("XDG_STATE_HOME", "~/.local/state")
+
+
+def user_folder(variable: str, default: str) -> Path:
+    """kiteline's folder in the one that a variable names, else in the usual one of a user. Raises KitelineError."""
+    folder = home_path(os.environ.get(variable) or default)
+    if str(folder).startswith("~"):
+        raise KitelineError(f"this user has no home folder for {default}/kiteline: set HOME, or {variable}")
+    return folder / "kiteline"
+
+
+def home_path(text: str) -> Path:
+    """A path whose ~ or ~USER at the beginning is a home folder; as it stands where there is no such user."""
+    try:
+        return Path(text).expanduser()
+    except RuntimeError:
+        return Path(text)
 
 
 def print_lines(lines: Iterable[str]) -> None:

@@ -21,12 +21,12 @@ from kiteline_hw.sources.kinds import source_forms
 from kiteline_hw.sources.open import open_source
 from kiteline_lab.calibration import boards, imu
 from kiteline_lab.calibration.best_lens import best_lens
-from kiteline_lab.calibration.boards import Board, parse_board
+from kiteline_lab.calibration.boards import U8, Board, parse_board
 from kiteline_lab.calibration.picture import residual_picture
 from kiteline_lab.calibration.solve import Calibrated
 from kiteline_lab.calibration.verdict import Finding, judge, overall
 from kiteline_lab.calibration.views import ViewCollector
-from kiteline_lab.flights.out_file import whole_file
+from kiteline_lab.flights.out_file import whole_file, write_whole
 from kiteline_lab.flights.progress import Progress
 
 _DPI = 300  # of a printed board
@@ -133,9 +133,7 @@ def _camera(args: argparse.Namespace) -> int:
         told = ToldCalibration(str(args.out), result.cameras, result.T_c_r, kept.T_b_c, kept.imu, kept.topics)
         part.write_text(own_texts(told, comments)["calibration.yaml"])
     if args.picture is not None:
-        args.picture.parent.mkdir(parents=True, exist_ok=True)
-        if not cv2.imwrite(str(args.picture), residual_picture(result, collector.coverage)):
-            raise NoBoard(f"{args.picture}: cannot be written: expected a name that ends in .png")
+        _write_picture(args.picture, residual_picture(result, collector.coverage))
     if args.json:
         print(json.dumps(_summary(args.out, result, findings, collector), indent=2))
     else:
@@ -178,12 +176,21 @@ def _summary(out: Path, result: Calibrated, findings: list[Finding], collector: 
 def _board(args: argparse.Namespace) -> int:
     board: Board = args.board
     px = max(20, round(board.square_m / _M_AN_INCH * _DPI))
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    if not cv2.imwrite(str(args.out), board.draw(px)):
-        raise NoBoard(f"{args.out}: cannot be written: expected a name that ends in .png")
+    _write_picture(args.out, board.draw(px))
     print(f"{args.out}: {_described(board)}; print it at {px / board.square_m * _M_AN_INCH:.1f} dots an inch without "
           "scaling, glue it on something flat, and measure a square")  # fmt: skip
     return 0
+
+
+def _write_picture(path: Path, picture: U8) -> None:
+    """Write a picture in the format that its name tells. Raises NoBoard for another one, OSError."""
+    try:
+        made, content = cv2.imencode(path.suffix, picture)
+    except cv2.error:
+        made = False
+    if not made:
+        raise NoBoard(f"{path}: no picture: expected a name that ends in .png")
+    write_whole(path, content.tobytes())
 
 
 def _export(args: argparse.Namespace) -> int:
@@ -192,7 +199,6 @@ def _export(args: argparse.Namespace) -> int:
         told.rig()  # says that no camera is there
     for name, text in FORMS[args.format](told).items():
         path = args.out / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text)
+        write_whole(path, text.encode())
         sys.stdout.write(f"{path}\n")
     return 0

@@ -7,13 +7,32 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from kiteline_hw.durable_files import write_atomically
+from kiteline_hw.logs.mcap_log import LogWriter
 from kiteline_hw.ports import SourceError
+
+_ROOM = "free some room, or name a place on another disk"
 
 
 def expect_writable(path: Path) -> None:
     """Raise SourceError if no file of this name can be written: for programs that take long before they write."""
     if path.is_dir() or not path.parent.is_dir() or not os.access(path.parent, os.W_OK):
         raise SourceError(f"{path}: cannot be written: expected a file name in a folder that exists and may be written")
+
+
+def expect_nothing_lost(log: LogWriter, path: Path) -> None:
+    """Raise SourceError where a disk did not take a part of a log that is of use as a whole only."""
+    if log.dropped:
+        raise SourceError(f"{path.parent}: {log.why}: {_ROOM}")
+
+
+def write_whole(path: Path, content: bytes) -> None:
+    """Write a file that is complete, or stays what it was; into a pipe or a device as it comes. Raises OSError."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if path.exists() and not path.is_file():
+        path.write_bytes(content)
+    else:
+        write_atomically(path.resolve(), content)  # of a link, what it leads to
 
 
 @contextmanager

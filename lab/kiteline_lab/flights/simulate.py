@@ -13,14 +13,13 @@ import numpy as np
 
 from kiteline_core.frame import EncodedImage, Frame, ImuBatch, OdometryBatch
 from kiteline_hw.logs.mcap_log import GROUND_TRUTH, IMU, ODOMETER, LogWriter
-from kiteline_hw.ports import SourceError
 from kiteline_hw.sensors.images import encode_depth, encode_image
 from kiteline_hw.sim.config import RIGS, SimConfig, read_config
 from kiteline_hw.sim.sensors.wear import KINDS
 from kiteline_hw.sim.source import SimSource
 from kiteline_hw.sim.truth.sight import CELL_M, look
 from kiteline_hw.sim.world.world import World
-from kiteline_lab.flights.out_file import whole_file
+from kiteline_lab.flights.out_file import expect_nothing_lost, whole_file
 from kiteline_lab.flights.progress import Progress
 from kiteline_lab.grids.truth import write_truth
 
@@ -114,8 +113,8 @@ def record(source: SimSource, path: Path, png: bool = False) -> int:
             log.frame(replace(item, encoded=encode(item, png)))
             frames += 1
             progress.update(frames)
-    if log.dropped:
-        raise SourceError(f"{path.parent}: disk full: {log.dropped} messages could not be written")
+            expect_nothing_lost(log, path)
+    expect_nothing_lost(log, path)
     return samples
 
 

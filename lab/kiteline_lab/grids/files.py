@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -49,11 +51,10 @@ class GridFile:
 def read_grid(path: Path) -> GridFile:
     """Read a map_server YAML file and its PGM image (P2 or P5). Raises GridFileError."""
     try:
-        lines = path.read_text().splitlines()
-    except (OSError, UnicodeDecodeError) as e:
+        lines = path.read_text(encoding="utf-8", errors="surrogateescape").split("\n")
+    except OSError as e:
         raise GridFileError(f"{path}: cannot be read as a grid's YAML file ({e})") from None
-    fields = dict(line.split("#")[0].split(":", 1) for line in lines if ":" in line.split("#")[0])
-    fields = {k.strip(): v.strip().strip("'\"") for k, v in fields.items()}
+    fields = {k.strip(): _value(v) for k, colon, v in (line.partition(":") for line in lines) if colon and "#" not in k}
     missing = [k for k in ("image", "resolution", "origin") if not fields.get(k)]
     if missing:
         raise GridFileError(f"{path}: no {', '.join(missing)}; expected map_server's image, resolution and origin")
@@ -72,6 +73,16 @@ def read_grid(path: Path) -> GridFile:
     state[solid < free] = 0
     state[solid > occupied] = 100
     return GridFile(cell_m, (origin[0], origin[1], origin[2]), np.ascontiguousarray(state[::-1]))
+
+
+def _value(text: str) -> str:
+    """The value of a line, without quotes and without a comment."""
+    text = text.strip()
+    if text.startswith('"'):
+        with contextlib.suppress(ValueError):
+            value, _ = json.JSONDecoder().raw_decode(text)
+            return str(value)
+    return text.split("#")[0].strip().strip("'\"")
 
 
 def read_pgm(path: Path) -> F64:

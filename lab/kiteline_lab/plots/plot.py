@@ -68,7 +68,7 @@ def plot_trajectories(
         if len(p) == 0:
             continue
         _, path_xy = _with_gaps(t_s, p[:, [across, along]])
-        top.plot(path_xy[:, 0], path_xy[:, 1], color=colour, lw=1.3, label=line.name, zorder=2)
+        top.plot(path_xy[:, 0], path_xy[:, 1], color=colour, lw=1.3, label=_as_text(line.name), zorder=2)
         top.plot(p[:1, across], p[:1, along], "o", color=colour, ms=5, zorder=3)
         height.plot(*_with_gaps(t_s, sign * p[:, up]), color=colour, lw=1.2, zorder=2)
         if error is not None and truth is not None:
@@ -78,11 +78,16 @@ def plot_trajectories(
     if error is not None:
         _draw_errors(error, errors)
     if title:
-        figure.suptitle(title, x=0.01, ha="left", color=INK, fontsize=12, fontweight="bold")
+        figure.suptitle(_as_text(title), x=0.01, ha="left", color=INK, fontsize=12, fontweight="bold")
     if top.get_legend_handles_labels()[0]:
         top.legend(frameon=False, fontsize=9, labelcolor=INK)
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, metadata={"Software": None})  # no version inside: equal runs give equal files
+
+
+def _as_text(name: str) -> str:
+    """A name of any file as matplotlib draws it: no formula between dollars, no bytes that are no letters."""
+    return name.encode(errors="backslashreplace").decode().replace("$", r"\$")
 
 
 def _panels(figure: Figure, *, with_error: bool) -> tuple[Axes, Axes, Axes | None]:

@@ -28,6 +28,7 @@ from kiteline_hw.links.kinds import link_traits
 from kiteline_hw.logs.log_parts import WholeLog
 from kiteline_hw.logs.mcap_log import LogReader
 from kiteline_hw.system import process
+from kiteline_lab.flights.out_file import write_whole
 from kiteline_lab.flights.progress import Progress
 from kiteline_lab.replay.logged_steps import Step, agent_input, agent_of_log, check_replayable, steps
 
@@ -181,9 +182,8 @@ def main(argv: list[str]) -> int:
         done = (replay_agent if is_agent else replay_base)(log, progress, stop_at_first=a.verify)
         cut = log.cut
     if a.out is not None and is_agent:
-        a.out.mkdir(parents=True, exist_ok=True)
-        (a.out / "live.tum").write_text("".join(done.live))
-        (a.out / "odometry.tum").write_text("".join(done.odometry))
+        write_whole(a.out / "live.tum", "".join(done.live).encode())
+        write_whole(a.out / "odometry.tum", "".join(done.odometry).encode())
     if cut is not None:
         print(f"the log was {cut}; what stands before was replayed")
     if done.difference is not None:

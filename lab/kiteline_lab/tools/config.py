@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from kiteline_core.config import ConfigError, UnknownKeyError, apply, in_range, toml_value
+from kiteline_core.config import ConfigError, UnknownKeyError, apply, in_range, parse, toml_value
 from kiteline_lab.tools.options import ROOTS, Option, as_markdown, as_toml, sections
 
 
@@ -54,15 +54,18 @@ def main(argv: list[str]) -> int:
 def check(text: str) -> list[Problem]:
     """Everything wrong with a configuration, by the same rules by which agent and base load it."""
     try:
-        table = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+        table = parse(text)
+    except ConfigError as error:
         at = re.search(r"line (\d+)", str(error))
-        return [Problem(int(at[1]) if at else None, f"no valid TOML: {error}")]
+        return [Problem(int(at[1]) if at else None, str(error))]
     problems, known = [], _options()
     for root in (r for r in table if r not in ROOTS):
         what = f"unknown table [{root}]; known are: {', '.join(ROOTS)}"
         problems.append(Problem(_line_of(text, root), what))
-    for name, value in _leaves({root: table[root] for root in ROOTS if root in table}):
+    for root in (r for r in ROOTS if r in table and not isinstance(table[r], dict)):
+        what = f"[{root}] is a section: expected keys and values under it"
+        problems.append(Problem(_line_of(text, root), what))
+    for name, value in _leaves({root: table[root] for root in ROOTS if isinstance(table.get(root), dict)}):
         root, _, rest = name.partition(".")
         try:
             in_range(apply(ROOTS[root], _nested(rest, value) if rest else value, root), ROOTS[root], root)

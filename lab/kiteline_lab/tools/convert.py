@@ -7,10 +7,10 @@ from pathlib import Path
 
 from kiteline_core.frame import Frame, ImuBatch, Trajectory
 from kiteline_hw.logs.mcap_log import GROUND_TRUTH, IMU, ODOMETER, LogWriter
-from kiteline_hw.ports import FrameSource, SourceError
+from kiteline_hw.ports import FrameSource
 from kiteline_hw.sources.kinds import source_forms
 from kiteline_hw.sources.open import open_source
-from kiteline_lab.flights.out_file import whole_file
+from kiteline_lab.flights.out_file import expect_nothing_lost, whole_file
 from kiteline_lab.flights.progress import Progress
 
 
@@ -63,9 +63,9 @@ def record(source: FrameSource, path: Path) -> tuple[int, int]:
             log.frame(item)
             frames += 1
             progress.update(frames)
+            expect_nothing_lost(log, path)
         truth.write(log, None)
-    if log.dropped:
-        raise SourceError(f"{path.parent}: disk full: {log.dropped} messages could not be written")
+    expect_nothing_lost(log, path)
     return frames, samples
 
 

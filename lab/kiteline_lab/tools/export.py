@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import json
+import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,10 +25,12 @@ from kiteline_codec.sync.config import SyncConfig
 from kiteline_core.errors import KitelineError
 from kiteline_core.geometry import sim3
 from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, agent_of_keyframe
+from kiteline_lab.flights.out_file import write_whole
 
 I64 = NDArray[np.int64]
 
 FORMATS = ("tum", "ply", "pgm", "g2o")
+_PLAIN_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.+-]*")  # of a picture, as it stands in YAML
 ESSENTIAL_LANDMARKS = 100  # shared by two keyframes of an edge of the essential graph (ORB-SLAM2)
 
 
@@ -55,8 +59,12 @@ def files(mapper: Mapper, kind: str, name: str, agent: int | None = None) -> dic
     made = map_files(mapper)
     if kind == "ply":
         return {name: made["map.ply"]}
-    text = made["grid.yaml"].replace(b"image: grid.pgm\n", f"image: {name}\n".encode())
-    return {name: made["grid.pgm"], str(Path(name).with_suffix(".yaml")): text}
+    beside = str(Path(name).with_suffix(".yaml"))
+    if beside == name:
+        raise ExportError(f"{name}: this is the file beside the picture: expected a name that ends in .pgm")
+    shown = name if _PLAIN_NAME.fullmatch(name) else json.dumps(name, ensure_ascii=False)  # else it would not be YAML
+    text = made["grid.yaml"].replace(b"image: grid.pgm\n", f"image: {shown}\n".encode(errors="surrogateescape"))
+    return {name: made["grid.pgm"], beside: text}
 
 
 def _trajectory(mapper: Mapper, agent: int | None) -> bytes:
@@ -98,8 +106,7 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("--agent", type=int, help="tum: whose trajectory; needed if there are several")
     args = parser.parse_args(argv)
     made = files(load(args.store), args.format, args.out.name, args.agent)
-    args.out.parent.mkdir(parents=True, exist_ok=True)
     for name, content in made.items():
-        (args.out.parent / name).write_bytes(content)
+        write_whole(args.out.parent / name, content)
         print(args.out.parent / name)
     return 0

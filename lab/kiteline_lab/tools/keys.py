@@ -90,8 +90,8 @@ def _pair(path: Path, agent: int, code: str) -> None:
 
 
 def _agent(p: argparse.ArgumentParser, text: str) -> int:
-    if not text.isdecimal() or int(text) >= MAX_AGENTS:
-        p.error(f"{text!r} is no agent's number, 0 to {MAX_AGENTS - 1}, and not {MAPS}")
+    if not (text.isascii() and text.isdecimal() and len(text) < 5 and int(text) < MAX_AGENTS):
+        p.error(f"{text[:20]!r} is no agent's number, 0 to {MAX_AGENTS - 1}, and not {MAPS}")
     return int(text)
 
 

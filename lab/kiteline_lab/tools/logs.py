@@ -18,6 +18,7 @@ from kiteline_hw.logs.mcap_file import McapFile, RawMessage
 from kiteline_hw.ports import SourceError
 from kiteline_lab.flights.out_file import whole_file
 
+_LATEST_S = 1e9  # s from the start of a log: 30 years are later than any end
 _LASTING = ("kiteline.Rig", "sensor_msgs/msg/CameraInfo", "foxglove.CameraCalibration")
 
 
@@ -118,11 +119,12 @@ def _recover(path: Path, out: Path, force: bool) -> int:
 
 
 def _cut(path: Path, out: Path, begin_s: float, end_s: float, force: bool) -> int:
-    if not begin_s < end_s:
+    end_s = min(end_s, _LATEST_S)
+    if not -_LATEST_S < begin_s < end_s:
         raise SourceError(f"nothing lies between {begin_s:g} s and {end_s:g} s: expected --from before --to")
     file = McapFile(path)
     begin_ns = file.first_ns + round(begin_s * 1e9)
-    end_ns = file.first_ns + round(end_s * 1e9) if end_s != float("inf") else 2**64 - 1
+    end_ns = file.first_ns + round(end_s * 1e9)
     if begin_ns > file.last_ns:
         raise SourceError(
             f"{path} ends after {(file.last_ns - file.first_ns) * 1e-9:.1f} s: nothing from {begin_s:g} s"

@@ -27,6 +27,7 @@ from kiteline_core.errors import KitelineError
 from kiteline_core.geometry import disparity_offset, se3
 from kiteline_core.geometry.cameras import CameraModel, CameraRig, RectifiedCamera
 from kiteline_core.ids import AgentId
+from kiteline_lab.flights.out_file import write_whole
 from kiteline_lab.tools.export import load
 
 F64 = NDArray[np.float64]
@@ -260,7 +261,6 @@ def main(argv: Sequence[str]) -> int:
         return 0
     for name, text in exported(known, args.agent, args.format).items():
         path = args.out / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text)
+        write_whole(path, text.encode())
         print(path)
     return 0

@@ -214,6 +214,13 @@ def test_each_part_of_a_log_is_a_source(tmp_path: Path) -> None:
     assert frames[-1].t_ns == items[-1][1].t_ns
 
 
+def test_a_log_names_a_source_of_any_name(tmp_path: Path) -> None:
+    with LogWriter(tmp_path / "\udcff.mcap", {"source": "mcap:\udcff\n.mcap"}):
+        pass
+    with LogReader(tmp_path / "\udcff.mcap") as log:
+        assert log.metadata["source"] == "mcap:\\udcff\n.mcap"
+
+
 def test_writer_errors(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match="cannot write the log"):
         LogWriter(tmp_path / "missing" / "log.mcap", {})

@@ -252,3 +252,24 @@ def test_the_odometry_option() -> None:
     for text in ("gps", "wheels:x", "controller:1", "wheels:-1", ""):
         with pytest.raises(ValueError, match="expected controller, wheels or wheels:TRACK_M"):
             parse_odometry_option(text)
+
+
+ANY = st.floats(width=32) | st.sampled_from([NAN, float("inf"), -float("inf"), 0.0, 3.4e38])
+THREE = st.tuples(ANY, ANY, ANY)
+STAMP = st.integers(0, 2**64 - 1) | st.integers(0, 10**7)
+MESSAGES = st.one_of(
+    st.builds(Attitude, st.integers(0, 2**32 - 1) | st.integers(0, 99), THREE, THREE),
+    st.builds(LocalPosition, st.integers(0, 2**32 - 1) | st.integers(0, 99), THREE, THREE),
+    st.builds(WheelDistance, STAMP, st.lists(ANY, max_size=4).map(tuple)),
+    st.builds(
+        odometry, THREE, THREE, t_us=STAMP, child=st.sampled_from([1, 12, 20, 21]), q=st.tuples(ANY, ANY, ANY, ANY),
+        stated=ANY,
+    ),
+)  # fmt: skip
+
+
+@given(st.sampled_from(OdometrySource), st.lists(MESSAGES, max_size=20))
+def test_whatever_numbers_arrive_only_finite_velocities_pass(source: OdometrySource, messages: list[object]) -> None:
+    batch = told(ControllerOdometry(source, mounting("flu")), *messages)
+    if batch is not None:
+        assert np.isfinite(batch.velocity).all() and np.isfinite(batch.rate).all()

@@ -60,7 +60,7 @@ def test_limits_that_cannot_be_set(tmp_path: Path) -> None:
     with pytest.raises(QuotaError, match="no cgroup v1 or v2"):
         CpuQuota(50.0, root=tmp_path)
     for percent in (0.0, -1.0, float("nan"), 0.1, 1e9):
-        with pytest.raises(ValueError, match=r"expected 0\.2 to 100 per core"):
+        with pytest.raises(QuotaError, match=r"expected 0\.2 to 100 per core"):
             CpuQuota(percent)
 
 

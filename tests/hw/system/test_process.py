@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from kiteline_core.errors import KitelineError
 from kiteline_hw.system import process
 
 
@@ -32,6 +33,17 @@ def run(code: str, **options: object) -> subprocess.Popen[bytes]:
         [sys.executable, "-c", "from kiteline_hw.system import process\n" + code],
         env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
     )  # fmt: skip
+
+
+def test_a_user_without_a_home_is_told_what_to_set(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("STATE_DIRECTORY", "XDG_STATE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr("os.path.expanduser", lambda path: path)
+    with pytest.raises(KitelineError, match=r"no home folder .*: set HOME, or XDG_STATE_HOME"):
+        process.state_folder()
+    assert process.home_path("~nobody/flight.mcap") == Path("~nobody/flight.mcap")
+    monkeypatch.setenv("XDG_STATE_HOME", "/var/own")
+    assert process.state_folder() == Path("/var/own/kiteline")
 
 
 def test_a_signal_sets_the_flag_and_ends_a_wait() -> None:
@@ -87,3 +99,50 @@ def test_a_stop_signal_at_any_time() -> None:
         env={**os.environ, "PYTHONPATH": path},
     )
     assert done.returncode == 0, done.stderr
+
+
+LONG_WORK = """
+import os, signal, time
+from kiteline_hw.system.long_work import StoppedError, long_work
+
+def signal_me():
+    os.kill(os.getpid(), signal.SIGTERM)
+    sum(range(100))
+
+class Native:
+    def __del__(self):
+        signal_me()
+
+def native():
+    Native()
+
+def several_ways():
+    try:
+        signal_me()
+    except Exception:
+        pass
+
+stop = process.StopSignal()
+try:
+    with long_work(stop, "reading"):
+        {work}()
+        time.sleep(30)
+except StoppedError:
+    print("stopped", bool(stop))
+"""
+
+
+@pytest.mark.parametrize("work", ["signal_me", "native", "several_ways"])
+def test_a_signal_ends_long_work_wherever_it_arrives(work: str) -> None:
+    with run(LONG_WORK.format(work=work)) as child:
+        assert child.communicate(timeout=20)[0] == b"stopped True\n"
+
+
+def test_no_exception_is_raised_into_callbacks_of_native_code() -> None:
+    """ctypes swallows it; an object of LLVM that is half freed is freed twice."""
+    held: dict[str, object] = {}
+    code = "def free(frame):\n    return can_raise(frame())\n"
+    exec(compile(code, "/venv/llvmlite/binding/ffi.py", "exec"), {"can_raise": process.can_raise}, held)
+    free = held["free"]
+    assert callable(free)
+    assert not free(sys._getframe) and process.can_raise(sys._getframe())
