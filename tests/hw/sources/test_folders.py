@@ -1,5 +1,6 @@
 """Data set folders: the recordings, and small ones with every fault that folders have."""
 
+import re
 from pathlib import Path
 
 import cv2
@@ -159,6 +160,19 @@ def test_euroc_broken_images_are_skipped_and_counted(tmp_path: Path) -> None:
     assert [f.right is None for f in frames] == [False, *4 * [True], False]
     assert source.report.skipped == {"unreadable image": 4, "image of another size": 1, "missing right image": 1}
     assert any("64x40" in note and "64x48" in note for note in source.report.notes)
+
+
+def test_intrinsics_of_another_size_are_doubted(tmp_path: Path) -> None:
+    source = open_source(str(euroc(tmp_path)))
+    read(source)
+    assert source.report.notes == []
+    sensor = tmp_path / "mav0/cam1/sensor.yaml"
+    sensor.write_text(re.sub(r"intrinsics: .*", "intrinsics: [60.0, 60.0, 12.0, 8.0]", sensor.read_text()))
+    source = open_source(str(tmp_path))
+    for _ in range(2):  # once in each reading
+        read(source)
+        assert len(source.report.notes) == 1
+    assert source.report.notes[0].startswith("calibration: the centre of the right camera, (12, 8) px, is far from")
 
 
 def test_euroc_left_and_right_are_paired_by_time(tmp_path: Path) -> None:
