@@ -16,11 +16,11 @@ from kiteline_agent.governor.cost_model import Work
 from kiteline_agent.inertial.preintegration import Samples
 from kiteline_agent.inertial_start_config import ContradictionConfig
 from kiteline_agent.initialisation import inertial_start
-from kiteline_agent.initialisation.contradiction import ContradictionWatch
+from kiteline_agent.initialisation.contradiction import ContradictionWatch, contradicts
 from kiteline_agent.initialisation.corner_tracks import CornerObservations
 from kiteline_agent.initialisation.inertial_start import InertialStart
 from kiteline_agent.initialisation.window_noise import WindowNoise
-from tests.agent.test_inertial_bundle import CALIBRATION, window
+from tests.agent.test_inertial_bundle import CALIBRATION, PRIOR, window
 from tests.agent.test_inertial_start import CAMERA, Tracks
 
 Change = Callable[[CornerObservations, list[Samples]], tuple[CornerObservations, list[Samples]]]
@@ -94,6 +94,28 @@ def test_a_rig_that_is_not_as_calibrated_begins_none_and_says_so_once(
     assert begun_s == float("inf")
     assert len(warnings) == 1
     assert "T_BS" in warnings[0] and "--no-imu" in warnings[0]
+
+
+@pytest.mark.parametrize(
+    ("lens_chi2", "gyro_noise", "accel_bias_m_s2", "wrong"),
+    [
+        (2.0, 2.8, 0.1, False),  # images that are 20 ms late, which tracking finds
+        (17.0, 1.2, 0.3, False),  # worn rigs
+        (14.0, 1.9, 0.1, True),  # a focal length that is off by a tenth
+        (32.0, 1.2, 0.1, True),
+        (2.0, 7.0, 0.1, True),  # images that are 50 ms late
+        (2.0, 0.8, 8.0, True),  # accelerations in g
+    ],
+)
+def test_what_calibrated_and_worn_rigs_show_is_no_contradiction(
+    lens_chi2: float, gyro_noise: float, accel_bias_m_s2: float, wrong: bool
+) -> None:
+    info = np.diag(np.full(8, 1e4))
+    lens = np.array([1.0, 0, 0, 0, 0, 0, 0, 0]) * np.sqrt(lens_chi2 / 1e4)
+    solution: Any = SimpleNamespace(
+        state=SimpleNamespace(lens=lens), bias=np.array([0.0, 0.0, 0.0, 0.0, accel_bias_m_s2, 0.0])
+    )
+    assert contradicts(solution, gyro_noise, PRIOR, info, ContradictionConfig()) is wrong
 
 
 def test_a_contradiction_is_told_once_it_lasts_and_again_after_an_end() -> None:

@@ -26,11 +26,12 @@ def contradicts(
     gyro_noise: factor on the noise of single samples that the rotations show. lens_info: (8,8) inverse covariance of
     the errors of a calibrated camera. The scale of such a window is wrong, however small its deviation.
     """
-    lens = solution.state.lens
+    lens = float(solution.state.lens @ lens_info @ solution.state.lens)
     off = (solution.bias[3:] - prior.bias[3:]) / prior.sigma[3:]
     return bool(
-        lens @ lens_info @ lens > config.lens_chi2
+        lens > config.lens_chi2
         or gyro_noise > config.gyro_noise
+        or (lens > config.both_lens_chi2 and gyro_noise > config.both_gyro_noise)
         or np.abs(off).max() > config.accel_bias
     )
 
