@@ -43,6 +43,19 @@ class InertialBundleConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class ContradictionConfig:
+    """When images and IMU contradict each other: by a wrong calibration, place of the camera, time offset or unit."""
+
+    lens_chi2: float = 26.0  # squared deviations of the eight errors of a lens: 99.9 % of calibrations have less
+    gyro_noise: float = 5.0  # times that of single samples, as rotations by images show it: 20 ms of delay have 2.8
+    both_lens_chi2: float = 12.0  # of both together: a focal length that is off by a tenth has 13, 20 ms of delay 2
+    both_gyro_noise: float = 1.7  # likewise: a focal length that is off by a tenth has 1.9, worn rigs 1.2
+    accel_bias: float = 5.0  # deviations of the accelerometer's bias: that of missing gravity is 40
+    structure_px: float = 1.2  # median error of corners with the gyro's rotations: 0.3 if these are right, else 2
+    lasts_s: float = 5.0  # time over which all windows contradict before it is said: people in view are gone by then
+
+
+@dataclass(frozen=True, slots=True)
 class InertialStartConfig:
     """When a monocular camera with an IMU knows its scale, and begins a map in metres."""
 
@@ -65,5 +78,6 @@ class InertialStartConfig:
     max_imu_chi2: float = 1.5  # mean squared error of its inertial factors, in deviations
     state_inflation: float = 2.0  # of the deviations of the state with which tracking begins
     depth_sigma: float = 0.25  # relative deviation above which a landmark has no depth yet
+    contradiction: ContradictionConfig = field(default_factory=ContradictionConfig)
     corner_tracks: CornerTracksConfig = field(default_factory=CornerTracksConfig)
     bundle: InertialBundleConfig = field(default_factory=InertialBundleConfig)

@@ -184,3 +184,14 @@ def test_the_table_shows_what_counts(folder: Path) -> None:
     assert lines[0].split()[:4] == ["agent", "frames", "tracked", "lost"]
     assert lines[1].split()[:4] == ["0", "13", "13", "0"]
     assert "digests equal" in lines[2]
+
+
+def test_the_table_tells_what_was_skipped_and_what_to_check() -> None:
+    timing = {"cpu_ms_per_frame": statistic([]), "rss_mib": 1.0}
+    agent = {
+        "frames": 3, "tracked": 0, "lost": 3, "dropped": 0, "keyframes": 0, "bytes_per_keyframe": 0.0, "timing": timing,
+        "skipped": {"imu stamp not increasing": 12}, "notes": ["imu stamp not increasing: at 5 ns", "imu: no gravity"],
+    }  # fmt: skip
+    lines = table({"agents": [agent], "base": None, "notes": ["ended"]}).splitlines()
+    assert lines[-3:] == ["note: ended", "note: 12 skipped: imu stamp not increasing", "note: imu: no gravity"]
+    assert table({"agents": [agent, agent], "base": None}).splitlines()[-1] == "note: agent 1: imu: no gravity"

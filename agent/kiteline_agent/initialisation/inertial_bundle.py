@@ -82,11 +82,16 @@ class InertialBundle:
         self._error = np.zeros((0, 0))  # (K,P) of observations in deviations
         self._used = np.ones(self._landmarks, np.bool_)  # the other landmarks move, or their corners slide along edges
         self._projected: tuple[WindowState, tuple[F64, F64, F64, F64]] | None = None  # the last state's projections
+        self.structure_px = 0.0  # median error of corners in the structure that a solution from nothing starts with
 
     def solve(self, warm: WarmStart | None = None) -> WindowSolution | None:
         """The window's states; None if it is degenerate. warm: states to start from."""
+        with np.errstate(all="ignore"):  # where images and IMU contradict each other it diverges, and is refused
+            return self._solve(warm)
+
+    def _solve(self, warm: WarmStart | None) -> WindowSolution | None:
         try:
-            state = self._align(self._structure()) if warm is None else self._warm_state(warm)
+            state = self._first_state() if warm is None else self._warm_state(warm)
             if state is None:
                 return None
             self._terms.integrate(state)
@@ -123,6 +128,13 @@ class InertialBundle:
         return np.asarray((self._axes @ m[..., None])[..., 0])
 
     # stages
+
+    def _first_state(self) -> WindowState | None:
+        """The state in metres from nothing; None if it is degenerate."""
+        state = self._structure()
+        error = np.linalg.norm(self._project(state)[3][self._obs.seen], axis=-1)
+        self.structure_px = float(np.median(error)) * self._config.sigma_px
+        return self._align(state)
 
     def _structure(self) -> WindowState:
         """Poses and landmarks up to scale: from one depth for all, no translation, and the gyro's rotations."""
@@ -200,6 +212,8 @@ class InertialBundle:
         """
         square = np.where(self._obs.seen, np.sum(self._project(state)[3] ** 2, axis=2), 0.0)
         rms = np.sqrt(square.sum(axis=0) / np.maximum(self._obs.seen.sum(axis=0), 1))
+        if not self._used.any():
+            return False
         fits = rms < self._config.max_rms * max(1.0, float(np.median(rms[self._used])))
         changed = bool((self._used & ~fits).any())
         self._used &= fits

@@ -13,6 +13,7 @@ from kiteline_agent.governor.cost_model import Work
 from kiteline_agent.inertial.preintegration import BiasPrior, Samples
 from kiteline_agent.inertial.sample_buffer import SampleBuffer
 from kiteline_agent.initialisation import lens_correction
+from kiteline_agent.initialisation.contradiction import ContradictionWatch, contradicts
 from kiteline_agent.initialisation.corner_tracks import CornerObservations, CornerTracks, TrackedKeyframe
 from kiteline_agent.initialisation.inertial_bundle import InertialBundle, lens_prior
 from kiteline_agent.initialisation.inertial_window import WarmStart, WindowSolution
@@ -89,7 +90,11 @@ class InertialStart:
         self._before: _Window | None = None
         self._noise: WindowNoise | None = None  # as the windows so far show it
         self._vibration: Vibration | None = None  # of the newest window
-        self._lens_info = lens_prior(start.bundle, camera.fx)  # of what is left of the lens's errors
+        self._lens_prior = lens_prior(start.bundle, camera.fx)
+        self._lens_info = self._lens_prior  # of what is left of the lens's errors
+        self._contradiction = ContradictionWatch(start.contradiction)
+        self._warnings: list[str] = []
+        self._structure_px = 0.0  # of the newest solution from nothing
         self._tried_ns: int | None = None
         self._last_samples_ns: int | None = None  # stamp of the last frame with samples
 
@@ -105,6 +110,11 @@ class InertialStart:
         self._tracks.clear()
         self._before = self._tried_ns = None
         self._noise = self._vibration = None
+
+    def take_warnings(self) -> list[str]:
+        """Events since the last call: what the user should check."""
+        warnings, self._warnings = self._warnings, []
+        return warnings
 
     def add(self, ctx: FrameContext, prior: BiasPrior | None, offset_s: float) -> InertialMap | None:
         """Follow the corners into a frame whose samples were taken in. Returns a map once its scale is known.
@@ -149,6 +159,8 @@ class InertialStart:
             warm, found = None, self._solve(observations, intervals, prior, None)
         if found is None:
             self._before = None
+            wrong_turns = self._structure_px > config.contradiction.structure_px
+            self._note_contradiction(ctx.t_ns, contradicts=True if wrong_turns else None)
             return None
         solution, modelled = found.solution, self._noise
         noise, sigma = self._seen_noise(solution)
@@ -163,7 +175,9 @@ class InertialStart:
             solution = again.solve(WarmStart(solution.state, found.xyz[keep])) or solution
             noise, sigma = self._seen_noise(solution)
         self._before = _Window(stamps, observations.ids, found.xyz, solution)
-        known = solution.converged and self._fits(solution) and sigma < config.scale_sigma
+        wrong, fits = self._contradicts(solution, noise), solution.converged and self._fits(solution)
+        self._note_contradiction(ctx.t_ns, contradicts=wrong if wrong or fits else None)
+        known = fits and sigma < config.scale_sigma and not wrong
         agrees = before is not None and self._agrees(before, self._before)
         self._noise = modelled
         if known and agrees and warm is not None and not self._is_lowest(found, observations, intervals, prior):
@@ -189,6 +203,7 @@ class InertialStart:
     ) -> _Solved | None:
         bundle = self._bundle(corners, intervals, prior)
         solution = bundle.solve(warm)
+        self._structure_px = bundle.structure_px
         return None if solution is None else _Solved(solution, *bundle.landmarks_of(solution.state))
 
     def _is_lowest(
@@ -243,6 +258,13 @@ class InertialStart:
         """True if the errors of images and IMU are as expected: the solver has converged."""
         config = self._config.inertial_start
         return solution.reprojection_px < config.max_reprojection_px and solution.imu_chi2 < config.max_imu_chi2
+
+    def _contradicts(self, solution: WindowSolution, noise: WindowNoise) -> bool:
+        gyro_noise, limits = noise.gyro / self._measured_noise().gyro, self._config.inertial_start.contradiction
+        return contradicts(solution, gyro_noise, self._default_prior(), self._lens_prior, limits)
+
+    def _note_contradiction(self, t_ns: int, *, contradicts: bool | None) -> None:
+        self._warnings += self._contradiction.note(t_ns, contradicts=contradicts)
 
     def _agrees(self, before: _Window, now: _Window) -> bool:
         """True if later frames confirm the scale: the keyframes of both solutions are as far apart in both."""

@@ -79,6 +79,7 @@ class LossStage:
                 self.failed_searches = 0
                 placed = opened.placed
                 events += opened.events
+            events += self._submaps.take_warnings()
         if placed:
             self._camera.motion.restart(ctx.t_ns)
             bridged = False

@@ -114,6 +114,10 @@ class SubmapStage:
             self._share_tie(self._loss, camera.motion.loss_motion.begin(ctx.t_ns, camera.T_m_b, R_o_m))
         return OpenedSubmap(True, ["submap: opened"])
 
+    def take_warnings(self) -> list[str]:
+        """Events since the last call: what keeps a monocular map from its scale."""
+        return [] if self._inertial_start is None else self._inertial_start.take_warnings()
+
     def _measure_loss(self, ctx: FrameContext) -> None:
         """Share the motion over the loss again, once images in the new submap have shown the velocity."""
         estimator, loss = self._camera.motion.loss_motion, self._loss

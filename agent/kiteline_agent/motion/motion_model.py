@@ -66,7 +66,7 @@ class MotionModel:
         if self.tracker is not None and imu is not None and metric:
             self.loss_motion = LossMotionEstimator(self.tracker, imu, config.loss_motion, config.gravity_m_s2)
         self.odometer = Odometer(camera.T_b_c, odometer, metric=metric)
-        self._watch = ImuWatch(config.silent_s)
+        self._watch = ImuWatch(config.silent_s, config.gravity_m_s2)
         self._events: list[str] = []
 
     @property

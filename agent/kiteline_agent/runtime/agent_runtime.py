@@ -55,6 +55,7 @@ from kiteline_hw.system.vocabulary import shipped_vocabulary
 
 SAVE_FRAMES = 200  # frames between two looks at whether the rig file is up to date
 PROGRESS_FRAMES = 10  # frames between two reports of progress, and between two readings of the memory in use
+_WARNING, _MOST_WARNINGS = "imu:", 10  # events that begin so are noted in the report, as many at most
 
 
 class AgentRuntime:
@@ -74,6 +75,7 @@ class AgentRuntime:
         self.source = source
         self.channel = channel
         self.counts = FrameCounts()
+        self._warnings: list[str] = []
         self.flight_counts: dict[str, int | float] | None = None  # when the last frame had been flown
         self.rss_mib = 0.0
         grid = "agent" if options.grid == "base" and isinstance(channel, NoBaseChannel) else options.grid
@@ -235,6 +237,8 @@ class AgentRuntime:
             self._record.step(step_input, output, now_ns, now_ns + self._log_shift_ns)
         if frame is not None:
             self.counts.count(output.estimate, output.predicted)
+            if len(self._warnings) < _MOST_WARNINGS:
+                self._warnings += [event for event in output.events if event.startswith(_WARNING)]
             if self._record is not None:
                 self._record.pose(output)
             if not self._live_clock:
@@ -267,7 +271,7 @@ class AgentRuntime:
         skipped, notes = self.source.report.skipped, list(self.source.report.notes)
         if self._encoder.stored:
             notes.append(f"log: {self._encoder.stored} images stored uncompressed, as encoding fell behind")
-        notes += self.log_notes()
+        notes += [*self._warnings, *self.log_notes()]
         return {
             "source": self.source.name,
             **self.flight_counts,

@@ -12,6 +12,7 @@ from kiteline_hw.ports import SourceError
 F64 = NDArray[np.float64]
 
 LONGEST_READOUT_S = 0.2  # no video camera is slower
+_FAR_FROM_MIDDLE = 0.25  # of a side: centres of lenses and of cropped images lie nearer to the middle
 
 _EQUIDISTANT = ("equidistant", "fisheye", "kannalabrandt", "kannalabrandt4", "kannalabrandt8", "kb4")
 _RADTAN = ("radialtangential", "radtan", "plumbbob", "rationalpolynomial", "opencv", "browncornrady", "brown")
@@ -53,6 +54,16 @@ def checked_camera(camera: CameraModel, where: str) -> CameraModel:
             f"{where}: no usable calibration (fx {camera.fx}, fy {camera.fy}, {camera.width}x{camera.height} px)"
         )
     return camera
+
+
+def doubts(camera: CameraModel, name: str) -> list[str]:
+    """Notes about intrinsics that can be used and are hardly right. name: of the camera."""
+    off = max(abs(camera.cx / camera.width - 0.5), abs(camera.cy / camera.height - 0.5))
+    if off < _FAR_FROM_MIDDLE:
+        return []
+    centre, size = f"({camera.cx:g}, {camera.cy:g}) px", f"{camera.width}x{camera.height} px"
+    told = f"the centre of the {name} camera, {centre}, is far from the middle of {size}"
+    return [f"calibration: {told}: are its intrinsics those of other images, or of another size?"]
 
 
 def checked_readout(readout_s: float, where: str) -> float:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from kiteline_core.frame import EncodedImage, Frame, ImuBatch
 from kiteline_core.geometry.cameras import CameraModel, CameraRig
+from kiteline_hw.calibration.checks import doubts
 from kiteline_hw.ports import SourceError, SourceReport
 from kiteline_hw.sensors.images import ImageRef, decode_depth
 from kiteline_hw.sensors.imu_buffer import ImuSamples
@@ -130,6 +131,7 @@ def decode_frames(
     """
     last_ns = -(2**63)
     delivered = paired = 0
+    report.notes += doubts(rig.left, "left") + ([] if rig.right is None else doubts(rig.right, "right"))
     grey = SensorBits() if grey is None else grey
     for encoded in frames:
         if encoded.t_ns <= last_ns:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import heapq
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -20,8 +20,8 @@ from kiteline_core.geometry.cameras import CameraModel, CameraRig
 from kiteline_hw.calibration.checks import checked_baseline
 from kiteline_hw.calibration.euroc import read_camera, read_imu
 from kiteline_hw.calibration.files import read_calibration
-from kiteline_hw.calibration.nodes import read_nodes
-from kiteline_hw.calibration.told import ToldCalibration
+from kiteline_hw.calibration.nodes import Node, read_nodes
+from kiteline_hw.calibration.told import FilePart, ToldCalibration
 from kiteline_hw.ports import SourceError, SourceReport
 from kiteline_hw.sensors.frames import EncodedFrame, pair_by_time, pair_tolerance_ns
 from kiteline_hw.sensors.images import ImageFile
@@ -31,9 +31,18 @@ from kiteline_hw.sources.text_files import listed_file, nanoseconds, pose_from_t
 
 F64 = NDArray[np.float64]
 
+_CAMERA_KEYS = (
+    "T_BS (data: 16 numbers), resolution [width, height], intrinsics [fu, fv, cu, cv], distortion_model and "
+    "distortion_coefficients of a camera"
+)
+_IMU_KEYS = "T_BS (data: 16 numbers) and the noise of an IMU"
+
 
 def open_source(folder_name: str, mono: bool, imu: bool, told: ToldCalibration | None = None) -> Recording:
-    """Open an ASL folder (it holds mav0, or is mav0). told: used where no sensor.yaml is. Raises SourceError."""
+    """Open an ASL folder (it holds mav0, or is mav0).
+
+    told: used where no sensor.yaml is, or none that can be read. Raises SourceError.
+    """
     folder = Path(folder_name)
     mav = folder / "mav0" if (folder / "mav0").is_dir() else folder
     if not (mav / "cam0").is_dir():
@@ -46,6 +55,19 @@ def open_source(folder_name: str, mono: bool, imu: bool, told: ToldCalibration |
             f"{mav / 'cam0' / 'sensor.yaml'}: no such file: expected the camera's calibration, for TUM-VI's folders "
             "camchain.yaml beside mav0 or in dso, or --calibration FILE"
         )
+    try:
+        return _open_by_sensor_files(folder, mav, mono, imu)
+    except _UnreadableSensor:
+        if told is None or not told.cameras:
+            raise
+        return _open_told(folder, mav, told, mono, imu)
+
+
+class _UnreadableSensor(SourceError):
+    """A sensor.yaml of another form."""
+
+
+def _open_by_sensor_files(folder: Path, mav: Path, mono: bool, imu: bool) -> Recording:
     left, T_s_c = _read_camera(mav / "cam0")
     # The files give cameras and ground truth in their own frame "B" (here: s); the body frame is that of the IMU.
     T_s_i, noise = _read_imu_calibration(mav / "imu0")
@@ -121,7 +143,7 @@ def _read_imu(path: Path, report: SourceReport) -> ImuSamples:
 
 def _read_camera(folder: Path) -> tuple[CameraModel, F64]:
     """The camera and its T_BS (4,4)."""
-    part = read_camera(read_nodes(folder / "sensor.yaml"))
+    part = _read_sensor(folder / "sensor.yaml", read_camera, _CAMERA_KEYS)
     assert part.T_s_c is not None
     return part.calibration.cameras[0], part.T_s_c
 
@@ -130,9 +152,19 @@ def _read_imu_calibration(folder: Path) -> tuple[F64, ImuCalibration | None]:
     """The IMU's T_BS (4,4) and noise; identity and None without an IMU."""
     if not folder.is_dir():
         return np.eye(4), None
-    part = read_imu(read_nodes(folder / "sensor.yaml"))
+    part = _read_sensor(folder / "sensor.yaml", read_imu, _IMU_KEYS)
     assert part.T_s_i is not None
     return part.T_s_i, part.calibration.imu
+
+
+def _read_sensor(path: Path, read: Callable[[Node], FilePart], keys: str) -> FilePart:
+    """A sensor.yaml. Raises _UnreadableSensor, which says what one holds."""
+    try:
+        return read(read_nodes(path))
+    except SourceError as error:
+        raise _UnreadableSensor(
+            f"{error}; EuRoC's sensor.yaml holds {keys}; mend it, or use another calibration with --calibration FILE"
+        ) from error
 
 
 def _list_stamped(folder: Path) -> Stamped:

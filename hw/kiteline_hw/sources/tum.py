@@ -5,6 +5,7 @@ from __future__ import annotations
 import heapq
 import re
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from kiteline_hw.sources.recording import Recording, Stamped, image_size, list_i
 from kiteline_hw.sources.text_files import listed_file, read_rows, read_tum_poses, read_yaml, seconds_to_ns, yaml_number
 
 DEPTH_SCALE = 5000.0  # stored units a metre, as the data set's page says
+_MOST_BACKWARD = 0.1  # share of stamps before that of the line above, beyond which they are no times of the images
 
 # Intrinsics that the data set's page gives for its three cameras, 640x480.
 FREIBURG = {
@@ -66,11 +68,23 @@ def _list_stamped(folder: Path, kind: str) -> Stamped:
                 if len(cells) < 2:
                     raise ValueError(f"{' '.join(cells)!r} is no 't filename'")
                 out.append((seconds_to_ns(cells[0]), listed_file(folder, cells[1], listing)))
+            _check_order(out, listing)
         else:
             out = [(seconds_to_ns(path.stem), path) for path in list_images(folder / kind)]
     except ValueError as error:
         raise SourceError(f"{listing}: {error}: expected a time in seconds and a file name a line") from error
     return sorted(out)
+
+
+def _check_order(listed: Stamped, listing: Path) -> None:
+    """Raise SourceError if stamps jump back and forth: sorted by them the images would be in a random order."""
+    back = [k for k, (before, after) in enumerate(pairwise(listed), 2) if after[0] < before[0]]
+    if len(back) > _MOST_BACKWARD * len(listed):
+        raise SourceError(
+            f"{listing}: {len(back)} of {len(listed)} stamps are earlier than that of the line before, first that of "
+            f"{listed[back[0] - 1][1].name}: expected the time of each image since a common beginning in s, not the "
+            "time since the image before"
+        )
 
 
 def _read_calibration(folder: Path, colour: Stamped, told: ToldCalibration | None) -> tuple[CameraModel, float]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -69,8 +69,17 @@ def table(report: Report) -> str:
             f"{base['merges']} merges, digests {digests}, bundle {base['timing']['bundle_ms']['p50']:.1f} ms, "
             f"{base['timing']['rss_mib']:.0f} MiB"
         )
-    lines.extend(f"note: {note}" for note in report.get("notes", ()))
+    lines.extend(f"note: {note}" for note in (*report.get("notes", ()), *_agent_notes(report["agents"])))
     return "\n".join(lines)
+
+
+def _agent_notes(agents: Sequence[Report]) -> Iterator[str]:
+    """What each agent's source skipped, by reason, and its other notes."""
+    for k, agent in enumerate(agents):
+        skipped = agent.get("skipped", {})
+        notes = [f"{count} skipped: {reason}" for reason, count in skipped.items()]
+        notes += [note for note in agent.get("notes", ()) if note.partition(": ")[0] not in skipped]  # no examples
+        yield from (f"agent {k}: {note}" if len(agents) > 1 else note for note in notes)
 
 
 def _metres(accuracy: Mapping[str, float] | None) -> str:

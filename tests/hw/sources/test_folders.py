@@ -1,5 +1,6 @@
 """Data set folders: the recordings, and small ones with every fault that folders have."""
 
+import re
 from pathlib import Path
 
 import cv2
@@ -161,6 +162,19 @@ def test_euroc_broken_images_are_skipped_and_counted(tmp_path: Path) -> None:
     assert any("64x40" in note and "64x48" in note for note in source.report.notes)
 
 
+def test_intrinsics_of_another_size_are_doubted(tmp_path: Path) -> None:
+    source = open_source(str(euroc(tmp_path)))
+    read(source)
+    assert source.report.notes == []
+    sensor = tmp_path / "mav0/cam1/sensor.yaml"
+    sensor.write_text(re.sub(r"intrinsics: .*", "intrinsics: [60.0, 60.0, 12.0, 8.0]", sensor.read_text()))
+    source = open_source(str(tmp_path))
+    for _ in range(2):  # once in each reading
+        read(source)
+        assert len(source.report.notes) == 1
+    assert source.report.notes[0].startswith("calibration: the centre of the right camera, (12, 8) px, is far from")
+
+
 def test_euroc_left_and_right_are_paired_by_time(tmp_path: Path) -> None:
     root = euroc(tmp_path)
     late = (root / "mav0/cam1/data.csv").read_text().splitlines()
@@ -216,6 +230,18 @@ def test_euroc_errors(tmp_path: Path) -> None:
         open_source(str(broken))
 
 
+def test_a_sensor_file_of_another_form_says_what_one_holds_and_another_calibration_replaces_it(tmp_path: Path) -> None:
+    told = tmp_path / "told.yaml"
+    told.write_text((euroc(tmp_path / "flat") / "mav0/cam0/sensor.yaml").read_text())
+    other = euroc(tmp_path / "other")
+    for text in ("T_cam0_body: !!opencv-matrix\n   rows: 4 cols: 4 dt: d\n", "intrinsics: [fx: 400.0, fy: 400.0]\n"):
+        (other / "mav0/cam0/sensor.yaml").write_text(text)
+        with pytest.raises(SourceError, match=r"cam0/sensor\.yaml.*holds T_BS.*--calibration FILE"):
+            open_source(str(other))
+        source = open_source(str(other), mono=True, calibration=str(told))
+        assert source.rig.left == open_source(str(tmp_path / "flat"), mono=True).rig.left
+
+
 def test_layouts_that_are_not_read_say_what_helps(tmp_path: Path) -> None:
     fpv, seasons = tmp_path / "indoor_forward_3", tmp_path / "recording"
     fpv.mkdir()
@@ -264,6 +290,19 @@ def test_tum_association_and_scale(tmp_path: Path) -> None:
     (tmp_path / "depth.txt").write_text("110.0 depth/0.png")
     with pytest.raises(SourceError, match="not one usable image with its depth"):
         read(open_source(str(tmp_path)))
+
+
+def test_tum_stamps_that_jump_back_and_forth_are_an_error(tmp_path: Path) -> None:
+    root = tum(tmp_path)
+    lines = (root / "rgb.txt").read_text().splitlines()
+    (root / "rgb.txt").write_text("\n".join(lines[:2] + lines[:1:-1] + [f"{200 + i} rgb/0.png" for i in range(20)]))
+    assert len(read(open_source(str(root)))[0]) == 24, "a few lines that changed places are sorted"
+    for name in ("rgb", "depth"):
+        steps = [f"{0.016 + 0.001 * (-1) ** i:.3f} {name}/{i}.png" for i in range(4)]  # times since the image before
+        (root / f"{name}.txt").write_text("\n".join(steps))
+        with pytest.raises(SourceError, match=rf"{name}\.txt.*earlier than that of the line before.*time of each"):
+            open_source(str(root))
+        tum(tmp_path)
 
 
 def test_tum_defaults_by_name_else_an_error(tmp_path: Path) -> None:

@@ -1,0 +1,59 @@
+"""Images and IMU that contradict each other: how a window shows it, and the event once it lasts."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kiteline_agent.inertial.preintegration import BiasPrior
+from kiteline_agent.inertial_start_config import ContradictionConfig
+from kiteline_agent.initialisation.inertial_window import WindowSolution
+
+F64 = NDArray[np.float64]
+
+_WARNING = (
+    "imu: images and IMU contradict each other, so that no scale is known: check the camera's place in the IMU's axes "
+    "(T_BS), the time offset, the intrinsics and the units (rad/s, m/s^2); without the IMU (--no-imu) the images alone "
+    "can be flown"
+)
+
+
+def contradicts(
+    solution: WindowSolution, gyro_noise: float, prior: BiasPrior, lens_info: F64, config: ContradictionConfig
+) -> bool:
+    """True if a window fits only with errors of lens, gyro or accelerometer that no calibrated sensor has.
+
+    gyro_noise: factor on the noise of single samples that the rotations show. lens_info: (8,8) inverse covariance of
+    the errors of a calibrated camera. The scale of such a window is wrong, however small its deviation.
+    """
+    lens = float(solution.state.lens @ lens_info @ solution.state.lens)
+    off = (solution.bias[3:] - prior.bias[3:]) / prior.sigma[3:]
+    return bool(
+        lens > config.lens_chi2
+        or gyro_noise > config.gyro_noise
+        or (lens > config.both_lens_chi2 and gyro_noise > config.both_gyro_noise)
+        or np.abs(off).max() > config.accel_bias
+    )
+
+
+class ContradictionWatch:
+    """Reports once that all windows of some seconds contradict, and again after one that does not."""
+
+    def __init__(self, config: ContradictionConfig) -> None:
+        self._config = config
+        self._since_ns: int | None = None  # first of the windows that contradict
+        self._told = False
+
+    def note(self, t_ns: int, *, contradicts: bool | None) -> list[str]:
+        """Process a window that ends at t_ns; returns the events for the log. contradicts: None if it tells neither."""
+        if contradicts is None:
+            return []
+        if not contradicts:
+            self._since_ns, self._told = None, False
+            return []
+        if self._since_ns is None:
+            self._since_ns = t_ns
+        if self._told or (t_ns - self._since_ns) * 1e-9 < self._config.lasts_s:
+            return []
+        self._told = True
+        return [_WARNING]

@@ -1,0 +1,128 @@
+"""Images and IMU that contradict each other: no map in metres begins, and the user is told what to check."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from kiteline_agent.config import AgentConfig
+from kiteline_agent.governor.cost_model import Work
+from kiteline_agent.inertial.preintegration import Samples
+from kiteline_agent.inertial_start_config import ContradictionConfig
+from kiteline_agent.initialisation import inertial_start
+from kiteline_agent.initialisation.contradiction import ContradictionWatch, contradicts
+from kiteline_agent.initialisation.corner_tracks import CornerObservations
+from kiteline_agent.initialisation.inertial_start import InertialStart
+from kiteline_agent.initialisation.window_noise import WindowNoise
+from tests.agent.test_inertial_bundle import CALIBRATION, PRIOR, window
+from tests.agent.test_inertial_start import CAMERA, Tracks
+
+Change = Callable[[CornerObservations, list[Samples]], tuple[CornerObservations, list[Samples]]]
+
+
+def start_with(monkeypatch: pytest.MonkeyPatch, change: Change, keyframes: int = 36) -> tuple[float, list[str]]:
+    """Seconds until a map begins (infinite if none does) on a changed window, and the warnings until then."""
+    corners, samples, _ = window(1, keyframes=keyframes, noise_px=0.2)
+    corners, samples = change(corners, samples)
+    monkeypatch.setattr(InertialStart, "_points", lambda *_: SimpleNamespace(sigma_rho=np.ones(100)))
+    monkeypatch.setattr(inertial_start, "realigned", lambda _keyframes, observations, *_: observations)
+    start = InertialStart(CAMERA, CALIBRATION, AgentConfig(), Work())
+    start._tracks = Tracks(corners)  # type: ignore[assignment]
+    monkeypatch.setattr(start, "_intervals", lambda keyframes, _offset: samples[: len(keyframes) - 1])
+    monkeypatch.setattr(start, "_measured_noise", WindowNoise)
+    warnings: list[str] = []
+    for k in range(keyframes):
+        ctx: Any = SimpleNamespace(t_ns=250_000_000 * k, images=SimpleNamespace(left=None))
+        found = start.add(ctx, None, 0.0)
+        warnings += start.take_warnings()
+        if found is not None:
+            return ctx.t_ns * 1e-9, warnings
+    return float("inf"), warnings
+
+
+def unchanged(corners: CornerObservations, samples: list[Samples]) -> tuple[CornerObservations, list[Samples]]:
+    return corners, samples
+
+
+def longer_focal_length(corners: CornerObservations, samples: list[Samples]) -> Any:
+    """Corners as a camera shows them whose focal length is a tenth longer than told."""
+    return replace(corners, xy=1.1 * corners.xy), samples
+
+
+def turned(R: NDArray[np.float64]) -> Change:
+    def change(corners: CornerObservations, samples: list[Samples]) -> Any:
+        return corners, [replace(s, gyro=s.gyro @ R.T, accel=s.accel @ R.T) for s in samples]
+
+    return change
+
+
+def in_g(corners: CornerObservations, samples: list[Samples]) -> Any:
+    return corners, [replace(s, accel=s.accel / 9.81) for s in samples]
+
+
+def in_degrees(corners: CornerObservations, samples: list[Samples]) -> Any:
+    return corners, [replace(s, gyro=np.degrees(s.gyro)) for s in samples]
+
+
+def test_a_rig_as_calibrated_begins_a_map_and_warns_of_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    begun_s, warnings = start_with(monkeypatch, unchanged)
+    assert begun_s < 9.0
+    assert warnings == []
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        longer_focal_length,
+        turned(np.diag([1.0, -1.0, -1.0])),
+        turned(np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])),
+        in_g,
+        in_degrees,
+    ],
+    ids=["focal length", "two axes negated", "a quarter turn", "accelerations in g", "rates in degrees"],
+)
+def test_a_rig_that_is_not_as_calibrated_begins_none_and_says_so_once(
+    monkeypatch: pytest.MonkeyPatch, change: Change
+) -> None:
+    begun_s, warnings = start_with(monkeypatch, change)
+    assert begun_s == float("inf")
+    assert len(warnings) == 1
+    assert "T_BS" in warnings[0] and "--no-imu" in warnings[0]
+
+
+@pytest.mark.parametrize(
+    ("lens_chi2", "gyro_noise", "accel_bias_m_s2", "wrong"),
+    [
+        (2.0, 2.8, 0.1, False),  # images that are 20 ms late, which tracking finds
+        (17.0, 1.2, 0.3, False),  # worn rigs
+        (14.0, 1.9, 0.1, True),  # a focal length that is off by a tenth
+        (32.0, 1.2, 0.1, True),
+        (2.0, 7.0, 0.1, True),  # images that are 50 ms late
+        (2.0, 0.8, 8.0, True),  # accelerations in g
+    ],
+)
+def test_what_calibrated_and_worn_rigs_show_is_no_contradiction(
+    lens_chi2: float, gyro_noise: float, accel_bias_m_s2: float, wrong: bool
+) -> None:
+    info = np.diag(np.full(8, 1e4))
+    lens = np.array([1.0, 0, 0, 0, 0, 0, 0, 0]) * np.sqrt(lens_chi2 / 1e4)
+    solution: Any = SimpleNamespace(
+        state=SimpleNamespace(lens=lens), bias=np.array([0.0, 0.0, 0.0, 0.0, accel_bias_m_s2, 0.0])
+    )
+    assert contradicts(solution, gyro_noise, PRIOR, info, ContradictionConfig()) is wrong
+
+
+def test_a_contradiction_is_told_once_it_lasts_and_again_after_an_end() -> None:
+    watch = ContradictionWatch(ContradictionConfig(lasts_s=5.0))
+    said: list[int] = []
+    for k in range(60):
+        tells = k % 3 != 1  # every third window tells neither
+        events = watch.note(500_000_000 * k, contradicts=k not in (3, 30) if tells else None)
+        said += [k] * len(events)
+    assert said == [15, 42]
