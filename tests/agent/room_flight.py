@@ -54,7 +54,6 @@ def render() -> RoomFlight:
     """6.5 s in full motion along the room's own course, at half the usual size."""
     source = open_sim("room", seconds=6.5, seed=5, scale=0.5, texture_bits=9, rest=0.0, odometry=50.0)
     truth, driven = source.ground_truth, source.odometry()
-    assert truth is not None
     assert driven is not None
     assert source.imu is not None
     frames = [item for item in source if isinstance(item, Frame)]

@@ -50,7 +50,6 @@ def first_frames(source: FrameSource, n: int) -> list[Frame | ImuBatch]:
 def step_errors_m(source: FrameSource, estimates: list[Estimate]) -> NDArray[np.float64]:
     """Error of the motion between frames that have a true pose at their time."""
     truth = source.ground_truth
-    assert truth is not None
     at = {int(t): T for t, T in zip(truth.t_ns, truth.T_w_b)}
     known = [e for e in estimates if e.t_ns in at and e.T_m_b is not None]
     errors = []
@@ -171,5 +170,5 @@ def test_nothing_to_see_is_no_error() -> None:
     grey = np.full((240, 320), 100, np.uint8)
     for k in range(6):
         estimate = agent.step(StepInput(Frame(k * 50_000_000, grey, grey)), k * 50_000_000).estimate
-        assert estimate is not None and not estimate.tracked
+        assert not estimate.tracked
         assert estimate.quality == -1 and estimate.T_m_b is None

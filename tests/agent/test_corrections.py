@@ -104,7 +104,7 @@ def test_a_merge_is_taken_over_at_once_and_later_corrections_slowly(corrections:
     corrections.take([SubmapPlacement(FIRST, np.eye(4), recognised=True)], [])
     later = corrections.in_world(FIRST, np.eye(4), np.eye(4), 150_000_000, metric=True)
     assert merged is not None and np.allclose(merged, near)
-    assert later is not None and 0.29 < later[0, 3] < 0.3
+    assert 0.29 < later[0, 3] < 0.3
 
 
 def test_a_merge_of_a_submap_that_began_in_a_tracked_frame_is_smoothed(corrections: Corrections) -> None:
@@ -118,7 +118,6 @@ def test_a_merge_of_a_submap_that_began_in_a_tracked_frame_is_smoothed(correctio
         if k == 3:
             corrections.take([SubmapPlacement(FIRST, moved, recognised=True)], [])
         told = corrections.in_world(FIRST, np.eye(4), np.eye(4), 50_000_000 * k, metric=True)
-        assert told is not None
         path.append(told[0, 3])
     assert np.diff(path).max() < 0.003
     assert path[-1] == pytest.approx(0.04)
@@ -132,7 +131,7 @@ def test_time_without_a_placement_does_not_add_up_to_a_jump(corrections: Correct
         corrections.in_world(SECOND, np.eye(4), np.eye(4), 50_000_000 * k, metric=True)
     corrections.take([SubmapPlacement(SECOND, se3.from_rt(np.eye(3), np.array([0.2, 0.0, 0.0])))], [])
     told = corrections.in_world(SECOND, np.eye(4), np.eye(4), 600_000_000, metric=True)
-    assert told is not None and 0.0 < told[0, 3] < 0.003
+    assert 0.0 < told[0, 3] < 0.003
 
 
 @pytest.mark.parametrize("scale_sigma", [0.0, 0.001])
@@ -147,5 +146,4 @@ def test_places_are_corrected_by_shares_where_lengths_rest_on_accelerations(
         if k == 3:
             corrections.take([SubmapPlacement(FIRST, moved, scale_sigma=scale_sigma)], [])
         told = corrections.in_world(FIRST, np.eye(4), np.eye(4), 50_000_000 * k, metric=True)
-    assert told is not None
     assert told[0, 3] == pytest.approx(0.04 if scale_sigma == 0.0 else 0.04 * (1.0 - np.exp(-0.2)), rel=0.02)

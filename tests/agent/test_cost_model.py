@@ -82,7 +82,7 @@ def test_a_search_enters_a_few_keyframes_the_newest_first(recording: Path) -> No
         agent.work.clear()
         relocaliser.enter_keyframes()
         assert agent.work.places == (entered <= len(held))
-        assert relocaliser._index is not None and relocaliser._index.keys == held[:entered]
+        assert relocaliser._index.keys == held[:entered]
 
 
 def test_less_effort_is_counted_as_less(recording: Path) -> None:

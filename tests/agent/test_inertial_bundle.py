@@ -72,7 +72,6 @@ def scale_of(solution: WindowSolution, truth: F64) -> float:
 def test_scale_gravity_and_motion_are_found_without_a_first_guess(seed: int) -> None:
     corners, samples, truth = window(seed)
     found = bundle(corners, samples).solve()
-    assert found is not None
     assert abs(np.log(scale_of(found, truth))) < max(4.0 * found.scale_sigma, 0.01)
     assert found.scale_sigma < 0.05
     down_b = found.T_w_b[:3, :3].T @ found.gravity / 9.81
@@ -90,7 +89,6 @@ def test_deviations_of_the_scale_are_honest() -> None:
     for seed in range(12):
         corners, samples, truth = window(seed, keyframes=11)
         found = bundle(corners, samples).solve()
-        assert found is not None
         ratios.append(np.log(scale_of(found, truth)) / found.scale_sigma)
     assert 0.05 < np.sqrt(np.mean(np.square(ratios))) < 1.5
 
@@ -134,13 +132,12 @@ def test_a_warm_start_of_another_size_ends_at_the_scale_that_a_vibrating_imu_tel
     args = (corners, samples, CALIBRATION, T_B_C, FOCAL, 9.81, PRIOR, CONFIG, noise)
     solver = InertialBundle(*args)
     right = solver.solve()
-    assert right is not None
     xyz, _ = solver.landmarks_of(right.state)
     camera = right.state.p + right.state.R @ T_B_C[:3, 3]
     away = (factor - 1.0) * (camera - camera[0])
     wrong = replace(right.state, p=right.state.p + away, v=factor * right.state.v)
     found = InertialBundle(*args).solve(WarmStart(wrong, camera[0] + factor * (xyz - camera[0])))
-    assert found is not None and found.converged
+    assert found.converged
     assert found.cost < right.cost + 0.5
     ratio = np.linalg.norm(found.state.p - found.state.p[0]) / np.linalg.norm(right.state.p - right.state.p[0])
     assert abs(np.log(ratio)) < 0.5 * right.scale_sigma
@@ -169,7 +166,6 @@ def test_noise_of_the_accelerometer_is_found_from_more_than_there_is(factor: flo
     noise, config = WindowNoise(accel=20.0), replace(CONFIG, sigma_px=0.5, huber=1.5)  # corners are as good as said
     for _ in range(3):
         found = InertialBundle(corners, shaken, CALIBRATION, T_B_C, FOCAL, 9.81, PRIOR, config, noise).solve()
-        assert found is not None
         noise = found.evidence.updated(noise, 6.0)
     assert 0.5 * factor < noise.accel < 2.0 * factor
     assert noise.gyro < 3.0
@@ -208,7 +204,6 @@ def test_corners_that_walk_are_left_out(seed: int) -> None:
     assert found.reprojection_px < 1.2 * still.reprojection_px
     # and they become no landmarks of the map
     placed = bundle(crowd, samples).place_landmarks(found.state)
-    assert placed is not None
     newest = corners.seen[-1]
     assert (placed.depth_sigma[walks & newest] > 0.25).mean() > 0.9
     assert (placed.depth_sigma[~walks & newest] < 0.25).mean() > 0.7
@@ -219,7 +214,6 @@ def test_costs_with_and_without_walking_corners_can_be_compared() -> None:
     corners, samples, truth = window(1)
     crowd, walks = walking(corners, truth, 0.3, 1)
     with_them, without = bundle(crowd, samples).solve(), bundle(crowd.part(np.flatnonzero(~walks)), samples).solve()
-    assert with_them is not None and without is not None
     observations = np.count_nonzero(corners.seen[:, walks])
     each = CONFIG.huber * (CONFIG.max_rms - 0.5 * CONFIG.huber)
     assert with_them.cost - without.cost == pytest.approx(observations * each, rel=0.2)  # some corners that stay, too
@@ -245,7 +239,6 @@ def test_a_warm_start_ends_where_a_cold_one_does() -> None:
     corners, samples, truth = window(4, keyframes=14)
     first = bundle(replace(corners, xy=corners.xy[:12], seen=corners.seen[:12]), samples[:11])
     before = first.solve()
-    assert before is not None
     xyz, _ = first.landmarks_of(before.state)
     xyz[::7] = np.nan  # new corners
     warm, cold = bundle(corners, samples).solve(WarmStart(before.state, xyz)), bundle(corners, samples).solve()
@@ -256,7 +249,6 @@ def test_a_warm_start_ends_where_a_cold_one_does() -> None:
 def test_the_state_is_that_of_the_newest_keyframe() -> None:
     corners, samples, truth = window(5)
     found = bundle(corners, samples).solve()
-    assert found is not None
     xyz = np.full(3, np.nan)
     assert found.cov.shape == (17, 17) and np.linalg.eigvalsh(found.cov).min() > 0.0 and np.isnan(xyz).all()
     speed = np.linalg.norm(truth[-1, :3, 3] - truth[-2, :3, 3]) / 0.25
@@ -266,9 +258,7 @@ def test_the_state_is_that_of_the_newest_keyframe() -> None:
 def test_landmarks_are_placed_with_known_poses() -> None:
     corners, samples, truth = window(2)
     few = bundle(corners.part(np.arange(min(60, len(corners.ids)))), samples).solve()
-    assert few is not None
     every = bundle(corners, samples).place_landmarks(few.state)
-    assert every is not None
     known = (every.depth_sigma < 0.1) & corners.seen[-1]
     assert known.sum() > 10
     # true depths by the observations themselves: the ray through the newest pixel at that depth meets the others

@@ -96,7 +96,6 @@ def run(
 
 
 def apart_m(state: InertialState | None, T: F64) -> float:
-    assert state is not None
     return float(np.linalg.norm(state.T_m_b[:3, 3] - T[:3, 3]))
 
 
@@ -138,7 +137,6 @@ def test_prediction_is_near_what_comes() -> None:
     for k, step in enumerate(steps):
         ahead = tracker.predict(step.imu if k else None, step.t_ns)
         if k >= 30:
-            assert ahead is not None
             assert np.linalg.norm(ahead.T_m_b[:3, 3] - step.truth[:3, 3]) < 0.006
             assert np.linalg.norm(se3.so3_log(ahead.T_m_b[:3, :3].T @ step.truth[:3, :3])) < 0.003
         tracker.update(step.t_ns, step.visual, step.points)
@@ -295,7 +293,6 @@ def test_a_moved_map_and_a_new_one() -> None:
         )  # fmt: skip
         ahead = tracker.predict(step.imu, step.t_ns)
         if 40 <= k < 60:
-            assert ahead is not None
             assert np.linalg.norm(ahead.T_m_b[:3, 3] - (T @ step.truth)[:3, 3]) < 0.006
         tracker.update(step.t_ns, T @ step.visual, points)
     assert tracker.running and tracker.state is not None
@@ -311,7 +308,6 @@ def test_a_new_map_after_a_blackout_needs_no_new_start() -> None:
         if 30 <= k <= 50:
             state = tracker.dead_reckon(step.t_ns)
         if k == 50:  # texture again, but nothing that is known
-            assert state is not None
             shift = state.T_m_b @ se3.inverse(step.truth)
             tracker.begin_map(step.t_ns, state.T_m_b)
             assert tracker.image_loss_s == 0.0
@@ -329,5 +325,4 @@ def test_a_new_map_after_a_blackout_needs_no_new_start() -> None:
 def test_the_same_input_gives_the_same_output() -> None:
     steps = flight(40, 9)
     a, b = run(steps)[1][-1], run(steps)[1][-1]
-    assert a is not None and b is not None
     assert np.array_equal(a.T_m_b, b.T_m_b) and np.array_equal(a.cov, b.cov)

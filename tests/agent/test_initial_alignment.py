@@ -73,7 +73,6 @@ def test_velocity_and_gravity_in_a_map_of_any_tilt(seed: int, tilt: float) -> No
     found = imu_alignment.align(
         se3.from_rt(turn, np.array([1.0, 2.0, 3.0])) @ poses, P_B_C, motions, np.zeros(6), 9.81, with_scale=False
     )
-    assert found is not None
     np.testing.assert_allclose(found.gravity, turn @ GRAVITY, atol=0.03)
     np.testing.assert_allclose(found.velocities, velocities @ turn.T, atol=0.01)
     assert found.residual_m < 1e-3 and found.gravity_error < 0.01
@@ -89,7 +88,6 @@ def test_scale_of_a_map_without_one(seed: int) -> None:
     offset = poses[:, :3, :3] @ P_B_C
     mono[:, :3, 3] = (poses[:, :3, 3] + offset + 0.002 * rng.normal(size=(41, 3))) / scale - offset
     found = imu_alignment.align(mono, P_B_C, motions, np.zeros(6), 9.81, with_scale=True)
-    assert found is not None
     assert found.scale == pytest.approx(scale, rel=0.03)
     assert abs(found.scale - scale) < 5.0 * found.scale_sigma
     np.testing.assert_allclose(found.velocities[-1], velocities[-1], atol=0.08)

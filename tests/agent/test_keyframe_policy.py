@@ -21,7 +21,7 @@ def test_bare_regions_need_a_keyframe_only_where_the_last_one_filled_them() -> N
     assert keyframe_need(USUAL, CONFIG) is None
     left = replace(USUAL, cover=0.40, reference_cover=0.9)
     need = keyframe_need(left, CONFIG)
-    assert need is not None and need.rule == "bare image regions"
+    assert need.rule == "bare image regions"
     assert keyframe_need(replace(left, reference_cover=0.42), CONFIG) is None
     assert keyframe_need(replace(left, cover=0.30, reference_cover=0.42), CONFIG) is not None
 

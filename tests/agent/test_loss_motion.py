@@ -42,7 +42,6 @@ def flown(accel_error: F64, gap: int, seen: int) -> tuple[list[LossMotion], F64]
         true = VELOCITY * k * PERIOD_NS * 1e-9
         if k <= gap:
             state = tracker.dead_reckon(k * PERIOD_NS)
-            assert state is not None
             off = true - state.T_m_b[:3, 3]
         if k == gap:
             first = estimator.begin(k * PERIOD_NS, state.T_m_b, np.eye(3))

@@ -98,7 +98,6 @@ def test_a_good_odometer_is_believed_within_a_second_or_so_of_motion() -> None:
     assert len(flown.events) == 1
     assert flown.events[0].startswith("odometer: agrees with what is seen, its scale is ")
     report = flown.odometer.report()
-    assert report is not None
     assert report["scale"] == pytest.approx(1.0, abs=0.01)
     assert report["noise_m_s"] < 0.04
 
@@ -317,11 +316,9 @@ def test_wheels_tell_what_they_measure_alone() -> None:
 def test_the_monocular_unit_becomes_known(unit_m: float) -> None:
     flown = Flown(driven(6.0, 0.05), 6.0, unit_m=unit_m, metric=False)
     found = flown.odometer.metres_per_unit()
-    assert found is not None
     assert found[0] == pytest.approx(unit_m, rel=0.01)
     assert found[1] < 0.02 * unit_m
     early = Flown(driven(6.0, 0.05), 2.5, unit_m=unit_m, metric=False).odometer.metres_per_unit()
-    assert early is not None
     assert early[0] == pytest.approx(unit_m, rel=0.02)
     assert flown.odometer.predict(flown.pose, 6_000_000_000) is None  # not before the map is in metres
 
@@ -331,7 +328,6 @@ def test_a_slip_does_not_move_the_unit() -> None:
     velocity = batch.velocity.copy()
     velocity[(batch.t_ns > 3e9) & (batch.t_ns < 5e9)] *= 2.0
     found = Flown(replace(batch, velocity=velocity), 8.0, unit_m=2.0, metric=False).odometer.metres_per_unit()
-    assert found is not None
     assert found[0] == pytest.approx(2.0, rel=0.02)
 
 

@@ -51,7 +51,6 @@ def test_a_pixel_is_moved_to_where_the_frame_would_show_it() -> None:
 
 def test_rows_are_those_of_the_raw_image_and_the_middle_one_stays() -> None:
     rolling = shutter(TWIST)
-    assert rolling.grid is not None
     v, u = 200, 600
     times = rolling.row_times_s(np.array([[u, v], [u, 10.0], [u, 470.0]], np.float64))
     assert times[0] == pytest.approx(READOUT_S * ((rolling.grid[v // 4, u // 4, 1] + 0.5) / 480 - 0.5))
@@ -76,7 +75,6 @@ def step_error_m(rolled: Rolled, readout_s: float, begin: int) -> float:
     rig = replace(source.rig, left=replace(source.rig.left, readout_s=readout_s))
     agent = Agent(rig, source.imu, AgentConfig(), Identity(AgentId(0), 0), NoBaseChannel())
     found, imu, frames, truth = [], None, 0, source.ground_truth
-    assert truth is not None
     for item in items:
         if isinstance(item, ImuBatch):
             imu = item
@@ -84,7 +82,6 @@ def step_error_m(rolled: Rolled, readout_s: float, begin: int) -> float:
             frames += 1
             if frames > begin:
                 estimate = agent.step(StepInput(item, imu), item.t_ns).estimate
-                assert estimate is not None
                 assert estimate.tracked
                 found.append(estimate.T_o_b)
     true = truth.T_w_b[begin:]

@@ -49,17 +49,14 @@ def test_gravity_of_a_map_is_the_mean_and_bent_keyframes_are_less_certain() -> N
     sparse_map = a_map(np.zeros(3))
     keyframes = [keyframe_id(OLD, k) for k in range(4)]
     level = level_of(sparse_map, keyframes)
-    assert level is not None
     assert np.allclose(level.up_w, UP, atol=1e-9)
     assert np.allclose(level.sigma, 0.005)
     up, _ = sparse_map.up[keyframes[3]]
     T = sparse_map.world_pose(keyframes[3])
-    assert T is not None
     bent = T[:3, :3].T @ se3.so3_exp(np.array([0.1, 0.0, 0.0])) @ T[:3, :3] @ up
     sparse_map.up[keyframes[3]] = bent, 0.005
     del sparse_map.up[keyframes[1]]
     level = level_of(sparse_map, keyframes)
-    assert level is not None
     assert level.rows.tolist() == [0, 2, 3]
     assert level.sigma[2] > 0.06 > level.sigma[0] > 0.005
     assert level_of(sparse_map, []) is None
@@ -70,7 +67,6 @@ def test_a_match_that_tilts_a_map_is_refused(degrees: float, kept: bool) -> None
     turn = np.radians(degrees) * np.array([0.6, 0.8, 0.0])
     sparse_map = a_map(turn)
     found = tilt_between(sparse_map, NEW, OLD, np.eye(4))
-    assert found is not None
     assert found[0] == pytest.approx(np.radians(degrees), abs=1e-9)
     assert found[1] == pytest.approx(np.hypot(0.005, 0.005))
     new, old = keyframe_id(NEW, 0), keyframe_id(OLD, 0)

@@ -124,7 +124,6 @@ def test_repetitive_corridor_closes_no_loop(
     flight = make_flight(keyframes=40, turns=1.0, scene=corridor, seed=4)
     mapper = Mapper(WITHOUT_GRID, words)
     feed(mapper, [flight])
-    assert mapper.merger is not None
     assert mapper.merger.detector.verified > 0  # they do look alike
     assert mapper.summary()["loops"] == 0
     assert np.max(errors_m(mapper, flight)) < 0.3

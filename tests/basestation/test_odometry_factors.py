@@ -75,7 +75,6 @@ def test_links_hold_what_few_points_cannot() -> None:
     config = BaseConfig()
     keyframes = [keyframe_id(SUBMAP, k) for k in range(KEYFRAMES)]
     part = bundle_window(sparse_map, keyframes, config.bundle_window, config.measurement)
-    assert part is not None
     alone = bundle(part.problem, config.bundle)
     linked = with_odometry_factors(sparse_map, part, config.odometry_factors)
     assert len(linked.points) > len(part.problem.points)
@@ -89,7 +88,6 @@ def test_keyframes_that_see_nothing_of_those_before_them_are_held_by_their_paren
     sparse_map, _ = flight(noise_px=0.1, births=40, unseen=3)
     config, free = BaseConfig(), [keyframe_id(SUBMAP, k) for k in range(3, KEYFRAMES)]
     part = bundle_window(sparse_map, free, config.bundle_window, config.measurement)
-    assert part is not None
     held = dict(zip((sparse_map.keyframes.id[part.rows] - keyframe_id(SUBMAP, 0)).tolist(), part.problem.free))
     assert held == {2: False, 3: True, 4: True, 5: True}
     linked = with_odometry_factors(sparse_map, part, config.odometry_factors)
@@ -104,7 +102,6 @@ def test_a_culled_parent_holds_nothing() -> None:
     culled, *free = [keyframe_id(SUBMAP, k) for k in range(2, KEYFRAMES)]
     sparse_map.cull_keyframe(culled)
     part = bundle_window(sparse_map, free, BaseConfig().bundle_window, BaseConfig().measurement)
-    assert part is not None
     assert sparse_map.rows[culled] not in part.rows.tolist()
 
 
@@ -120,7 +117,6 @@ def test_keyframes_with_many_points_are_told_how_they_turned_and_no_lengths() ->
     part = bundle_window(
         sparse_map, [keyframe_id(SUBMAP, k) for k in range(KEYFRAMES)], config.bundle_window, config.measurement
     )
-    assert part is not None
     far = replace(part, problem=replace(part.problem, T_c_m=np.stack([se3.inverse(T) for T in truth])))
     alone = bundle(far.problem, config.bundle)
     loose, firm = (
@@ -150,7 +146,6 @@ def test_turns_that_are_all_off_the_same_way_count_less() -> None:
         part = bundle_window(
             sparse_map, [keyframe_id(SUBMAP, k) for k in range(KEYFRAMES)], config.bundle_window, config.measurement
         )
-        assert part is not None
         part = replace(part, problem=replace(part.problem, T_c_m=np.stack([se3.inverse(T) for T in truth])))
         sigma[name] = with_odometry_factors(sparse_map, part, OdometryFactorConfig(enough_observations=5)).sigma[-1, 0]
     assert sigma["alike"] > 1.3 * sigma["by chance"]
@@ -161,7 +156,6 @@ def test_links_of_a_worn_rig_count_less() -> None:
     config = BaseConfig()
     keyframes = [keyframe_id(SUBMAP, k) for k in range(KEYFRAMES)]
     part = bundle_window(sparse_map, keyframes, config.bundle_window, config.measurement)
-    assert part is not None
     sparse_map.keyframes.t_ns[: len(sparse_map)] = 2_000_000_000 * np.arange(len(sparse_map))  # as over a radio
     good = with_odometry_factors(sparse_map, part, config.odometry_factors).sigma[len(part.slots) :]
     sparse_map.disparity_sigma_px[AgentId(0)] = 0.2
@@ -177,18 +171,15 @@ def test_links_of_few_points_are_measured_with_the_offset_of_the_border() -> Non
     part = bundle_window(
         sparse_map, [keyframe_id(SUBMAP, k) for k in range(KEYFRAMES)], config.bundle_window, config.measurement
     )
-    assert part is not None
     problem, agents = with_border(sparse_map, part.slots, part.problem, config.disparity)
     assert agents == (AgentId(0),)
     linked = with_odometry_factors(sparse_map, replace(part, problem=problem), config.odometry_factors)
-    assert linked.border is not None
     assert len(linked.border.group) == len(linked.border.terms) == len(linked.camera) > len(part.slots)
     disparity = linked.measured[len(part.slots) :, 2].reshape(-1, 2)
     assert ((disparity >= 0.0).sum(1) == 1).all()
     assert np.array_equal(linked.border.group[len(part.slots) :] == 0, disparity.ravel() >= 0.0)
     many = OdometryFactorConfig(enough_observations=5)  # rotations alone, of points far away: no disparity counts there
     linked = with_odometry_factors(sparse_map, replace(part, problem=problem), many)
-    assert linked.border is not None
     assert (linked.border.group[len(part.slots) :] == -1).all()
     assert bundle(linked, config.bundle).offset.shape == (1, 5)
 
@@ -203,7 +194,6 @@ def test_steps_follow_the_disparity_offset_as_it_becomes_known() -> None:
     sparse_map, truth = flight(noise_px=0.0, births=70)
     sparse_map.keypoints.inv_depth[: sparse_map.slots] += OFFSET[0] / CAMERA.bf
     part = bundle_window(sparse_map, keyframes, config.bundle_window, config.measurement)
-    assert part is not None
     told = bundle(part.problem, replace(config.bundle, robust_trials=20)).T_c_m
     for k in range(1, KEYFRAMES):
         sparse_map.keyframes.T_p_k[sparse_map.rows[keyframes[k]]] = told[k - 1] @ se3.inverse(told[k])
@@ -247,7 +237,6 @@ def test_steps_in_a_scene_without_disparities_are_taken_as_told() -> None:
     keyframes = [keyframe_id(SUBMAP, k) for k in range(KEYFRAMES)]
     config = BaseConfig()
     part = bundle_window(sparse_map, keyframes, config.bundle_window, config.measurement)
-    assert part is not None
     sparse_map.disparity_offset_px[AgentId(0)] = 4.0 * OFFSET
     far = replace(part, problem=replace(part.problem, measured=part.problem.measured * (1.0, 1.0, 0.005)))
     linked = with_odometry_factors(sparse_map, far, config.odometry_factors)
@@ -298,7 +287,6 @@ def test_a_keyframe_without_observations_stays_tied_to_its_parent() -> None:
     few = replace(config.bundle_window, max_fixed=0)  # nobody is in the window for what it observes
     free = [keyframe_id(SUBMAP, k) for k in (3, 4, 5)]
     part = bundle_window(sparse_map, free, few, config.measurement)
-    assert part is not None
     ids = sparse_map.keyframes.id[part.rows].tolist()
     assert ids == [keyframe_id(SUBMAP, k) for k in (2, 3, 4, 5)]
     assert part.problem.free.tolist() == [False, True, True, True]
@@ -311,7 +299,6 @@ def test_median_depths_are_those_of_each_camera_s_disparities() -> None:
     sparse_map, _ = flight(0.3, 40, unseen=3)
     config, keyframes = BaseConfig(), [keyframe_id(SUBMAP, k) for k in range(KEYFRAMES)]
     part = bundle_window(sparse_map, keyframes, config.bundle_window, config.measurement)
-    assert part is not None
     problem = part.problem
     measured = problem.measured.copy()
     measured[problem.camera == 2, 2] = -1.0

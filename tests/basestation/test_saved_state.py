@@ -91,7 +91,6 @@ def whole(station: Station) -> dict[str, Any]:
         refined = table.flags[slots] & 4 != 0
         alive = refined & (roots == slots) & (table.flags[slots] & 2 == 0)
         pose, world = sparse_map.pose(keyframe), sparse_map.world_pose(keyframe)
-        assert pose is not None and world is not None
         out[str(keyframe)] = (
             pose.tobytes(), world.tobytes(), points.tolist(), (table.flags[slots] & 3).tolist(),
             table.refined[slots[alive]].tobytes(), table.offset[slots[alive]].tobytes(),

@@ -104,7 +104,6 @@ def test_a_far_view_frees_alone_what_lies_well_before_its_obstacle_and_two_what_
     """A far box and the wall behind it are one surface: between them nothing is free by one look from afar."""
     bf = 48.0
     found = keep(CONFIG, scan_of(np.array(box(-5.53, -5.53, 5.53, 5.53)), 0.0, 0.0, 0.0), bf)
-    assert found is not None
     grid = ScanGrid(CONFIG)
     grid.put(0, found, camera(0.0, 0.0, 0.0))
     row = np.concatenate([grid.log_odds(Place(0, 0, k))[0, 1] for k in range(2)])
@@ -129,7 +128,6 @@ def test_a_far_view_of_ground_that_ends_before_no_obstacle_frees_alone_nearly_up
         np.zeros(70, np.uint8), np.zeros(70), HEIGHT_M,
     )  # fmt: skip
     found = keep(CONFIG, bare, bf)
-    assert found is not None
     grid = ScanGrid(CONFIG)
     grid.put(0, found, camera(0.0, 0.0, 0.0))
     row = np.concatenate([grid.log_odds(Place(0, 0, k))[0, 1] for k in range(2)])
@@ -188,12 +186,11 @@ def test_overlong_and_far_rays_are_cut_and_unknown_ground_is_not_drawn() -> None
     long[40] = 19.5
     bare = replace(scan, free_m=long, obstacle_m=np.full(84, np.inf), bands=np.zeros(84, np.uint8))
     found = keep(CONFIG, bare, 1e4)
-    assert found is not None
     ranges = found.ranges()
     q1, q3 = np.quantile(long[long > 0], (0.25, 0.75))
     assert ranges[3].max() == pytest.approx(q3 + 1.5 * (q3 - q1), abs=0.01)
     near = keep(CONFIG, replace(scan, free_m=np.full(84, 19.0), obstacle_m=np.full(84, 19.0)), 20.0)
-    assert near is not None and near.ranges()[3].max() < np.sqrt(CONFIG.max_sigma_m * 20.0 / CONFIG.sigma_px) + 0.01
+    assert near.ranges()[3].max() < np.sqrt(CONFIG.max_sigma_m * 20.0 / CONFIG.sigma_px) + 0.01
     assert np.isinf(near.ranges()[0]).all()
     assert keep(CONFIG, replace(scan, camera_height_m=np.nan), BF) is None
 
@@ -209,7 +206,6 @@ def test_nothing_is_free_close_before_an_obstacle_that_is_too_far_to_be_drawn() 
             bands=np.full(84, 7, np.uint8),
         )  # fmt: skip
         found = keep(CONFIG, scan, 20.0)
-        assert found is not None
         obstacle, _, _, free, clear = found.ranges()
         assert np.isinf(obstacle).all()
         until_m = min(limit_m, at_m - CONFIG.gap_sigmas * sigma_per_m2 * at_m**2)

@@ -72,7 +72,6 @@ def test_the_new_submap_begins_where_the_steps_end_in_the_agents_new_metre(told:
     S = sim3.normalise(S_new_old @ tie.S_older_newer)
     assert sim3.scale_of(S) == pytest.approx(1.0)  # a metre of the new submap is one of w
     T_w_a = sparse_map.world_pose(LAST)
-    assert T_w_a is not None
     relative = se3.inverse(T_B_C) @ moved(a_record()) @ T_B_C
     expected = T_w_a @ sim3.with_scaled_translation(relative, told)
     assert np.allclose(sim3.place(S, T_M_FIRST), expected, atol=1e-9)
@@ -102,7 +101,7 @@ def test_a_map_in_the_base_s_metres_tells_how_long_the_agents_unit_was_there() -
     ties = InertialTies(sparse_map)
     ties.add(replace(a_record(), since=keyframe_id(OLD, n - 1)))
     tie = ties.take()
-    assert tie is not None and tie.metre == 1.0
+    assert tie.metre == 1.0
     assert sim3.scale_of(tie.S_older_newer) == pytest.approx(0.98 / UNIT)
 
 

@@ -57,7 +57,6 @@ def test_a_flight_played_backward_rotates_the_other_way(flight: Recording) -> No
     for item, same in zip(flown.items, reversed(back.items), strict=True):
         assert same.frame.left is item.frame.left and same.frame.t_ns == begin_ns + end_ns - item.frame.t_ns
     forth, reverse = (joined([i.imu for i in r.items if i.imu is not None]) for r in (flown, back))
-    assert forth is not None and reverse is not None
     inside = forth.t_ns >= begin_ns  # what came before the first frame would be after the last one
     np.testing.assert_array_equal(reverse.t_ns[::-1], begin_ns + end_ns - forth.t_ns[inside])
     np.testing.assert_array_equal(reverse.gyro[::-1], -forth.gyro[inside])
@@ -94,7 +93,7 @@ def test_a_flight_backward_turns_the_other_way(data_dir: Path) -> None:
     once = sum(float(imu.gyro.sum()) for item in flight.items[1:] if (imu := item.imu) is not None)
     assert abs(turn) < 0.2 * abs(once)
     for item in there_and_back[1:]:
-        assert item.imu is not None and abs(int(item.imu.t_ns[-1]) - item.frame.t_ns) <= 5_000_000
+        assert abs(int(item.imu.t_ns[-1]) - item.frame.t_ns) <= 5_000_000
     force = np.concatenate([imu.accel for item in there_and_back if (imu := item.imu) is not None])
     assert abs(np.linalg.norm(force.mean(axis=0)) - 9.8) < 0.3
 
@@ -119,7 +118,7 @@ def test_saved_clip_is_read_again(flight: Recording, tmp_path: Path) -> None:
     again = load(str(flight.save(tmp_path / "flight.mcap")))
     assert [item.frame.t_ns for item in again.items] == [item.frame.t_ns for item in flight.items]
     assert np.abs(again.items[3].frame.left.astype(int) - flight.items[3].frame.left).mean() < 4.0
-    assert again.truth is not None and len(again.truth.t_ns) == len(flight.items)
+    assert len(again.truth.t_ns) == len(flight.items)
 
 
 @pytest.mark.parametrize("name", CAMERA_FAULTS)

@@ -50,7 +50,6 @@ def passage(sigma: float = 10.0, seed: int = 4) -> BundleProblem:
 
 
 def residuals(problem: BundleProblem, poses: F64, points: F64, c: F64) -> F64:
-    assert problem.border is not None
     which = np.repeat(np.arange(len(points)), np.diff(problem.starts))
     q = np.einsum("nij,nj->ni", poses[problem.camera][:, :3, :3], points[which]) + poses[problem.camera][:, :3, 3]
     off = np.where(problem.border.group >= 0, np.sum(problem.border.terms * c[problem.border.group], axis=1), 0.0)
@@ -138,7 +137,6 @@ def test_a_prior_widens_where_the_data_contradict_it() -> None:
 
 def test_a_prior_stays_where_the_data_agree_with_it() -> None:
     problem = passage(0.02)
-    assert problem.border is not None
     off = np.sum(problem.border.terms * TRUE[problem.border.group], axis=1)
     good = problem.measured.copy()
     good[:, 2] -= np.where(problem.border.group >= 0, off, 0.0)

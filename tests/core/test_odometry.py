@@ -75,7 +75,6 @@ def test_batches_are_joined_and_chosen_from() -> None:
     assert odometry.joined([]) is None
     assert odometry.joined([a]) is a
     both = odometry.joined([a, b])
-    assert both is not None
     assert both.velocity[:, 0].tolist() == [1.0, 2.0]
     assert both.rate_cov.shape == (2, 3, 3)
     assert odometry.chosen(both, slice(1, 2)).velocity[0, 0] == 2.0

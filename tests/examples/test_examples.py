@@ -50,4 +50,4 @@ def test_a_flown_log_becomes_arrays(recording: Path, tmp_path: Path) -> None:
     assert lines[0].startswith("left images    (30, 240, 320) uint8")
     assert lines[1] == "gyro, accel    (0, 3), (0, 3)"
     found = re.match(r"odometry       \(30, 4, 4\), path (\d\.\d+) m", lines[2])
-    assert found is not None and float(found[1]) == pytest.approx(29 * STEP_M, abs=0.01)
+    assert float(found[1]) == pytest.approx(29 * STEP_M, abs=0.01)

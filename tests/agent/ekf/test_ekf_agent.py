@@ -113,7 +113,6 @@ def test_poses_go_to_the_flight_controller_gravity_aligned(has_body: bool) -> No
         batch = OdometryBatch(t_ns, velocity, np.zeros((5, 3)), small, small)
         output = agent.step(StepInput(Frame(k * _PERIOD_NS, black), odometry=batch), k * _PERIOD_NS)
     sample = pose_sample(agent, output, 0, 0)
-    assert sample is not None
     np.testing.assert_allclose(sample.T_o_b[:3, 3], [0.1, 0.0, 0.0], atol=1e-3)
     output = agent.step(StepInput(predict_ns=3 * _PERIOD_NS), 3 * _PERIOD_NS)
     predicted = pose_sample(agent, output, 0, 0)

@@ -134,8 +134,7 @@ def test_a_kalibr_chain_with_its_imu(tmp_path: Path) -> None:
     c = told(tmp_path, camchain=CHAIN, imu=IMU)
     assert c.cameras[0].lens is Lens.EQUIDISTANT and c.cameras[0].fx == 190.97847715128717
     assert (c.cameras[1].width, c.cameras[1].cy) == (512, 254.91723064636983)
-    assert c.T_c_r is not None and c.T_c_r[0, 3] == pytest.approx(0.1)  # T_cn_cnm1 is the left camera in the right one
-    assert c.T_b_c is not None
+    assert c.T_c_r[0, 3] == pytest.approx(0.1)  # T_cn_cnm1 is the left camera in the right one
     np.testing.assert_allclose(c.T_b_c[:3, 3], [0.02, -0.01, -0.03], atol=1e-12)
     assert c.imu == ImuCalibration(1.87e-4, 2.66e-5, 1.86e-3, 4.33e-4, 190.0)
     assert c.topics == ("/cam0/image_raw", "/cam1/image_raw")
@@ -147,13 +146,13 @@ def test_a_chain_whose_cameras_know_the_imu_only(tmp_path: Path) -> None:
         "[0.0, 0.0, 1.0, 0.03]", "[0, 0, 1, 0]"
     )
     c = told(tmp_path, camchain=text)
-    assert c.T_c_r is not None and c.T_c_r[0, 3] == pytest.approx(0.1)
+    assert c.T_c_r[0, 3] == pytest.approx(0.1)
 
 
 def test_ros_files_of_a_pair(tmp_path: Path) -> None:
     c = told(tmp_path, left=ROS.format(side="left", tx=0), right=ROS.format(side="right", tx=-48.0))
     assert c.cameras[0].lens is Lens.RADTAN and c.cameras[0].distortion[0] == -0.36
-    assert c.T_c_r is not None and c.T_c_r[0, 3] == pytest.approx(0.12) and c.T_b_c is None
+    assert c.T_c_r[0, 3] == pytest.approx(0.12) and c.T_b_c is None
     rig = c.rig()
     assert not rig.has_body and rig.right is not None
 

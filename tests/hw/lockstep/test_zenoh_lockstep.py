@@ -82,7 +82,7 @@ def test_a_killed_base_is_noticed_at_once() -> None:
             assert client.exchange(b"%d" % tick, 10.0) == b"%d" % tick
 
         def kill() -> None:
-            assert process.stdout is not None and process.stdout.readline() == "collected\n"
+            assert process.stdout.readline() == "collected\n"
             process.kill()
 
         thread = threading.Thread(target=kill)

@@ -28,7 +28,6 @@ def test_the_same_bytes_as_here_and_slots_are_used_again(monkeypatch: pytest.Mon
     apart = EncoderProcess((48, 75), 3)
     for k in range(10):
         done = apart.submit(picture(k))
-        assert done is not None
         apart.wait(done)
         assert done.result() == encode_image(picture(k))
     waiting = [apart.submit(picture(k)) for k in range(3)]
@@ -66,7 +65,6 @@ def test_a_log_is_whole_whenever_the_process_ends(tmp_path: Path, kill_at: int |
             log.blob("/packets", k, b"%d" % k)
             if k == kill_at:
                 process = encoder._process
-                assert process is not None
                 process._process.kill()
             if k % 3 == 2:
                 time.sleep(0.1)

@@ -42,7 +42,7 @@ def test_udp_out_to_a_controller_with_another_clock() -> None:
         # TIMESYNC was answered: the stamp means our capture, as exactly as the offset is known
         assert -50_000_000 < last.received_ns - last.t_ns < 100_000_000
         seen = sink.autopilot()
-        assert seen is not None and seen.autopilot == 12
+        assert seen.autopilot == 12
         assert not model.dropped and sink.counters.timesync_answers >= 1
         assert model.heartbeats[1, 197] >= 1
 

@@ -53,11 +53,11 @@ def test_the_vehicle_is_learnt_and_others_are_not_mixed_in() -> None:
         session.receive(other.encode(LocalPosition(i, (0.0, 0.0, 0.0), (9.0, 0.0, 0.0))), now_ns)
         session.receive(ours.encode(VehicleImu(i * 5000, (0.0, 0.0, -9.8), (0.0, 0.0, 0.0))), now_ns)
     batch = session.take_imu(S)
-    assert batch is not None and len(batch.t_ns) == 5 and (batch.accel[:, 2] < -9.7).all()
+    assert len(batch.t_ns) == 5 and (batch.accel[:, 2] < -9.7).all()
     assert session.take_odometry(S) is None
     assert session.counters.other_autopilots == 5 and session.codec.other_systems == 21
     found = session.autopilot(S)
-    assert found is not None and found.system == 7
+    assert found.system == 7
 
 
 def test_a_system_that_was_told_is_the_only_one() -> None:

@@ -36,7 +36,6 @@ def run(code: str, **options: object) -> subprocess.Popen[bytes]:
 
 def test_a_signal_sets_the_flag_and_ends_a_wait() -> None:
     with run("s = process.StopSignal(); print(bool(s), flush=True); print(s.wait(20), bool(s), flush=True)") as child:
-        assert child.stdout is not None
         assert child.stdout.readline() == b"False\n"
         child.send_signal(signal.SIGTERM)
         assert child.stdout.readline() == b"True True\n"
@@ -48,7 +47,6 @@ def test_a_child_reads_lines_and_ends_with_its_parent() -> None:
         "while (word := p.next_line()) is None: time.sleep(0.01)\np.send_event('heard', word=word); time.sleep(60)"
     )
     with run(code) as child:
-        assert child.stdin is not None and child.stdout is not None
         assert child.stdout.readline() == b'{"event": "ready", "n": 1}\n'
         child.stdin.write(b"frames_over\n")
         child.stdin.flush()
