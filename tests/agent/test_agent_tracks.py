@@ -54,7 +54,6 @@ def step_errors_m(source: FrameSource, estimates: list[Estimate]) -> NDArray[np.
     known = [e for e in estimates if e.t_ns in at and e.T_m_b is not None]
     errors = []
     for a, b in pairwise(known):
-        assert a.T_m_b is not None and b.T_m_b is not None
         true = se3.inverse(at[a.t_ns]) @ at[b.t_ns]
         errors.append(np.linalg.norm((se3.inverse(true) @ se3.inverse(a.T_m_b) @ b.T_m_b)[:3, 3]))
     return np.array(errors)

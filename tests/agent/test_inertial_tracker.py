@@ -124,7 +124,6 @@ def test_starts_in_motion_in_a_map_that_is_not_level(seed: int) -> None:
     assert tracker.started == "motion"
     assert next(k for k, s in enumerate(states) if s is not None) < 25
     level_R = tracker.gravity_rotation()
-    assert level_R is not None
     upright = level_R @ lean[:3, :3]
     assert upright[2, 2] > np.cos(np.radians(1.0))
     assert apart_m(states[-1], steps[-1].truth) < 0.004

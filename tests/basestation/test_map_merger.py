@@ -34,7 +34,6 @@ def joint_error_m(mapper: Mapper, flights: Sequence[Any]) -> F64:
         T_w_m = mapper.placements[submap_of_keyframe(flight.keyframes[0])]
         for k, true in zip(flight.keyframes, flight.true_T_w_k):
             pose = mapper.map.pose(k)
-            assert pose is not None
             out.append(float(np.linalg.norm((T_w_m @ pose)[:3, 3] - true[:3, 3])))
     return np.array(out)
 

@@ -253,7 +253,6 @@ def test_submap_without_first_keyframe_begins_at_its_oldest(make_flight: MakeFli
         mapper.step(MapperInput(()), 20_000_000_000)
     assert mapper.counts.keyframes == 8
     a, b = mapper.map.pose(flight.keyframes[4]), mapper.map.pose(flight.keyframes[9])
-    assert a is not None and b is not None
     true = se3.inverse(flight.true_T_m_k[4]) @ flight.true_T_m_k[9]
     assert np.allclose(se3.inverse(a) @ b, true, atol=0.05)
 
@@ -327,7 +326,6 @@ def test_later_submap_is_placed_by_odometry(make_flight: MakeFlight) -> None:
     published = feed_groups(mapper, later, later.records)
     (placement,) = [r for r in published if isinstance(r, SubmapPlacement)]
     left, begin = mapper.map.pose(live.keyframe), mapper.map.pose(later.keyframes[0])
-    assert left is not None and begin is not None
     assert np.allclose(placement.S_w_m @ begin, left @ live.T_k_c, atol=1e-9)
     assert not placement.recognised
 

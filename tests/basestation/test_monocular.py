@@ -269,7 +269,6 @@ def test_depths_that_do_not_say_one_length_say_none() -> None:
     rng = np.random.default_rng(0)
     config, own = BaseConfig().loops, rng.uniform(1.0, 8.0, 60)
     told = depth_scale(own, 2.5 * own * np.exp(rng.normal(0.0, 0.05, 60)), config)
-    assert told is not None
     assert abs(told / 2.5 - 1.0) < 0.03
     assert depth_scale(own[:10], 2.5 * own[:10], config) is None
     assert depth_scale(own, own * np.exp(rng.normal(0.0, 0.4, 60)), config) is None
@@ -314,7 +313,6 @@ def test_a_map_begun_in_metres_stays_as_it_is_and_the_one_before_it_is_stretched
         assert np.isclose(sim3.scale_of(placed_at[before]), 2.0)
         assert sim3.scale_of(placed_at[after]) == 1.0
         begin, end = mapper.map.pose(later.keyframes[0]), mapper.map.pose(flight.keyframes[-1])
-        assert begin is not None and end is not None
         assert np.allclose((placed_at[after] @ begin)[:3, 3], 2.0 * end[:3, 3], atol=1e-6)  # where it was left
 
 

@@ -66,7 +66,6 @@ def test_a_jump_beside_the_odometry_is_measured(flight: Flown) -> None:
         shift = np.eye(4)
         shift[0, 3] = 0.05
         pose = live_pose(moved[k])
-        assert pose is not None
         moved[k] = replace(moved[k], T_w_b=shift @ pose)
     jumping = replace(flight, run=replace(flight.run, estimates=moved))
     assert jumping.largest_jump_m() == pytest.approx(0.05, abs=0.012)
