@@ -319,9 +319,3 @@ def test_a_new_map_after_a_blackout_needs_no_new_start() -> None:
             if k > 50:
                 assert apart_m(state, shift @ step.truth) < 0.01
     assert tracker.running and tracker.started == "motion"
-
-
-def test_the_same_input_gives_the_same_output() -> None:
-    steps = flight(40, 9)
-    a, b = run(steps)[1][-1], run(steps)[1][-1]
-    assert np.array_equal(a.T_m_b, b.T_m_b) and np.array_equal(a.cov, b.cov)

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import pytest
-
-from kiteline_bench.benchmark import parts
 from kiteline_bench.reality.cpu import over_yardstick, yardstick_ms
 
 
@@ -19,8 +16,3 @@ def test_every_fourth_image_is_measured(data_dir: Path) -> None:
     spent = yardstick_ms(str(data_dir / "kitti_straight"))
     assert len(spent) > 3
     assert all(ms > 0.0 for ms in spent)
-
-
-@pytest.mark.parametrize("name", ["reality", "reality/cpu"])
-def test_the_benchmark_is_found(name: str) -> None:
-    assert any(part == "reality/cpu" for part, _, _ in parts(name))

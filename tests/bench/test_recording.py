@@ -10,10 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kiteline_bench.agent import flights as bench_agent
 from kiteline_bench.agent.governor import governor_table
 from kiteline_bench.agent.governor_plot import plot_governor
-from kiteline_bench.benchmark import BENCHMARKS
 from kiteline_bench.harness import processes
 from kiteline_bench.harness.faults import CAMERA_FAULTS, black, camera_faults_of, changed, rearranged, wall
 from kiteline_bench.harness.limited_cpu import LimitedFlight, fly_limited
@@ -29,10 +27,6 @@ from kiteline_hw.system.cpu import CpuQuota
 @pytest.fixture(scope="module")
 def flight(recording: Path) -> Recording:
     return load(str(recording))
-
-
-def test_benchmark_is_registered() -> None:
-    assert BENCHMARKS["agent"] == bench_agent.__name__
 
 
 def test_clip_goes_to_and_fro_without_a_jump(flight: Recording) -> None:
@@ -194,12 +188,6 @@ def test_trial_that_fails_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(processes, "_MODULE", "json.tool")  # any program that fails: this one starts at once
     with pytest.raises(RuntimeError, match=r"(?s)^first-pose .*nothing: .*No such file"):
         processes.start("first-pose", str(tmp_path / "nothing"))
-
-
-@pytest.mark.skipif(CpuQuota.unavailable() is not None, reason=str(CpuQuota.unavailable()))
-def test_flight_under_the_kernel_s_limit(recording: Path) -> None:
-    found = LimitedFlight(**processes.start("quota", str(recording), "--percent", "20", "--governor"))
-    assert found.real and found.tracked + found.lost + found.dropped == found.frames and found.tracked > 0
 
 
 @pytest.mark.alone

@@ -9,11 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kiteline_bench.benchmark import parts
 from kiteline_bench.harness.bars import Bench
 from kiteline_bench.vehicle import controllers, faults
 from kiteline_bench.vehicle.sitl import flights
-from kiteline_bench.vehicle.sitl.arducopter import PARAMETERS, VARIABLE
+from kiteline_bench.vehicle.sitl.arducopter import VARIABLE
 from kiteline_bench.vehicle.sitl.copter import Copter
 from kiteline_bench.vehicle.sitl.loop import Truth
 from kiteline_hw.sim.flight_controller import VisionSample
@@ -73,13 +72,6 @@ def test_truth_is_interpolated_across_south() -> None:
     assert np.allclose(position, 0.5) and math.cos(heading[0] - math.pi) == pytest.approx(1.0)
 
 
-def test_all_parts_are_there_and_one_can_be_chosen() -> None:
-    assert [name for name, _, _ in parts("vehicle")] == [
-        f"vehicle/{part}" for part in ("sitl", "controllers", "faults", "camera", "calibration", "units")
-    ]
-    assert len(parts("vehicle/units")) == 1
-
-
 def test_without_an_autopilot_the_loop_is_not_flown_and_says_so(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -88,12 +80,6 @@ def test_without_an_autopilot_the_loop_is_not_flown_and_says_so(
     assert flights.run(bench) == [] and VARIABLE in bench.more[0]
     monkeypatch.setenv(VARIABLE, str(tmp_path / "none"))
     assert not flights.run(bench)[0].met
-
-
-def test_the_ekf_has_nothing_but_poses() -> None:
-    """No GPS and no compass: position, velocity, height and heading are those of the poses."""
-    assert all(PARAMETERS[f"EK3_SRC1_{what}"] == 6 for what in ("POSXY", "VELXY", "POSZ", "VELZ", "YAW"))
-    assert PARAMETERS["GPS1_TYPE"] == 0 and "ARMING_CHECK" not in PARAMETERS
 
 
 def test_wrong_axes_are_named_and_right_ones_are_not() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from math import pi
+from math import cos, pi, sin
 
 import numpy as np
 import pytest
@@ -23,12 +23,14 @@ from kiteline_hw.mavlink.controller_odometry import (
 )
 from kiteline_hw.mavlink.controller_session import ControllerSession
 from kiteline_hw.mavlink.coordinate_frames import controller_rates, local_pose, mounting
-from kiteline_hw.mavlink.messages import Attitude, Heartbeat, LocalPosition, Odometry, WheelDistance
+from kiteline_hw.mavlink.messages import Attitude, Heartbeat, LocalPosition, MavlinkMessage, Odometry, WheelDistance
 from kiteline_hw.sim.flight_controller import FlightController
 
 S = 1_000_000_000
 NAN = float("nan")
 CODEC = MavlinkCodec(1, 1)  # of the autopilot
+STILL = (0.0, 0.0, 0.0)
+EAST, EAST_Q = (0.0, 0.0, pi / 2), (cos(pi / 4), 0.0, 0.0, sin(pi / 4))  # the nose points east
 
 # forward 1, right 2, down 3 m/s, in the axes of three bodies
 BODIES = {"frd": [1.0, 2.0, 3.0], "flu": [1.0, -2.0, -3.0], "rdf": [2.0, 3.0, 1.0]}
@@ -50,19 +52,32 @@ def told(source: ControllerOdometry, *messages: object, now_ns: int = 5 * S) -> 
     return source.take_until(now_ns + 100 * S)
 
 
-@pytest.mark.parametrize(("axes", "velocity"), BODIES.items())
-def test_velocity_in_every_body_frame(axes: str, velocity: list[float]) -> None:
-    batch = told(ControllerOdometry(OdometrySource.CONTROLLER, mounting(axes)), odometry((1.0, 2.0, 3.0)))
-    np.testing.assert_allclose(batch.velocity[0], velocity, atol=1e-12)
+def local(
+    velocity: tuple[float, float, float], angles: tuple[float, float, float], rate: tuple[float, ...] = STILL
+) -> list[MavlinkMessage]:
+    """An attitude, and a velocity in the local frame."""
+    return [Attitude(1000, angles, rate), LocalPosition(1010, STILL, velocity)]
 
 
-def test_a_turn_to_the_right() -> None:
-    # FRD: about down. FLU: about up it is a turn to the left, so negative. A camera's y points down.
-    for axes, rate in (("frd", [0, 0, 0.3]), ("flu", [0, 0, -0.3]), ("rdf", [0, 0.3, 0])):
-        batch = told(
-            ControllerOdometry(OdometrySource.CONTROLLER, mounting(axes)), odometry((0.0,) * 3, (0.0, 0.0, 0.3))
-        )
-        np.testing.assert_allclose(batch.rate[0], rate, atol=1e-12)
+@pytest.mark.parametrize(
+    ("axes", "messages", "velocity", "rate"),
+    [
+        *[(axes, [odometry((1.0, 2.0, 3.0))], velocity, STILL) for axes, velocity in BODIES.items()],
+        # A turn to the right. FRD: about down. FLU: about up it is to the left, so negative. A camera's y points down.
+        ("frd", [odometry(STILL, (0.0, 0.0, 0.3))], STILL, (0.0, 0.0, 0.3)),
+        ("flu", [odometry(STILL, (0.0, 0.0, 0.3))], STILL, (0.0, 0.0, -0.3)),
+        ("rdf", [odometry(STILL, (0.0, 0.0, 0.3))], STILL, (0.0, 0.3, 0.0)),
+        # Flying east with the nose to the east, climbing and turning; flying north with the nose to the east.
+        ("flu", local((0.0, 2.0, -0.5), EAST, (0.0, 0.0, 0.1)), (2.0, 0.0, 0.5), (0.0, 0.0, -0.1)),
+        ("flu", local((1.5, 0.0, 0.0), EAST), (0.0, 1.5, 0.0), STILL),
+        ("frd", local((0.0, 0.0, 1.0), (pi / 2, 0.0, 0.0)), (0.0, 1.0, 0.0), STILL),  # falling, right wing down
+        ("frd", [odometry((0.0, 2.0, 0.0), child=1, q=EAST_Q)], (2.0, 0.0, 0.0), STILL),  # child frame: local
+    ],
+)
+def test_motion_by_hand(axes: str, messages: list[MavlinkMessage], velocity: list[float], rate: list[float]) -> None:
+    batch = told(ControllerOdometry(OdometrySource.CONTROLLER, mounting(axes)), *messages)
+    np.testing.assert_allclose(batch.velocity[0], velocity, atol=1e-9)
+    np.testing.assert_allclose(batch.rate[0], rate, atol=1e-12)
 
 
 def test_lever_arm_between_camera_and_controller() -> None:
@@ -70,38 +85,6 @@ def test_lever_arm_between_camera_and_controller() -> None:
     source = ControllerOdometry(OdometrySource.CONTROLLER, mounting("flu", (-0.4, 0.0, 0.0)))
     batch = told(source, odometry((1.0, 0.0, 0.0), (0.0, 0.0, 0.5)))
     np.testing.assert_allclose(batch.velocity[0], [1.0, -0.2, 0.0], atol=1e-4)
-
-
-def test_flying_east_facing_east_is_forward() -> None:
-    source = ControllerOdometry(OdometrySource.CONTROLLER, mounting("flu"))
-    nose_east = Attitude(1000, (0.0, 0.0, pi / 2), (0.0, 0.0, 0.1))
-    batch = told(source, nose_east, LocalPosition(1010, (0.0,) * 3, (0.0, 2.0, -0.5)))  # east, and climbing
-    np.testing.assert_allclose(batch.velocity[0], [2.0, 0.0, 0.5], atol=1e-12)
-    np.testing.assert_allclose(batch.rate[0], [0.0, 0.0, -0.1], atol=1e-12)
-
-
-def test_flying_north_facing_east_is_to_the_left() -> None:
-    nose_east = Attitude(1000, (0.0, 0.0, pi / 2), (0.0,) * 3)
-    north = LocalPosition(1010, (0.0,) * 3, (1.5, 0.0, 0.0))
-    batch = told(ControllerOdometry(OdometrySource.CONTROLLER, mounting("flu")), nose_east, north)
-    np.testing.assert_allclose(batch.velocity[0], [0.0, 1.5, 0.0], atol=1e-12)
-
-
-def test_a_rolled_vehicle_falls_along_its_right_side() -> None:
-    rolled = Attitude(1000, (pi / 2, 0.0, 0.0), (0.0,) * 3)  # right wing down
-    batch = told(
-        ControllerOdometry(OdometrySource.CONTROLLER, mounting("frd")),
-        rolled,
-        LocalPosition(1000, (0.0,) * 3, (0, 0, 1.0)),
-    )
-    np.testing.assert_allclose(batch.velocity[0], [0.0, 1.0, 0.0], atol=1e-12)
-
-
-def test_local_velocities_are_rotated_to_the_body() -> None:
-    q = se3.quaternion_from_rotation(se3.so3_exp(np.array([0.0, 0.0, pi / 2])))  # nose east
-    message = odometry((0.0, 2.0, 0.0), child=1, q=tuple(float(v) for v in q))
-    batch = told(ControllerOdometry(OdometrySource.CONTROLLER, mounting("frd")), message)
-    np.testing.assert_allclose(batch.velocity[0], [2.0, 0.0, 0.0], atol=1e-9)
 
 
 def test_unknown_frames_are_ignored() -> None:
