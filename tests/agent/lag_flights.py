@@ -1,7 +1,5 @@
 """Flights of a fixed-lag smoother among points, with images and samples made of the truth."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

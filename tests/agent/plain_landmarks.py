@@ -1,7 +1,5 @@
 """New landmarks of a keyframe in tests that look at places alone."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

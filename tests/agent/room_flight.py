@@ -1,7 +1,5 @@
 """A rendered flight that many tests fly: whole, or its first seconds."""
 
-from __future__ import annotations
-
 import hashlib
 from dataclasses import dataclass, replace
 
@@ -28,7 +26,7 @@ class RoomFlight:
     driven: OdometryBatch
     truth: F64
 
-    def first(self, seconds: float) -> RoomFlight:
+    def first(self, seconds: float) -> "RoomFlight":
         """The first seconds of the flight."""
         frames = self.frames[: round(seconds * 1e9) // SimConfig().frame_ns]
         felt, driven = (batch.t_ns <= frames[-1].t_ns for batch in (self.samples, self.driven))

@@ -1,7 +1,5 @@
 """Landmarks as a camera sees them whose calibration is off."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

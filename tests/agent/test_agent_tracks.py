@@ -1,7 +1,5 @@
 """The agent on recordings and on bad frames: it follows the truth, survives faults, and stays continuous."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import replace
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """Template alignment: it finds known displacements to a fraction of a pixel, whatever brightness does."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

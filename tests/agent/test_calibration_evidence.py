@@ -1,7 +1,5 @@
 """What residuals tell of errors of the calibration, and how they widen the covariance."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

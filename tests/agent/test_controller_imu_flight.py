@@ -1,7 +1,5 @@
 """Whole flights of an agent on the IMU of a flight controller, whose samples come late and with another clock."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """FAST corners: those of OpenCV, in free cells only."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

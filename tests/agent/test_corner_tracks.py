@@ -1,7 +1,5 @@
 """Which keyframes a window of corners keeps."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """How much of a correction of the live pose is taken over, by the deviation that the base tells."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

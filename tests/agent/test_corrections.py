@@ -1,7 +1,5 @@
 """What the agent knows of how its submaps lie to each other, from the placements that a base sends."""
 
-from __future__ import annotations
-
 import copy
 
 import numpy as np

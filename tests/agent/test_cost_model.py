@@ -1,7 +1,5 @@
 """The virtual CPU's prices: every kind of work has one, and flights cost the same wherever they are flown."""
 
-from __future__ import annotations
-
 from dataclasses import fields, replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The offset of disparities is found on board, by the parallax of landmarks; kernels against numpy."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """A frame in which most landmarks move alike, as people do: the IMU tells which landmarks stand still."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

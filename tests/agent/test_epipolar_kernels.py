@@ -1,7 +1,5 @@
 """Templates are found on segments: where they are, at every level, and not where two places look alike."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray

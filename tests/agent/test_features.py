@@ -1,7 +1,5 @@
 """Corners and descriptors: spread, repeatable, and the same as written plainly."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

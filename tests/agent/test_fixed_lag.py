@@ -1,7 +1,5 @@
 """The fixed-lag smoother: marginalisation against the whole problem, honesty, dead reckoning, maps that move."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Terms of the fixed-lag smoother: Jacobians against differences, sums and elimination against plain references."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The source read ahead, the tally, the virtual core, and estimates that pass through a log unchanged."""
 
-from __future__ import annotations
-
 import itertools
 import json
 from collections.abc import Iterator

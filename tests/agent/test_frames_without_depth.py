@@ -1,7 +1,5 @@
 """Frames of a depth camera that came without depth: they are tracked, but no keyframe is made of them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """An agent flies on when the disk of its log, trajectories and rig file is full or failing, and says so once."""
 
-from __future__ import annotations
-
 import errno
 import os
 from pathlib import Path

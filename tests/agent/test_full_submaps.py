@@ -1,7 +1,5 @@
 """A submap whose ids of keyframes are used up is continued in another one: neither tracker nor base lose anything."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

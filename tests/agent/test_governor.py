@@ -1,7 +1,5 @@
 """The governor: within its budget over every second, evenly, frames before tracking, no haste."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -28,7 +26,7 @@ class Flight:
         self.keyframe_ns = 0
         self.waits: list[int] = []  # ns by which keyframes were late
 
-    def fly(self, frames: int) -> Flight:
+    def fly(self, frames: int) -> "Flight":
         for _ in range(frames):
             k = len(self.cost_ns)
             now_ns = k * PERIOD_NS

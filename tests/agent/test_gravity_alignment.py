@@ -1,7 +1,5 @@
 """Which way is up: at once, after a few frames in motion, and who is told."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Small images have as many cells for corners and landmarks as large ones."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Preintegration against exact motion, against a plain reference, and its Jacobians against differences."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

@@ -1,7 +1,5 @@
 """Calibration of the IMU in flight, on simulated samples of worn and true IMUs."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

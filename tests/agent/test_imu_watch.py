@@ -1,7 +1,5 @@
 """People are told when an IMU stays silent, once, and when it speaks again."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from kiteline_agent.inertial.imu_watch import ImuWatch

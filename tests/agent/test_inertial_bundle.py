@@ -1,7 +1,5 @@
 """The window of a monocular start in metres: scale, gravity, biases and honest deviations, from simulated corners."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
 

@@ -1,7 +1,5 @@
 """When a monocular map in metres begins: the window is solved again until the newest keyframe sees enough landmarks."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any

@@ -1,7 +1,5 @@
 """The inertial tracker on simulated flights: starts, fuses, coasts, finds a wrong level, a time offset and a scale."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from itertools import pairwise
 

@@ -1,7 +1,5 @@
 """Start in motion: gyro bias, velocity, gravity, scale; and the camera's time offset."""
 
-from __future__ import annotations
-
 from typing import cast
 
 import numpy as np

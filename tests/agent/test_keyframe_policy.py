@@ -1,7 +1,5 @@
 """When a frame becomes a keyframe: not where another keyframe would find no more landmarks."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Errors of a calibrated lens as a map of pixels, and images that are read through it."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Where the base says that a submap lies, and how long: the live pose in w takes it on, the odometry does not."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

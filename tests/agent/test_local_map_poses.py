@@ -1,7 +1,5 @@
 """Corrections of keyframes of the local map: taken over together, once they differ by more than errors."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What an agent holds beside its map does not grow with the keyframes of a flight."""
 
-from __future__ import annotations
-
 import io
 from collections import Counter
 from dataclasses import replace

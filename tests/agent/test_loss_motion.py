@@ -1,7 +1,5 @@
 """The motion over a loss: the velocity after it corrects the IMU's error, and the deviations tell how far."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

@@ -1,7 +1,5 @@
 """How far corrections move the map under the camera: with the landmarks in view, not with one keyframe."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

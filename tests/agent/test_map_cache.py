@@ -1,7 +1,5 @@
 """The base's copies: kept within bounds, met by corners, and enough to find a lost frame."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A monocular flight: it begins when two views give depth, keeps its own scale, and landmarks find their true depth."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """The odometer against poses that are known: when it is believed, what it is worth, where it says that one is."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

@@ -1,7 +1,5 @@
 """Whole flights of an agent through a simulated room, with an odometer and without."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The command line of an agent."""
 
-from __future__ import annotations
-
 import pytest
 
 from kiteline_agent.__main__ import main

@@ -1,7 +1,5 @@
 """How certain poses are: errors of calibration carried along, noise that adds up, times without images."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

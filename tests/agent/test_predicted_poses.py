@@ -1,7 +1,5 @@
 """Predicted poses of skipped frames and between frames: true, of growing covariance, and without effect on tracking."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

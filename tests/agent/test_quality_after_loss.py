@@ -1,7 +1,5 @@
 """`quality` for a flight controller after a loss: it comes back when the map says that odometry is where it was."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The velocity of a vehicle without an IMU, as of an instant after its last frame."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Forced losses: turned into a wall and out again, black for seconds, the old place seen again, and places alike."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """What flights found of a rig is kept in a file, and the next flight begins with it."""
 
-from __future__ import annotations
-
 import tomllib
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Rows of a rolling shutter: moved to the frame's time as the true motion says, and flights that gain by it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
 

@@ -1,7 +1,5 @@
 """Rows of the right image: offsets are measured in two dimensions, and a worn right camera is read where it looks."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

@@ -1,7 +1,5 @@
 """The noise that IMU samples show: vibration, missing samples, the end of the range."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

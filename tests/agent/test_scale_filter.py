@@ -1,7 +1,5 @@
 """The scale of a monocular map, watched by displacements of images and IMU: its deviation is honest."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

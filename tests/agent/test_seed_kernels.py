@@ -1,7 +1,5 @@
 """Segments and depths of landmarks without depth, against plain numpy."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

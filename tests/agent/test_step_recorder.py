@@ -1,7 +1,5 @@
 """Steps between keyframes: they tile the flight, and are left out where they would not."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Stereo along the row: against a plain search, and against known sub-pixel disparities."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray

@@ -1,7 +1,5 @@
 """What a person is told of a live flight."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from kiteline_agent.runtime.frame_counts import FrameCounts

@@ -1,7 +1,5 @@
 """The time from a frame to its pose is that of the tracker, not of what follows."""
 
-from __future__ import annotations
-
 import time
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Rotations by images that scatter against the gyro: people who drag the map must not pass for a worn IMU."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

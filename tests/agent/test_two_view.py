@@ -1,7 +1,5 @@
 """Motion from two views: exact on clean scenes, sure under noise and outliers, silent where nothing tells."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,7 +1,5 @@
 """How much an accelerometer vibrates in each interval of a window."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """What corrections move the whole map by is left out of the live pose; what changes its shape is not."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from unittest.mock import MagicMock
 

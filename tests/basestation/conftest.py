@@ -1,7 +1,5 @@
 """A synthetic flight: points on the walls of a room, keyframes along a path, a forgetful tracker, noisy pixels."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 

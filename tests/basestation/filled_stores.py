@@ -1,7 +1,5 @@
 """Stores with some values."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from kiteline_basestation.store.saved_map import SavedMap, SavedValues

@@ -1,7 +1,5 @@
 """Rooms of walls seen from above, cameras in them, and the column scans that they see."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

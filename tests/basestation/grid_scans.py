@@ -1,7 +1,5 @@
 """Scans of a room that is known, for tests of the grid."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """Inertial steps of a body that flies a curve."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Velocity of an agent between two plans."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from kiteline_basestation.exchange.agent_velocity import AgentVelocity

@@ -1,7 +1,5 @@
 """A store that is damaged: nothing wrong is loaded, what is sound is kept, and every fault is named."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import sqlite3

@@ -1,7 +1,5 @@
 """What all disparities are off by is found by bundles of the whole map, and taken off."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any

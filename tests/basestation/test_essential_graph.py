@@ -1,7 +1,5 @@
 """Pose graph optimisation: drift is spread over the path, wrong loops have little effect."""
 
-from __future__ import annotations
-
 import time
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Files of the grid, and views of it for the status page."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

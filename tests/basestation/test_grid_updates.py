@@ -1,7 +1,5 @@
 """The grid as the mapper draws it: from scans and landmarks, after corrections, restarts and deletions."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any

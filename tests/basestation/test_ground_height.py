@@ -1,7 +1,5 @@
 """The ground under sparse points, and scans made from them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The kernel of the ground's height against a plain Python reference."""
 
-from __future__ import annotations
-
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st

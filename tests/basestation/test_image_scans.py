@@ -1,7 +1,5 @@
 """Scans that the base makes of images: those that the agent would have made, in order, kept and taken back."""
 
-from __future__ import annotations
-
 from itertools import count
 
 import cv2

@@ -1,7 +1,5 @@
 """Matching kernels against plain numpy."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """Gravity at keyframes: loop closures keep roll and pitch, and matches that tilt a map are no closures."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Loop closures reduce drift, and repetitive corridors close none."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any

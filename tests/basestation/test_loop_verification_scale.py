@@ -1,7 +1,5 @@
 """Monocular maps with different units of length are not matched."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

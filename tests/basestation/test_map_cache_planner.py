@@ -1,7 +1,5 @@
 """Map cache planner: keyframes near the agent that it lacks, from agents that share with it, at their current poses."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Maps are merged where they overlap, and not where they only look alike."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Full bundles of maps of any size: none, one, or parts that overlap."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise

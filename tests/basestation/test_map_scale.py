@@ -1,7 +1,5 @@
 """The scale of a map by inertial steps: the truth, an IMU that is silent about it, maps whose scale drifts."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
 

@@ -1,7 +1,5 @@
 """The mapper on synthetic flights: refinement, landmark matching, culling, determinism."""
 
-from __future__ import annotations
-
 import pickle
 from collections.abc import Callable
 from dataclasses import replace

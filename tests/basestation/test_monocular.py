@@ -1,7 +1,5 @@
 """Monocular maps: loops take the drift of their unit of length back, and merges find how long it is."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from dataclasses import replace

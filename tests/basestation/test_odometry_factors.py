@@ -1,7 +1,5 @@
 """Links between keyframes: they hold the poses of those that see few points, and are loose where many are seen."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

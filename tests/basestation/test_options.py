@@ -1,7 +1,5 @@
 """Options of the base that are refused, and who may connect where maps are asked for."""
 
-from __future__ import annotations
-
 import contextlib
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A saved map is restored bit for bit; inconsistent values are reported and left out."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path

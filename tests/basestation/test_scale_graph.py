@@ -1,7 +1,5 @@
 """Pose graph optimisation over similarities: loops correct scale drift."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import replace
 

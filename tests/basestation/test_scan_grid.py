@@ -1,7 +1,5 @@
 """The grid from column scans: what it says of a room, that redrawing equals drawing from scratch, storeys, memory."""
 
-from __future__ import annotations
-
 import tracemalloc
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """What single views free, and what several say together."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

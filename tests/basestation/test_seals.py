@@ -1,7 +1,5 @@
 """Keys of a base that change while it runs."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

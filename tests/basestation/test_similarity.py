@@ -1,7 +1,5 @@
 """Alignment of point sets against a plain SVD, and of two views among outliers."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

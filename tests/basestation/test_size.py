@@ -1,7 +1,5 @@
 """Maps of any size: regions, memory, corrections of many keyframes, loops that many votes close."""
 
-from __future__ import annotations
-
 import itertools
 import time
 import tracemalloc

@@ -1,7 +1,5 @@
 """The sparse map: composed poses, points on anchors, observations, and sections in any order."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

@@ -1,7 +1,5 @@
 """What a base says of itself: each thing that is wrong is named while it is, and imported agents are not in contact."""
 
-from __future__ import annotations
-
 import errno
 import os
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """The store returns what was written, in whole batches, also after the writer was killed."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import shutil

@@ -1,7 +1,5 @@
 """What a person at a base's terminal is told."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from typing import Any

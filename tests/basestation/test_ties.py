@@ -1,7 +1,5 @@
 """Submaps that an agent flew without a break are tied, with the metre that it corrected."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any

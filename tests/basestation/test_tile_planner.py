@@ -1,7 +1,5 @@
 """Tiles for agents: near and ahead first, within the bytes that keyframes earn, removed when far."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

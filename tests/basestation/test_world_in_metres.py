@@ -1,7 +1,5 @@
 """Chains of inertial steps over keyframes of a map, and a world in metres by all of them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """What the mapper's benchmark measures with: problems that can be solved, a queue that fills, pieces that overlap."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from kiteline_bench.base.mapper import further_kb, map_bytes_a_keyframe, queue_p95_s, ring_of_poses, row_of_cameras

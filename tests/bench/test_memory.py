@@ -1,7 +1,5 @@
 """Memory of the parts of a base."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from kiteline_basestation.config import BaseConfig

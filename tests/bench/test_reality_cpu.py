@@ -1,7 +1,5 @@
 """The yardstick of the agent's CPU."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from kiteline_bench.reality.cpu import over_yardstick, yardstick_ms

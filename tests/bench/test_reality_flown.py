@@ -1,7 +1,5 @@
 """The figures of the reality benches, on a flight whose errors are known."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

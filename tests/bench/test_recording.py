@@ -1,7 +1,5 @@
 """Recordings, camera faults, flights under a CPU limit, and the trials in processes of their own."""
 
-from __future__ import annotations
-
 import json
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace

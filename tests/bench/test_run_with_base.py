@@ -1,7 +1,5 @@
 """Flights whose agents come and go: frames in the order asked for, link outages, restarts, and a map sent back."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

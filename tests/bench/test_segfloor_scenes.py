@@ -1,7 +1,5 @@
 """Worlds like Segfloor's: as large as the thesis says, and driven without touching anything."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import cv2

@@ -1,7 +1,5 @@
 """A user's folder of data sets: sequences are found by their layout, and the papers' cuts are made of them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

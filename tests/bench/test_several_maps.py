@@ -1,7 +1,5 @@
 """Bars on flights in several maps: a map that is missing, wrong or inaccurate is not passed."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path

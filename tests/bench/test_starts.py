@@ -1,7 +1,5 @@
 """Median ratios of errors, and the pieces of a recording."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Tables and bars of throttled flights, from made-up ones."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

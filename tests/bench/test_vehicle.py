@@ -1,7 +1,5 @@
 """The bench on the vehicle: its physics, what it says without an autopilot, and how it counts."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The status page in a real browser, where there is one: it draws, writes its numbers, and complains of nothing."""
 
-from __future__ import annotations
-
 import base64
 import json
 import re

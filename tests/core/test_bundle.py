@@ -1,7 +1,5 @@
 """Bundle adjustment against numeric differences, plain numpy and an independent solver."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

@@ -1,7 +1,5 @@
 """Offsets of disparities as unknowns of a bundle, against an independent solver and dense algebra."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

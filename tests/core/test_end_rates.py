@@ -1,7 +1,5 @@
 """Velocity and rate at the end of a row of poses."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from kiteline_core.geometry import se3

@@ -1,7 +1,5 @@
 """Velocities brought to the body frame: by hand, and against motion itself."""
 
-from __future__ import annotations
-
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st

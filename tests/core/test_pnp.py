@@ -1,7 +1,5 @@
 """Absolute pose: P3P against constructed truth, RANSAC among outliers."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import assume, given

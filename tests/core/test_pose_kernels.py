@@ -1,7 +1,5 @@
 """Motion-only optimisation: it finds the pose, ignores outliers, and weighs points by how well they are known."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

@@ -1,7 +1,5 @@
 """Rigid motions in Python's floats against the matrix exponential and numpy's linear algebra."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

@@ -1,7 +1,5 @@
 """Similarities are a group that contains the rigid motions, to the last bit."""
 
-from __future__ import annotations
-
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st

@@ -1,7 +1,5 @@
 """Points from rays."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from kiteline_core.geometry import se3

@@ -1,7 +1,5 @@
 """The documentation: links lead somewhere, files that it names exist, and no page is forgotten."""
 
-from __future__ import annotations
-
 import pkgutil
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The scripts in examples/ run as they are, on a small simulated recording."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """`kiteline doctor --camera`: modelled devices with each fault, and the verdict on it."""
 
-from __future__ import annotations
-
 import json
 import time
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """`kiteline doctor` on a computer in a vehicle, and with a modelled flight controller behind a real socket."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import socket

@@ -1,7 +1,5 @@
 """Exports of a map that was made by the real mapper."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import gtsam

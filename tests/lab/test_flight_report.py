@@ -1,7 +1,5 @@
 """Composing the refined trajectory, the report's numbers, and the check of a flight's folder."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """`kiteline keys` at a base and at an agent."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

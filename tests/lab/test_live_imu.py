@@ -1,7 +1,5 @@
 """A live flight on the IMU of a flight controller that has a clock of its own, and the same flight from its log."""
 
-from __future__ import annotations
-
 import threading
 import time
 from math import cos, radians, sin

@@ -1,7 +1,5 @@
 """`kiteline maps` meets something that is no base where it asks."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """`kiteline rig`: what was found of a rig, shown and in the forms of other tools."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`kiteline sim`: what it records opens again as the same flight, and its truth lies beside it."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The kept flight again on a small share of a modelled core: within its budget, and still where it should be."""
 
-from __future__ import annotations
-
 import contextlib
 from pathlib import Path
 

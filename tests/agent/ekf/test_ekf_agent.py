@@ -1,7 +1,5 @@
 """The agent with the filter as its tracker: odometry, black images, gaps, and the same output for the same input."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

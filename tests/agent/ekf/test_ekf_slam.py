@@ -1,7 +1,5 @@
 """The filter along simulated loops: accuracy, honesty, wrong matches, determinism, and the limits of its state."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
 

@@ -1,7 +1,5 @@
 """Delayed initialisation: points by rays, their covariance, and what is refused."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The filter's keyframes: what the base receives of them, and what its corrections move."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

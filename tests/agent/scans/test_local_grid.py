@@ -1,7 +1,5 @@
 """Distances around the vehicle from its own scans and from tiles of the base's grid, in a room that is known."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast

@@ -1,7 +1,5 @@
 """The agent's scans in flight: spread over frames, the same each time, shared last, dropped first."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

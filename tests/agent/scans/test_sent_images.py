@@ -1,7 +1,5 @@
 """Images in place of scans: the base makes these, except while the link does not carry images."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

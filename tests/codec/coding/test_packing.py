@@ -1,7 +1,5 @@
 """Numbers to bytes and back; columns against a second reader written from SPEC.md alone."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

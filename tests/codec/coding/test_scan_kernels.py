@@ -1,7 +1,5 @@
 """Columns of scans as decisions: what is written is read, and any bytes are refused or read."""
 
-from __future__ import annotations
-
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st

@@ -1,7 +1,5 @@
 """Keyframes of a flight, coded relative to each other."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """Residual codes: lossless, refused if the two sides hold other values, and short."""
 
-from __future__ import annotations
-
 import random
 import time
 from dataclasses import replace

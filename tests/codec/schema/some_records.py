@@ -1,7 +1,5 @@
 """Examples of all records."""
 
-from __future__ import annotations
-
 from dataclasses import fields
 from typing import Any
 

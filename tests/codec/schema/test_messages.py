@@ -1,7 +1,5 @@
 """Records: fixed bytes, round trips, damage, and what a keyframe costs."""
 
-from __future__ import annotations
-
 import json
 import time
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Values in an agent's log come back as they were written."""
 
-from __future__ import annotations
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st

@@ -1,7 +1,5 @@
 """The recipe of CONTRIBUTING.md, "A record": one module and one line make a record that crosses a channel."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Endpoints in bounded memory and time, whatever arrives."""
 
-from __future__ import annotations
-
 import time
 import zlib
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Endpoints that start again: what the other end keeps, and what it asks for."""
 
-from __future__ import annotations
-
 import zlib
 
 from kiteline_codec.schema import (

@@ -1,7 +1,5 @@
 """The base's values of keyframes over hours: beyond a limit they are archived, and none is lost."""
 
-from __future__ import annotations
-
 import random
 
 from kiteline_codec.schema import (

@@ -1,7 +1,5 @@
 """Seals: only what a key's holder wrote, once, goes through."""
 
-from __future__ import annotations
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st

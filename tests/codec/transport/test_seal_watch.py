@@ -1,7 +1,5 @@
 """Ends that do not understand each other say why, on both sides, after a few packets."""
 
-from __future__ import annotations
-
 import pytest
 
 from kiteline_codec.coding.packing import WireError

@@ -1,7 +1,5 @@
 """Brightness of a pair: what gain and falloff are learned from matches, and that the next match is free of them."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

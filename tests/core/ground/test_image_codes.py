@@ -1,7 +1,5 @@
 """Coded images of scans: the same images but for what JPEG rounds, and no memory for what is no such code."""
 
-from __future__ import annotations
-
 import struct
 import time
 

@@ -1,7 +1,5 @@
 """Surfaces that are thinner than a matched block: they get their own disparity, not that of the wall behind."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray

@@ -1,7 +1,5 @@
 """The wider view of scans: it goes on where the rectified images end, and holds nothing that a lens did not see."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2

@@ -1,7 +1,5 @@
 """Picamera2 behind a model of its interface."""
 
-from __future__ import annotations
-
 import sys
 import time
 from pathlib import Path

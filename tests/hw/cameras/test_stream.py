@@ -1,7 +1,5 @@
 """Network cameras: a real ffmpeg sends and another one receives; and programs that misbehave."""
 
-from __future__ import annotations
-
 import shutil
 import socket
 import subprocess

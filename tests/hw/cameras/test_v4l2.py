@@ -1,7 +1,5 @@
 """V4L2 cameras on modelled devices behind the system calls: formats, stamps, pairs, faults."""
 
-from __future__ import annotations
-
 import ctypes
 import errno
 import platform

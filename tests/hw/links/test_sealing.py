@@ -1,7 +1,5 @@
 """What is sealed by default, pairing codes, and what a base lets strangers do."""
 
-from __future__ import annotations
-
 import socket
 import stat
 import time

@@ -1,7 +1,5 @@
 """The serial link on pseudo terminals: noise, full buffers, hang-ups and reopening."""
 
-from __future__ import annotations
-
 import os
 import time
 import zlib

@@ -1,7 +1,5 @@
 """Zenoh links: reconnect with either side, never block the caller, never keep a process from ending."""
 
-from __future__ import annotations
-
 import signal
 import time
 from typing import Any

@@ -1,7 +1,5 @@
 """The agent's end of a lock-step flight: it waits for a base that compiles its kernels first."""
 
-from __future__ import annotations
-
 import time
 from types import SimpleNamespace
 from typing import Any

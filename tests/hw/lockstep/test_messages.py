@@ -1,7 +1,5 @@
 """Messages of the barrier: round trips, and errors on any other bytes."""
 
-from __future__ import annotations
-
 import contextlib
 
 import pytest

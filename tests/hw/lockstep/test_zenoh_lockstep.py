@@ -1,7 +1,5 @@
 """The barrier between processes: every message is answered in order, and errors when either side ends."""
 
-from __future__ import annotations
-
 import signal
 import threading
 import time

@@ -1,7 +1,5 @@
 """Images encoded in another process: the same pixels, in order, also when that process ends before its time."""
 
-from __future__ import annotations
-
 import os
 import signal
 import time

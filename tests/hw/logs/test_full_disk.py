@@ -1,7 +1,5 @@
 """Logs on a disk that becomes full at any write: nothing is raised, what was written stays, and it is told."""
 
-from __future__ import annotations
-
 import errno
 import os
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Raw images of a log: encoded apart, in order, never lost."""
 
-from __future__ import annotations
-
 import threading
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The logs of all starts, those of this one included, stay within their limit; the oldest go first."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Temporary storage on disk."""
 
-from __future__ import annotations
-
 import os
 import tempfile
 from pathlib import Path

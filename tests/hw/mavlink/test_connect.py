@@ -1,7 +1,5 @@
 """What users say about a flight controller: where it sits, its key, its origin."""
 
-from __future__ import annotations
-
 import socket
 from pathlib import Path
 

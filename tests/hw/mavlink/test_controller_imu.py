@@ -1,7 +1,5 @@
 """The IMU of a flight controller against values by hand: frames, signs, units, clocks, and the choice of message."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from pymavlink.dialects.v20 import common

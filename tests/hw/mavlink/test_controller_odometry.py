@@ -1,7 +1,5 @@
 """Velocities of a flight controller against values by hand: frames, signs, clocks, and unusable messages."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from math import cos, pi, sin
 

@@ -1,7 +1,5 @@
 """The session with a flight controller: what modelled ArduPilot and PX4 accept, when, and with which values."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from math import cos, inf, nan, sin
 

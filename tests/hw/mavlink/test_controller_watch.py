@@ -1,7 +1,5 @@
 """What is said about modelled ArduPilot and PX4, with the faults that users have."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from math import radians, sin

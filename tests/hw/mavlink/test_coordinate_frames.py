@@ -1,7 +1,5 @@
 """Coordinate frames against values by hand."""
 
-from __future__ import annotations
-
 from math import cos, radians, sin
 
 import numpy as np

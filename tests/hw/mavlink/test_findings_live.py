@@ -1,7 +1,5 @@
 """What a pose sink says over a real pseudo terminal: its device missing, there, and gone again."""
 
-from __future__ import annotations
-
 import os
 import time
 from pathlib import Path

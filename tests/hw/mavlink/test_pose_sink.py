@@ -1,7 +1,5 @@
 """Poses over real sockets and pseudo terminals, with a modelled controller at the other end."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import socket

@@ -1,7 +1,5 @@
 """HIGHRES_IMU parsed without pymavlink, against pymavlink; and the sink, which parses samples together."""
 
-from __future__ import annotations
-
 import socket
 import time
 

@@ -1,7 +1,5 @@
 """Which vehicle is served, origins and the older messages; frames as they are on the wire."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The frame of the poses sent: at the start, north, or where it was before a restart."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from math import cos, degrees, pi, radians, sin

@@ -1,7 +1,5 @@
 """Who is served over UDP, TCP that comes and goes, and poses, IMU and tunnel on one serial line."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import socket

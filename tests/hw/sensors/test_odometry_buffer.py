@@ -1,7 +1,5 @@
 """The odometry buffer, and batches in a log."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

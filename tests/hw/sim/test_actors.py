@@ -1,7 +1,5 @@
 """People and cars in the view, and surfaces that mislead."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

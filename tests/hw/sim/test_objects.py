@@ -1,7 +1,5 @@
 """Objects and floors of indoor scenes that are hard on an occupancy grid."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

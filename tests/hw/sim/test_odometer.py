@@ -1,7 +1,5 @@
 """The simulated odometer."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A simulated flight as a source: reproducible to the byte, and its options."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The worn rig: what is drawn is what the measurements show, and the calibration that is told stays the good one."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

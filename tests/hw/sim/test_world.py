@@ -1,7 +1,5 @@
 """Scenes that keep their distance from the paths, and statistics of textures."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """ROS 2 bags in SQLite storage, in parts, packed message by message; and bags that are refused with what helps."""
 
-from __future__ import annotations
-
 import os
 import sqlite3
 import threading

@@ -1,7 +1,5 @@
 """Kernels are compiled once, by a process of their own."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Resident memory, and its return to the system."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Lines for the user."""
 
-from __future__ import annotations
-
 from kiteline_hw.system.notices import Notices
 
 

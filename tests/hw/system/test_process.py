@@ -1,7 +1,5 @@
 """Signals, systemd, and the pipe to the parent."""
 
-from __future__ import annotations
-
 import os
 import signal
 import socket

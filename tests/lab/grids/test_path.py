@@ -1,7 +1,5 @@
 """Shortest paths: against Dijkstra, and where there is none."""
 
-from __future__ import annotations
-
 import heapq
 import json
 import math
