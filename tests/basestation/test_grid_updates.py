@@ -17,7 +17,7 @@ from kiteline_basestation.mapper import Mapper, MapperInput
 from kiteline_codec.schema import CameraIntrinsics, KeyframeScan, Record, messages
 from kiteline_core.geometry import se3
 from kiteline_core.ground.column_scan import level_rotation
-from kiteline_core.ids import KEYPOINT_BITS, submap_of_keyframe
+from kiteline_core.ids import KEYPOINT_BITS, KeyframeId, submap_of_keyframe
 from tests.basestation.flat_rooms import box, scan_of
 
 MakeFlight = Callable[..., Any]
@@ -26,20 +26,19 @@ HEIGHT_M = 1.5
 STEP_NS = 500_000_000
 
 
+def seen(keyframe: KeyframeId, T_w_s: NDArray[np.float64], *of_scan: Any) -> KeyframeScan:
+    """What a camera truly saw at T_w_s. of_scan: labels, and what tells a scan between keyframes."""
+    up = T_w_s[2, :3]
+    ahead = T_w_s[:3, :3] @ level_rotation(up)[:, 0]
+    scan = scan_of(ROOM, T_w_s[0, 3], T_w_s[1, 3], float(np.arctan2(ahead[1], ahead[0])))
+    record = KeyframeScan(keyframe, replace(scan, up_c=up, camera_height_m=HEIGHT_M + T_w_s[2, 3]), *of_scan)
+    return messages.decode(messages.key(record), messages.encode(record))
+
+
 def scans(flight: Any, first: int = 0, last: int | None = None) -> list[KeyframeScan]:
     """What each keyframe truly saw; even keypoints lie on the ground, odd ones on obstacles."""
-    out = []
-    for keyframe, T_w_k in list(zip(flight.keyframes, flight.true_T_w_k, strict=True))[first:last]:
-        up = T_w_k[2, :3]
-        ahead = T_w_k[:3, :3] @ level_rotation(up)[:, 0]
-        scan = scan_of(ROOM, T_w_k[0, 3], T_w_k[1, 3], float(np.arctan2(ahead[1], ahead[0])))
-        changes = {"up_c": up, "camera_height_m": HEIGHT_M + T_w_k[2, 3]}
-        scan = type(scan)(**{f: changes.get(f, getattr(scan, f)) for f in scan.__dataclass_fields__})
-        record = KeyframeScan(keyframe, scan, (1 + np.arange(150) % 2).astype(np.uint8))
-        decoded = messages.decode(messages.key(record), messages.encode(record))
-        assert isinstance(decoded, KeyframeScan)
-        out.append(decoded)
-    return out
+    labels = (1 + np.arange(150) % 2).astype(np.uint8)
+    return [seen(k, T_w_k, labels) for k, T_w_k in list(zip(flight.keyframes, flight.true_T_w_k))[first:last]]
 
 
 def between(flight: Any) -> list[KeyframeScan]:
@@ -48,15 +47,7 @@ def between(flight: Any) -> list[KeyframeScan]:
     for n, (keyframe, T_w_k) in enumerate(zip(flight.keyframes, flight.true_T_w_k, strict=True)):
         for part in (1, 2 + n % 3):
             T_k_s = se3.exp(np.array([0.02, 0.01, 0.1 * part, 0.02, 0.1 * part, -0.03]))
-            T_w_s = T_w_k @ T_k_s
-            up = T_w_s[2, :3]
-            ahead = T_w_s[:3, :3] @ level_rotation(up)[:, 0]
-            scan = scan_of(ROOM, T_w_s[0, 3], T_w_s[1, 3], float(np.arctan2(ahead[1], ahead[0])))
-            scan = replace(scan, up_c=up, camera_height_m=HEIGHT_M + T_w_s[2, 3])
-            record = KeyframeScan(keyframe, scan, np.zeros(0, np.uint8), part, T_k_s)
-            decoded = messages.decode(messages.key(record), messages.encode(record))
-            assert isinstance(decoded, KeyframeScan)
-            out.append(decoded)
+            out.append(seen(keyframe, T_w_k @ T_k_s, np.zeros(0, np.uint8), part, T_k_s))
     return out
 
 
