@@ -10,8 +10,7 @@ from kiteline_core.ids import NO_KEYFRAME, keyframe_id, submap_id
 
 
 @pytest.mark.parametrize(
-    ("unit", "known", "one"),
-    [(1.0, 40, True), (1.08, 40, True), (1.4, 40, False), (0.6, 40, False), (0.6, 5, True)],
+    ("unit", "known", "one"), [(1.0, 40, True), (1.08, 40, True), (1.4, 40, False), (0.6, 40, False), (0.6, 5, True)]
 )
 def test_same_unit_compares_depths_of_both_maps(unit: float, known: int, one: bool) -> None:
     random = np.random.default_rng(0)

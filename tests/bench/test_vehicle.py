@@ -45,8 +45,7 @@ def test_it_climbs_and_what_it_measures_is_its_motion() -> None:
 
 
 @pytest.mark.parametrize(
-    ("motors", "axis"),
-    [((0.5, 0.6, 0.6, 0.5), 0), ((0.6, 0.5, 0.6, 0.5), 1), ((0.6, 0.6, 0.5, 0.5), 2)],
+    ("motors", "axis"), [((0.5, 0.6, 0.6, 0.5), 0), ((0.6, 0.5, 0.6, 0.5), 1), ((0.6, 0.6, 0.5, 0.5), 2)]
 )  # rolls right by the left motors, lifts its nose by the front ones, turns clockwise against those that turn back
 def test_motors_turn_it_as_in_arducopters_quadrotor_x(motors: tuple[float, ...], axis: int) -> None:
     copter = flown(Copter(), pwm(0.6, 0.6, 0.6, 0.6), 0.2)

@@ -3,15 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_codec.schema import (
-    CameraIntrinsics,
-    Key,
-    KeyframeHeader,
-    NewLandmarks,
-    Observations,
-    Record,
-    messages,
-)
+from kiteline_codec.schema import CameraIntrinsics, Key, KeyframeHeader, NewLandmarks, Observations, Record, messages
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, keyframe_id, submap_id

@@ -30,12 +30,7 @@ from kiteline_codec.schema import (
 )
 from kiteline_core.geometry import se3
 from kiteline_core.ground.column_scan import ColumnScan, level_rotation
-from kiteline_core.ids import (
-    KeyframeId,
-    SubmapId,
-    keyframe_id,
-    submap_id,
-)
+from kiteline_core.ids import KeyframeId, SubmapId, keyframe_id, submap_id
 from tests.codec.schema.some_records import a_scan, assert_same, some_cells, some_records
 from tests.yardstick import slowness
 

@@ -8,13 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kiteline_codec.schema import (
-    Key,
-    KeyframePose,
-    LivePose,
-    NewLandmarks,
-    WireError,
-)
+from kiteline_codec.schema import Key, KeyframePose, LivePose, NewLandmarks, WireError
 from kiteline_codec.sync.config import SyncConfig
 from kiteline_codec.sync.endpoint import Endpoint
 from kiteline_codec.transport.packet import parse

@@ -2,11 +2,7 @@
 
 import zlib
 
-from kiteline_codec.schema import (
-    Key,
-    KeyframePose,
-    NewLandmarks,
-)
+from kiteline_codec.schema import Key, KeyframePose, NewLandmarks
 from kiteline_codec.sync.endpoint import Endpoint
 from tests.codec.sync.endpoint_pair import PLAIN, Pair, fill
 

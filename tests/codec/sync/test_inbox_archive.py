@@ -16,13 +16,7 @@ from tests.codec.sync.spill_memory import Memory
 
 TICK_NS = 50_000_000
 LIMIT = 100_000
-KINDS = (
-    KeyframePose.KIND,
-    RefinedLandmarks.KIND,
-    FusedLandmarks.KIND,
-    RemovedObservations.KIND,
-    CulledLandmarks.KIND,
-)
+KINDS = (KeyframePose.KIND, RefinedLandmarks.KIND, FusedLandmarks.KIND, RemovedObservations.KIND, CulledLandmarks.KIND)
 
 
 class Line:

@@ -87,11 +87,7 @@ def test_the_older_messages_say_the_same_as_odometry() -> None:
     _, position, speed = read(session.step(pose, 0))
     assert position.get_type() == "VISION_POSITION_ESTIMATE" and speed.get_type() == "VISION_SPEED_ESTIMATE"
     assert [position.x, position.y, position.z] == [3.0, -4.0, -1.0]
-    np.testing.assert_allclose(
-        [position.roll, position.pitch, position.yaw],
-        [0.0, 0.0, -np.pi / 2],
-        atol=1e-6,
-    )
+    np.testing.assert_allclose([position.roll, position.pitch, position.yaw], [0.0, 0.0, -np.pi / 2], atol=1e-6)
     np.testing.assert_allclose([speed.x, speed.y, speed.z], [1.0, -2.0, -0.5], atol=1e-6)
     assert position.usec == speed.usec == S // 1000
     lost = PoseSample(2 * S, np.eye(4), False, -1, velocity=np.zeros(3), rate=np.zeros(3))
