@@ -87,7 +87,6 @@ def test_a_new_submap_continues_where_odometry_puts_it(corrections: Corrections)
     T_o_b = se3.exp(np.array([0.4, 0.1, -0.2, 0.1, 0.0, 0.3]))
     before = corrections.in_world(FIRST, T_o_b, np.eye(4), 0, metric=True)
     entered = corrections.in_world(SECOND, np.eye(4), T_o_b, 50_000_000, metric=True)
-    assert before is not None and entered is not None
     assert np.allclose(entered, before)
     assert corrections.in_world(SECOND, np.eye(4), T_o_b, 50_000_000, metric=False) is None
 

@@ -69,8 +69,6 @@ def test_a_match_that_tilts_a_map_is_refused(degrees: float, kept: bool) -> None
     assert found[1] == pytest.approx(np.hypot(0.005, 0.005))
     new, old = keyframe_id(NEW, 0), keyframe_id(OLD, 0)
     T_w_old, T_w_new = sparse_map.world_pose(old), sparse_map.world_pose(new)
-    assert T_w_old is not None
-    assert T_w_new is not None
     for yaw in (0.0, 1.0, 3.0):  # which gravity does not tell
         X = se3.from_rt(se3.so3_exp(yaw * UP), np.array([3.0, -1.0, 0.5]))
         edge = LoopEdge(new, old, se3.inverse(T_w_old) @ X @ T_w_new, 50, 3.0)
@@ -150,18 +148,12 @@ def test_a_submap_after_a_loss_lies_where_its_tie_says(late: bool) -> None:
     if late:
         assert placed(mapper) is None  # without images for longer than odometry is followed
         step(mapper, 2.0, tie)
-    found = placed(mapper)
-    assert found is not None
-    assert np.allclose(found, T_K_F, atol=1e-9)
+    assert np.allclose(placed(mapper), T_K_F, atol=1e-9)
     better = T_K_F @ se3.exp(np.array([0.1, 0.0, -0.2, 0.0, 0.0, 0.0]))
     step(mapper, 3.0, SubmapTie(NEW, LAST, better, 0.05, 0.004))
-    found = placed(mapper)
-    assert found is not None
-    assert np.allclose(found, better, atol=1e-9)
+    assert np.allclose(placed(mapper), better, atol=1e-9)
     step(mapper, 4.0, SubmapTie(NEW, LAST, T_K_F, 0.5, 0.004))  # too uncertain
-    found = placed(mapper)
-    assert found is not None
-    assert np.allclose(found, better, atol=1e-9)
+    assert np.allclose(placed(mapper), better, atol=1e-9)
 
 
 @pytest.mark.parametrize("up_to_scale", [False, True])
@@ -190,9 +182,7 @@ def test_submaps_after_one_that_follows_its_tie_move_along() -> None:
     before = mapper.placements[later]
     better = T_K_F @ se3.exp(np.array([0.1, 0.0, -0.2, 0.0, 0.0, 0.3]))
     step(mapper, 3.0, SubmapTie(NEW, LAST, better, 0.05, 0.004))
-    found = placed(mapper)
-    assert found is not None
-    assert np.allclose(found, better, atol=1e-9)
+    assert np.allclose(placed(mapper), better, atol=1e-9)
     assert not np.allclose(before, mapper.placements[later], atol=0.05)
     assert np.allclose(se3.inverse(mapper.placements[NEW]) @ mapper.placements[later], between, atol=1e-9)
     mapper.map.root_submaps[later] = OLD  # recognised: it lies where the merge says

@@ -86,7 +86,6 @@ def believed(flight: Any) -> F64:
 def error_m(found: F64, true: F64) -> tuple[float, float]:
     """RMS after the best similarity, in true metres, and the scale of that."""
     S = align_points(true, found, with_scale=True)
-    assert S is not None
     return float(np.sqrt(np.mean(np.sum((se3.transform(S, found) - true) ** 2, axis=1)))), sim3.scale_of(S)
 
 
