@@ -1,13 +1,15 @@
-"""The motion over a loss: the velocity after it corrects the IMU's error, and the deviations tell how far."""
+"""Motion over a loss, motion between frames, and an IMU that falls silent."""
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from kiteline_agent.inertial.gravity_alignment import up_of
+from kiteline_agent.inertial.imu_watch import ImuWatch
 from kiteline_agent.inertial.inertial_config import InertialConfig, StartDeviations
 from kiteline_agent.inertial.inertial_tracker import InertialTracker
 from kiteline_agent.motion.loss_motion import LossMotion, LossMotionEstimator, _largest
+from kiteline_agent.motion.recent_motion import RecentMotion
 from kiteline_core.frame import ImuBatch, ImuCalibration
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
@@ -101,3 +103,55 @@ def test_up_is_that_of_the_state_and_as_certain() -> None:
 def test_a_deviation_is_never_none_at_all() -> None:
     """A record cannot tell a deviation of 0."""
     assert 0.0 < _largest(np.zeros((3, 3))) < 1e-5
+
+
+MS = 1_000_000
+
+
+def at(t_s: float) -> np.ndarray:
+    T = np.eye(4)
+    T[0, 3] = 1.5 * t_s**2  # 3 m/s^2
+    return T
+
+
+def test_it_is_of_the_instant_asked_for_but_looks_ahead_one_frame_at_most() -> None:
+    motion = RecentMotion()
+    for i in range(10):
+        motion.add(i * 50 * MS, at(0.05 * i), measured=True)
+    for ask_ms, t_s in ((450, 0.45), (480, 0.48), (500, 0.5), (900, 0.5)):
+        found = motion.rates(ask_ms * MS)
+        assert found[0] == pytest.approx([3.0 * t_s, 0.0, 0.0], abs=1e-6)
+
+
+def test_a_loss_forgets_the_motion() -> None:
+    motion = RecentMotion()
+    for i in range(5):
+        motion.add(i * 50 * MS, at(0.05 * i), measured=i != 3)
+    assert motion.rates(210 * MS) is None
+
+
+_FRAME_NS = 50_000_000
+
+
+def samples(t_ns: int, n: int = 10) -> ImuBatch:
+    return ImuBatch(t_ns + np.arange(n, dtype=np.int64), np.zeros((n, 3)), np.zeros((n, 3)))
+
+
+def test_a_silence_is_told_once_and_its_end_too() -> None:
+    watch = ImuWatch(3.0)
+    told = {}
+    for k in range(300):
+        t_ns = k * _FRAME_NS
+        speaks = 20 <= k < 100 or k >= 200
+        for line in watch.frame(t_ns, samples(t_ns) if speaks else samples(t_ns, 0) if k % 2 else None):
+            told[k] = line
+    assert told == {
+        159: "imu: silent for 3.0 s, the images alone carry the pose",  # the last samples came at frame 99
+        200: "imu: samples again",
+    }
+
+
+def test_an_imu_that_never_speaks_is_told_of() -> None:
+    watch = ImuWatch(3.0)
+    told = [line for k in range(200) for line in watch.frame(k * _FRAME_NS, None)]
+    assert told == ["imu: silent for 3.0 s, the images alone carry the pose"]

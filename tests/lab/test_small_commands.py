@@ -1,0 +1,53 @@
+"""Keys and answers of the base's maps on the command line."""
+
+from pathlib import Path
+
+import pytest
+
+from kiteline_core.ids import MAX_AGENTS
+from kiteline_hw.ports import LinkError
+from kiteline_hw.system.key_store import read_file
+from kiteline_lab.tools import keys, maps
+
+
+def test_a_base_that_pairs_before_its_first_start_has_the_keys_of_all(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    base, agent = tmp_path / "base", tmp_path / "agent"
+    keys.main(["pair", "3", "--file", str(base)])
+    code = capsys.readouterr().out.split("pair 3 ")[1].split()[0]
+    keys.main(["--file", str(agent), "pair", "3", code])
+    held = read_file(base)
+    assert len(held.agents) == MAX_AGENTS and held.maps is not None
+    assert read_file(agent).agents == {3: held.agents[3]} and read_file(agent).maps is None
+    keys.main(["pair", "4", "--file", str(base)])
+    again = read_file(base)
+    assert again.agents[4] != held.agents[4] and {**again.agents, 4: held.agents[4]} == held.agents
+
+
+def test_no_file_is_made_for_an_agent_that_cannot_be(tmp_path: Path) -> None:
+    with pytest.raises(SystemExit):
+        keys.main(["pair", str(MAX_AGENTS), "--file", str(tmp_path / "keys")])
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("asked_for", [["list"], ["--json", "list"]])
+@pytest.mark.parametrize(
+    "answer",
+    [(True, "<html>"), (False, "go away"), (False, "[]"), (True, "3"), (True, '{"maps": 3}'), (False, "{}"),
+     (True, '{"maps": [{"id": "0.0.0"}]}'), (True, "[" * 100_000)],
+)  # fmt: skip
+def test_an_answer_of_another_program_is_told_in_a_line(
+    answer: tuple[bool, str], asked_for: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(maps, "ask", lambda *_, **__: answer)
+    monkeypatch.setattr(maps, "default_path", lambda: Path("no keys"))
+    with pytest.raises(LinkError, match="answers"):
+        maps.main(asked_for)
+
+
+def test_options_may_follow_the_verb() -> None:
+    given = maps.parser().parse_args(["--base", "a", "--json", "get", "hangar", "--base", "b", "--key", "k"])
+    assert (given.base, given.key, given.json) == ("b", Path("k"), True)
+    given = maps.parser().parse_args(["--base", "a", "--key", "k", "list"])
+    assert (given.base, given.key, given.json) == ("a", Path("k"), False)
