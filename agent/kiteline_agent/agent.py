@@ -3,8 +3,6 @@
 Agent._process is the algorithm of one frame; its numbered steps are those of ARCHITECTURE.md.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

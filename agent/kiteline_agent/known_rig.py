@@ -1,7 +1,5 @@
 """What earlier flights found of a rig, as options of the agent: the next flight begins with it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -51,8 +49,8 @@ class KnownRigConfig:
         return self.is_of(camera) and bool(self.T_b_c) and np.allclose(self.T_b_c, camera.T_b_c.ravel(), atol=_SAME)
 
     def updated(
-        self, camera: RectifiedCamera, right: KnownRigConfig | None, imu: KnownImuConfig | None
-    ) -> KnownRigConfig | None:
+        self, camera: RectifiedCamera, right: "KnownRigConfig | None", imu: KnownImuConfig | None
+    ) -> "KnownRigConfig | None":
         """This, with what a flight found of the right camera and the IMU; None if that is nothing."""
         if right is None and imu is None:
             return None

@@ -1,7 +1,5 @@
 """What enters one step of the agent and what leaves it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -4,8 +4,6 @@ A command is an input of the mapper's step, logged and replayed with it; see doc
 named AGENT.BOOT.NUMBER; a map by any of its submaps, or by a name that a user gave it.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
@@ -22,14 +20,7 @@ from kiteline_basestation.merging.merges import NOTHING, MergeResult
 from kiteline_codec.coding.quantise import MAX_SCALE, MIN_SCALE
 from kiteline_core.errors import INPUT_FAULTS
 from kiteline_core.geometry import sim3
-from kiteline_core.ids import (
-    BOOT_BITS,
-    SUBMAP_BITS,
-    SubmapId,
-    agent_of_submap,
-    submap_id,
-    submap_of_keyframe,
-)
+from kiteline_core.ids import BOOT_BITS, SUBMAP_BITS, SubmapId, agent_of_submap, submap_id, submap_of_keyframe
 
 _NAME_CHARS = 64
 _TEXT_CHARS = 1 << 14  # of a command

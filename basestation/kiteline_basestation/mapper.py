@@ -3,8 +3,6 @@
 Method: "DS-PTAM: a distributed stereo PTAM", the mapper of chapter 3, with the culling of ORB-SLAM2.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections import Counter, deque

@@ -3,8 +3,6 @@
 Keyframes, submaps and landmarks are named by their ids, because slots are numbered anew in each process.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 

@@ -1,7 +1,5 @@
 """Sensor data: images at one instant, IMU samples, odometer velocities."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Odometer velocities: conversion to the body frame, checks, concatenation."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

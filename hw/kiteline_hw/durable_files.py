@@ -1,7 +1,5 @@
 """Files that are whole, and the newest, after a crash or a loss of power. It imports nothing but the system's calls."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

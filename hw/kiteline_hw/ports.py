@@ -1,7 +1,5 @@
 """The interfaces of sources, links, flight controllers and clocks, and the errors that they raise."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol, TypeGuard

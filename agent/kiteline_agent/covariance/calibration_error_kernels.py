@@ -1,7 +1,5 @@
 """Kernels that propagate calibration errors, shared by a whole flight, to a pose measured against a map."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

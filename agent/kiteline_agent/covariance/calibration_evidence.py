@@ -1,7 +1,5 @@
 """How far the calibration of the cameras is off, by the residuals of tracked landmarks over a flight."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """When the covariance of the pose is evaluated again."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Drift of the odometry frame since the flight began, as the map measures it."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

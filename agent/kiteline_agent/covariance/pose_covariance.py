@@ -10,8 +10,6 @@
 - *Dead reckoning* has the covariance of the IMU or odometer, or that of unknown accelerations.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Probability that a pose is as accurate as configured."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

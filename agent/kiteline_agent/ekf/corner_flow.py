@@ -5,8 +5,6 @@ for motion. So each corner is aligned with the image in which it was found, warp
 filter knows it, by its distance.
 """
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray

@@ -3,8 +3,6 @@
 Sums run in a fixed order, so that the same input gives the same bits.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

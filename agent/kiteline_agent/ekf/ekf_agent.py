@@ -1,7 +1,5 @@
 """The onboard half with the smallest tracker: one camera and odometry. Sans-IO; it is stepped like Agent."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The filter over a flight: odometry moves it, tracked pixels correct it, landmarks enter late and leave."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -6,8 +6,6 @@ of the whole map, which nothing measures; errors that add up make a filter claim
 Source: A. Barrau, S. Bonnabel, "An EKF-SLAM algorithm with consistency properties", 2015.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Which of the matched landmarks are compatible with the state, and the update by them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

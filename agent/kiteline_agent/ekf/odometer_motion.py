@@ -1,7 +1,5 @@
 """The camera's motion between two frames, and its error, by an odometer's samples."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -5,8 +5,6 @@ that of the linearised pixels given the poses in the state; what the rays say be
 the poses from which they were seen.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Kernel that positions a landmark by its rays."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """Pixels that past views saw of tracks which are not yet landmarks."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -6,8 +6,6 @@ Where odometry is poor the views are off by a tenth of the way between them, and
 in that: all tracks are linearised again at the corrected views (iterated Kalman filter).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

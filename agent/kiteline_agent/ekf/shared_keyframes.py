@@ -3,8 +3,6 @@
 The filter keeps what it estimates: o stays continuous. A corrected keyframe moves m under the camera.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

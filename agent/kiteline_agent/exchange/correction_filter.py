@@ -5,8 +5,6 @@ share of its distance from the origin. A Kalman filter of the vehicle's position
 deviation of the base's scale and that of the position reported so far.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """Records of the base: corrections of the local map, cached keyframes, submap placements, grid tiles."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Smooths corrections of the live pose: the odometry frame moves in the world at a limited speed."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

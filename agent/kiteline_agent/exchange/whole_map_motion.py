@@ -5,8 +5,6 @@ others by milliradians. The shape of the flown path, and all that is left to fly
 turn; poses from before and after it do not fit each other. Changes of shape are not touched.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

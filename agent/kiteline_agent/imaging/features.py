@@ -1,7 +1,5 @@
 """Image pyramids, corner detection spread over the image, and binary descriptors."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2

@@ -6,8 +6,6 @@ passes for a curved disparity offset. Offsets of rows need no depth and no motio
 a pixel.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Options for the IMU of a flight controller: its noise, and the pose of the camera."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

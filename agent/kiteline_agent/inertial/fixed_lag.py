@@ -5,8 +5,6 @@ remaining state, linearised once (S. Leutenegger et al., "Keyframe-based visual-
 optimization", 2015; the chain is that of T. Qin et al., "VINS-Mono", 2018, without points among the unknowns).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -4,8 +4,6 @@ States and residuals are those of inertial_kernels. The matrix is block tridiago
 so elimination goes along the chain.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

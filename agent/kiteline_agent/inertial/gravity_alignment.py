@@ -5,8 +5,6 @@ acceleration, so that gravity is known to half a degree in motion too. The first
 sent to the base, and a flight controller gets its first pose once the rotation is known.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """Initialisation of the inertial state from a window of poses by images: at rest, or in motion."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal

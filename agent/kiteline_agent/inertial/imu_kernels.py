@@ -4,8 +4,6 @@ Source: C. Forster, L. Carlone, F. Dellaert, D. Scaramuzza, "On-manifold preinte
 odometry", 2017; rotations are perturbed on the right, R = R_hat Exp(phi). Midpoint rule instead of Euler's.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """Watch for missing IMU samples."""
 
-from __future__ import annotations
-
 from kiteline_core.frame import ImuBatch
 
 

@@ -5,8 +5,6 @@ are [rotation (on the right), position, velocity, gyro bias, accel bias]. All st
 two tilt angles about x and y of m.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

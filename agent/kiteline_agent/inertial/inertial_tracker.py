@@ -1,7 +1,5 @@
 """Inertial tracking: initialisation, prediction, fusion with poses from images, and dead reckoning without them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -6,8 +6,6 @@ motion", 2014). The gyro bias and the refinement that imposes the length of grav
 "VINS-Mono", 2018, section V-B.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Preintegration of IMU samples between two instants, with covariance and bias Jacobians."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

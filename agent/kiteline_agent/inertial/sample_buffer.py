@@ -1,7 +1,5 @@
 """The newest IMU samples, and the noise that they show."""
 
-from __future__ import annotations
-
 from copy import copy
 
 import numpy as np
@@ -71,7 +69,7 @@ class SampleBuffer:
                 self._measure_noise(min(self._unmeasured, len(self._t)))
                 self._unmeasured = 0
 
-    def extended(self, imu: ImuBatch | None) -> SampleBuffer:
+    def extended(self, imu: ImuBatch | None) -> "SampleBuffer":
         """A copy with more samples; this buffer stays as it is."""
         other = copy(self)
         other._largest, other._variance = self._largest.copy(), self._variance.copy()  # `push` replaces the others

@@ -5,8 +5,6 @@ gyro. Neither displacements of images nor those of the IMU are free of noise, so
 other would be biased: the update is linearised at the displacement that both give together.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

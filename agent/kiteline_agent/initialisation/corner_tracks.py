@@ -1,7 +1,5 @@
 """Corners followed by optical flow over a window of monocular keyframes, before there is a map."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2
@@ -39,7 +37,7 @@ class CornerObservations:
     seen: Bools
     ids: I64
 
-    def part(self, keep: Bools | I64) -> CornerObservations:
+    def part(self, keep: Bools | I64) -> "CornerObservations":
         """The corners in these columns."""
         return CornerObservations(
             np.ascontiguousarray(self.xy[:, keep]), np.ascontiguousarray(self.seen[:, keep]), self.ids[keep]

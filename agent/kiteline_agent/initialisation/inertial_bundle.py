@@ -6,8 +6,6 @@ two follow T. Qin et al., "VINS-Mono", 2018, section V; the last one is that of 
 optimization for visual-inertial initialization", 2020, with the landmarks among the unknowns.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Starts a monocular map in metres from corners and IMU, once the scale is known; until then there is no pose."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from itertools import pairwise
 

@@ -1,7 +1,5 @@
 """The inertial part of a window: errors of the IMU's samples and of priors, and how large these errors turn out."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

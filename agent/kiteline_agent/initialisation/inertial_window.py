@@ -1,7 +1,5 @@
 """States of a window of monocular keyframes with an IMU, and its solution."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

@@ -3,8 +3,6 @@
 Optical flow drifts from keyframe to keyframe; an alignment with one template, warped by the geometry, does not.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

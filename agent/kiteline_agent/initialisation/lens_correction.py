@@ -4,8 +4,6 @@ A pixel at (x, y), r from the axis, is moved by (x, y) (focal + r^2 radial + r^4
 rotation of the camera in the body, which a shift of the centre resembles.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

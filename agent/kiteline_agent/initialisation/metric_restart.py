@@ -3,8 +3,6 @@
 Shared values keep their unit, so a scale found late begins a new submap instead of rescaling the old one.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -5,8 +5,6 @@ A homography and a fundamental matrix are fitted; the ratio of their scores tell
 views is refined by bundle adjustment.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2

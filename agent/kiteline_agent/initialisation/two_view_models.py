@@ -4,8 +4,6 @@ All draws are fitted and scored at once, as stacks of small matrices. Scores are
 each inlier adds its distance to the outlier bound, so that scores of both models compare.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -3,8 +3,6 @@
 The scale is free: the median depth of the first landmarks is set to a convention, and the map keeps that scale.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import cv2

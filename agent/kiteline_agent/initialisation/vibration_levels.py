@@ -1,7 +1,5 @@
 """How much an accelerometer vibrates over a window, and in each of its intervals."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

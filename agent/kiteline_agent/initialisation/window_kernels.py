@@ -1,7 +1,5 @@
 """Normal equations of a monocular window's observations, before landmarks are eliminated."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """How noisy the IMU is beside its calibration, as the errors of a window show it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -4,8 +4,6 @@ Two rays are intersected by least squares; successive inverse depths are average
 "SVO", 2014, section V). A seed becomes a landmark of the map once its depth is known well enough.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

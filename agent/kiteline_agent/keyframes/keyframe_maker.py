@@ -4,8 +4,6 @@ The local map keeps what was measured, whatever is shared of it and however it i
 the agent tracks.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Corners that become the new landmarks of a keyframe."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Decides when a frame becomes a keyframe."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

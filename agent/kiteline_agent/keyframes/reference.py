@@ -3,8 +3,6 @@
 Beside it the newest of all is known: where a link carries fewer keyframes than tracking needs, some are not shared.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

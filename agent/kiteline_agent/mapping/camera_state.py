@@ -1,7 +1,5 @@
 """Where the camera is: pose, motion, covariance, reference keyframe and submap, which change together."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """Makes keyframes of frames, and enters them in all that reads keyframes."""
 
-from __future__ import annotations
-
 from numpy import float64
 from numpy.typing import NDArray
 

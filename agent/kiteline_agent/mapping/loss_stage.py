@@ -1,7 +1,5 @@
 """Handles a frame that was not tracked: dead reckoning, relocalisation, or a new submap."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from numpy import float64

@@ -1,7 +1,5 @@
 """Reports the pose of each processed frame, and predicts it for the time after that frame."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """Opens submaps, joins new ones to older ones, continues full ones, and restarts monocular ones in metres."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -176,10 +174,7 @@ class SubmapStage:
             return None
         if camera.submaps.any:
             camera.leave_submap()
-        events = [
-            "submap: opened",
-            f"mono: scale by convention, median depth {two_views.median_depth_m:.3g} m",
-        ]
+        events = ["submap: opened", f"mono: scale by convention, median depth {two_views.median_depth_m:.3g} m"]
         camera.motion.begin_unscaled_map()
         camera.open_submap()
         camera.pose.reset_motion()

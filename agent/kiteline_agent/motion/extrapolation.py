@@ -1,7 +1,5 @@
 """The motion since the last frame, for a pose between frames or of a frame that was skipped."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import StrEnum
 

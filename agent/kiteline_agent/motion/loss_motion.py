@@ -5,8 +5,6 @@ A quarter of a second of images in a new submap tells the velocity there, and by
 error of the position, as in a Kalman smoother.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

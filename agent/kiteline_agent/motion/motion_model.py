@@ -1,7 +1,5 @@
 """Motion model of the tracker: IMU, odometer or constant velocity."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Any
 

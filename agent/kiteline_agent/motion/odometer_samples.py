@@ -1,7 +1,5 @@
 """Buffer of odometer samples and their means over an interval."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

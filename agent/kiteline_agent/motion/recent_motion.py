@@ -1,7 +1,5 @@
 """Velocity of the vehicle by its last poses, as of an instant after them, where no sensor measures it."""
 
-from __future__ import annotations
-
 from collections import deque
 
 import numpy as np

@@ -4,8 +4,6 @@ Only short steps tell it: between keyframes, a second apart, an accelerometer's 
 and IMU would have to differ by.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """Scale of a monocular map of unknown unit, from displacements by the odometer and by the images."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """Corners and descriptors of a whole frame, to match it with keyframes."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

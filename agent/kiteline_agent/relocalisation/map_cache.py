@@ -3,8 +3,6 @@
 They have landmarks and descriptors but no image, so a lost frame is matched with them by descriptor.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -5,8 +5,6 @@ is found, one keyframe is made in each, with the same stamp. Both are the same c
 T_old_new = T_old_k1 @ inverse(T_new_k2). The agent continues in the old submap; the base moves the other keyframes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 

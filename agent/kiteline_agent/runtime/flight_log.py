@@ -3,8 +3,6 @@
 Each step begins with a /step message that counts the messages after it. Numbers are logged bit for bit.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from typing import Any, Protocol

@@ -1,7 +1,5 @@
 """Counts and CPU time of a flight, frame by frame, and its trajectory lines. The clock is handed in; no file."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Compile all kernels of the onboard half before the first frame, by flying a few frames of noise."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

@@ -1,7 +1,5 @@
 """How much ranges of scans deviate, and what they are once more is known of the rig's disparities."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,7 +28,7 @@ class RangeError:
     cov_px: F64
 
     @staticmethod
-    def of_noise(bf: float, sigma_px: float) -> RangeError:
+    def of_noise(bf: float, sigma_px: float) -> "RangeError":
         """That of a camera whose disparities have noise alone."""
         return RangeError(bf, sigma_px, np.zeros(TERMS), np.zeros((TERMS, TERMS)))
 
@@ -39,11 +37,11 @@ class RangeError:
         """Deviation of what disparities in the middle of the image have in common."""
         return float(np.sqrt(self.cov_px[0, 0]))
 
-    def moved(self, other: RangeError) -> bool:
+    def moved(self, other: "RangeError") -> bool:
         """True if the offset is not that of the other one."""
         return bool(np.abs(self.offset_px - other.offset_px).max() > _LEAST_CHANGE_PX)
 
-    def differs(self, other: RangeError) -> bool:
+    def differs(self, other: "RangeError") -> bool:
         """True if ranges drawn by the other one have to be drawn anew."""
         mine, theirs = (float(np.hypot(e.sigma_px, e.common_px)) for e in (self, other))
         return self.moved(other) or abs(float(np.log(mine / theirs))) > _LEAST_CHANGE

@@ -5,8 +5,6 @@ and then. The height of the ground is followed from scan to scan; those that saw
 If the base makes the scans, their images are sent in place of all that, except while the link does not carry them.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

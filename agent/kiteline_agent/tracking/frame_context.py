@@ -1,7 +1,5 @@
 """What every stage may read of the frame in work."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from numpy import float64

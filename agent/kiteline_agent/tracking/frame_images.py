@@ -1,7 +1,5 @@
 """Image pyramids of one frame, rectified only where they are read."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -116,7 +114,7 @@ class FrameImages:
         """The whole level 0, and coarser levels rectified at half size, as the right image's: for templates."""
         return self.left if self.rectifier is None else (self.left[0], *self._halves(self.rectifier))
 
-    def rectified_by(self, rectifier: Rectifier) -> FrameImages:
+    def rectified_by(self, rectifier: Rectifier) -> "FrameImages":
         """The same frame, read through a rectifier that has changed."""
         grid = NO_GRID if rectifier.left_grid is None else rectifier.left_grid
         used = None if rectifier.left_grid is None else rectifier

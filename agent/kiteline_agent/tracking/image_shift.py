@@ -4,8 +4,6 @@ After G. Klein and D. Murray, "Improving the agility of keyframe-based SLAM" (20
 their alignment. It finds the large shifts of a quick rotation, which template alignment cannot.
 """
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray

@@ -4,8 +4,6 @@ Keyframe and landmarks do not move alike: a refined landmark moves relative to i
 hang on many keyframes. The camera moves with what it sees, so that the next frame is where odometry expects it.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

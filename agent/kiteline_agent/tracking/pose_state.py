@@ -1,7 +1,5 @@
 """Pose of the camera in the submap and in the odometry frame, and its constant-velocity motion."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """Rolling shutter: pixels moved from the time of their row to that of the frame, by the camera's predicted motion."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

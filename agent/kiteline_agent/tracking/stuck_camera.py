@@ -1,7 +1,5 @@
 """Detects a camera that repeats its last image while the vehicle moves."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

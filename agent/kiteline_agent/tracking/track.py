@@ -1,7 +1,5 @@
 """The measured pose of one frame, and the observations behind it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

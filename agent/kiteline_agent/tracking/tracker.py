@@ -1,7 +1,5 @@
 """Measures the pose of a frame: align templates, search disparities along the row, optimise the pose."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

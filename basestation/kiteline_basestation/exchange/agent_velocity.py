@@ -1,7 +1,5 @@
 """Velocity of an agent between two plans of what it is sent."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

@@ -5,8 +5,6 @@ now or after a short prediction. They are sent in the frame of the submap that t
 others are needed more.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 

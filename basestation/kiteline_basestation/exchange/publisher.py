@@ -1,7 +1,5 @@
 """Collects changes of the map as records for the agents that own the keyframes."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Collection, Iterable, Mapping
 from itertools import chain, islice

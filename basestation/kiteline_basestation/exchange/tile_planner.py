@@ -4,8 +4,6 @@ A tile is sent when enough of its cells differ from what the agent has, the most
 for each of the agent's keyframes. Tiles far away are removed again.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Draws the grid: the scans of new keyframes, and anew those of keyframes that moved."""
 
-from __future__ import annotations
-
 import copy
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """The grid for others than its own stage: coded tiles for pages and links, and files for map_server."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import pairwise

@@ -4,8 +4,6 @@ First the lowest peak of the height histogram below the cameras, propagated from
 a plane for each patch, fitted to the points near it in narrowing bands (a hard-limited M-estimator).
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

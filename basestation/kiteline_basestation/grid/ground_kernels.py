@@ -1,7 +1,5 @@
 """Kernel that propagates the height of the ground."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

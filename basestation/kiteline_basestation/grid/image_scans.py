@@ -1,7 +1,5 @@
 """Scans of agents that send images: one job at a time for each agent, as each needs the ground that others saw."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass

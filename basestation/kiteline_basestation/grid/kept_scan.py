@@ -1,7 +1,5 @@
 """Column scans as the base keeps them: small, and in whole numbers."""
 
-from __future__ import annotations
-
 import math
 import zlib
 from dataclasses import dataclass

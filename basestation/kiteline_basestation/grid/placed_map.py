@@ -1,7 +1,5 @@
 """The placed part of the map in w: input of exports and of the status page."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

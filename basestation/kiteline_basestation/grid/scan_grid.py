@@ -15,8 +15,6 @@ Method: log-odds of A. Hornung et al., "OctoMap", 2013, equation 2, in the secto
 and the opening of the result after "Segfloor", equation 5.3 and section 5.6.
 """
 
-from __future__ import annotations
-
 import itertools
 from bisect import insort
 from collections import Counter
@@ -189,7 +187,7 @@ class ScanGrid:
         self._store.close()
         return cells, int(known)
 
-    def redrawn(self, config: GridConfig) -> ScanGrid:
+    def redrawn(self, config: GridConfig) -> "ScanGrid":
         """The same scans where they lie now, all of them, drawn with other weights and thresholds."""
         grid = ScanGrid(config)
         for placed in self._placed.values():

@@ -1,7 +1,5 @@
 """Makes a column scan of images that an agent sent, as a job: what the agent would do with them on board."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

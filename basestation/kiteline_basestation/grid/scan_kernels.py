@@ -6,8 +6,6 @@ plane 1 + b what band b has beyond it. All drawing is the sum of integers, so th
 leaves no trace.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """Sectors of free cells and obstacles around a camera, from the columns of a scan, in cells of w."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

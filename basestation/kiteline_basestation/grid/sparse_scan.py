@@ -4,8 +4,6 @@ Method: "Segfloor", section 5.6, points above the ground and rays to points of t
 a ray over a box clears neither the box nor the floor below.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

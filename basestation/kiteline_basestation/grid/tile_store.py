@@ -1,7 +1,5 @@
 """Tiles of log-odds by place, in memory as few as are drawn on at a time; the others are kept deflated."""
 
-from __future__ import annotations
-
 import zlib
 from collections.abc import Iterator
 from typing import NamedTuple

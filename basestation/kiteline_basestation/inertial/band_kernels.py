@@ -1,7 +1,5 @@
 """Kernel for normal equations of a chain: a symmetric band, with a border of a few unknowns that all rows share."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

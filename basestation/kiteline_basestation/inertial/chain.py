@@ -1,7 +1,5 @@
 """The agents' inertial steps along the keyframes of a map, and the path of the body that poses and steps give."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any

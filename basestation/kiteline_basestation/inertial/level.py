@@ -1,7 +1,5 @@
 """Roll and pitch of maps whose agents know gravity: loop closures keep them, merges have to agree with them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

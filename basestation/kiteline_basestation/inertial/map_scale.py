@@ -7,8 +7,6 @@ accelerates, and taken as exact they would make the scale too small. Nor is it o
 (`scale_drift`).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -6,8 +6,6 @@ turns over a shallow scene. The scale is piecewise linear along the path, in vie
 where the path comes back to landmarks, the two passes have nearly the same scale.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

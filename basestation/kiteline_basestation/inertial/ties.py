@@ -4,8 +4,6 @@ A monocular agent begins such a submap to correct its scale. The steps from the 
 first one of the new submap give the relative pose, the agent's record the scale; images need not recognise anything.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from dataclasses import dataclass
 

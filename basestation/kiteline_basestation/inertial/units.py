@@ -1,7 +1,5 @@
 """The length in w of the unit in which a monocular agent measured its motion, along the keyframes of a map."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

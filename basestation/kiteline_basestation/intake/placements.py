@@ -5,8 +5,6 @@ may have another unit of length than w. w keeps the unit in which it began until
 first submap, or an agent reports how long that unit is.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 

@@ -1,7 +1,5 @@
 """Tables of the sparse map: one row per keyframe, one row per keypoint, with spare capacity."""
 
-from __future__ import annotations
-
 from array import array
 from dataclasses import dataclass, fields
 

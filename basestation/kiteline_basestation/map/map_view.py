@@ -1,7 +1,5 @@
 """Queries of the sparse map; `sparse_map` holds what changes it."""
 
-from __future__ import annotations
-
 from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
 from dataclasses import fields

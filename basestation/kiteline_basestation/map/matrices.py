@@ -1,7 +1,5 @@
 """Poses (4,4) as 16 numbers in JSON, row by row, to the last bit."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

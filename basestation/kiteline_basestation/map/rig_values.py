@@ -1,7 +1,5 @@
 """Calibrations and disparity offsets of the agents' cameras."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -5,8 +5,6 @@ with that keyframe. Each keypoint has one slot (row of `keypoints`), and a landm
 landmark that a keypoint observes; for a fused landmark, the root landmark. Records may come in any order, repeatedly.
 """
 
-from __future__ import annotations
-
 from bisect import bisect_right
 from collections.abc import Collection, Sequence
 

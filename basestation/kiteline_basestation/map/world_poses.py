@@ -1,7 +1,5 @@
 """Poses of many keyframes at once: a pose graph moves all of a map within one step."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """Corrections of whole maps: pose graphs and full bundle windows, and how keyframes take on their results."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import compress

@@ -1,7 +1,5 @@
 """Checks that distinguish loop closures from places that only look alike."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -4,8 +4,6 @@ Each new keyframe queries the place index, and candidates are verified geometric
 accepted when enough keyframes agree on one correction and few or none contradict it (`loop_consistency`).
 """
 
-from __future__ import annotations
-
 from bisect import insort
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,5 @@
 """Verified matches of two keyframes, and the edges of the pose graph that they become."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import TypeVar

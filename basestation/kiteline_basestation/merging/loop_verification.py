@@ -6,8 +6,6 @@ pose by RANSAC and guided matching follow (ORB-SLAM2, section III-E). The matche
 image and make up most of those expected in view.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

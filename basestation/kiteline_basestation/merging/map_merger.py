@@ -5,8 +5,6 @@ bundle (job). A newer closure in a map cancels its pending jobs. A merge that th
 undone. Every method that moves maps returns what the mapper has to apply.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 

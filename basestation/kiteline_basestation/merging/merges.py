@@ -1,7 +1,5 @@
 """Merges of maps, and what a step of the map merger changed."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -70,7 +68,7 @@ class MergeResult:
     requeried: tuple[KeyframeId, ...] = ()
     bent: frozenset[int] = frozenset()
 
-    def __add__(self, later: MergeResult) -> MergeResult:
+    def __add__(self, later: "MergeResult") -> "MergeResult":
         factors = {submap: self.rescaled.get(submap, 1.0) * factor for submap, factor in later.rescaled.items()}
         return MergeResult(
             self.moved | later.moved, {**self.rescaled, **factors}, {**self.scale_sigma, **later.scale_sigma},

@@ -1,7 +1,5 @@
 """Similarity transform between two sets of points, or between two cameras that observe the same points."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Kernels of point-set alignment, with or without scale, in a RANSAC seeded by the caller."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

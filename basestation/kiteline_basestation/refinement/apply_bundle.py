@@ -1,7 +1,5 @@
 """Applies the result of a bundle to the map: poses, landmark positions, rejected observations."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The part of the map that a bundle adjusts, as a bundle problem."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

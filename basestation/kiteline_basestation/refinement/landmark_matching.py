@@ -4,8 +4,6 @@ Known landmarks are projected into a new keyframe, and its new landmarks into ol
 stereo PTAM", sections 2.4.4 and 3.1.2). The older landmark of a match becomes the root.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """Kernels that match descriptors: of projected landmarks in a circle, of keypoints along epipolar lines."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

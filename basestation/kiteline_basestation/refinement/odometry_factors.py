@@ -12,8 +12,6 @@ its IMU, or, where the map's own accelerations have corrected lengths, those tha
 tie the first keyframe of a submap to the last one of the submap before.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import NamedTuple

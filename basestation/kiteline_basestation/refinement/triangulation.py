@@ -4,8 +4,6 @@ Source: "Monocular EKF-SLAM with delayed landmark initialisation" (the point nea
 reprojection tests of ORB-SLAM2.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -29,10 +27,7 @@ _MIN_BASELINE_RATIO = 0.01  # baseline over median depth: below it two keyframes
 
 
 def triangulate_landmarks(
-    sparse_map: SparseMap,
-    keyframe: KeyframeId,
-    config: TriangulationConfig,
-    publisher: Publisher,
+    sparse_map: SparseMap, keyframe: KeyframeId, config: TriangulationConfig, publisher: Publisher
 ) -> int:
     """Triangulate landmarks of a new keyframe that have no depth. Returns the number triangulated."""
     return _from_observations(sparse_map, keyframe, config, publisher) + _from_epipolar_matches(

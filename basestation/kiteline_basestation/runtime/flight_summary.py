@@ -1,7 +1,5 @@
 """Numbers of a base's flight for report.json: counts, keyframe poses, CPU times. Pure."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 

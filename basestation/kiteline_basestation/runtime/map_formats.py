@@ -5,8 +5,6 @@ tum(t_ns, T_w_b) -> base/agentN.tum
 g2o(keyframes, T_w_k, edges) -> the keyframe graph
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

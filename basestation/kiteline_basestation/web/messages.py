@@ -6,8 +6,6 @@ A binary message starts with 16 bytes, little endian: kind u8, agent u8, 0 u16, 
 3 path of an agent's keyframes: int16 (n,3) times scale = metres in w.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Sequence
 from typing import Any

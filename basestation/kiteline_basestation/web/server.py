@@ -4,8 +4,6 @@ It listens on the loopback address by default, serves only the files beside this
 sites (Origin) and, on loopback, other host names (DNS rebinding).
 """
 
-from __future__ import annotations
-
 import asyncio
 import ipaddress
 import json
@@ -53,7 +51,7 @@ def address(text: str) -> tuple[str, int]:
 class Handle:
     """A running server."""
 
-    def __init__(self, page: _Page, thread: threading.Thread, url: str) -> None:
+    def __init__(self, page: "_Page", thread: threading.Thread, url: str) -> None:
         self._page = page
         self._thread = thread
         self.url = url

@@ -1,7 +1,5 @@
 """The snapshot of the station that the status page shows."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any

@@ -3,8 +3,6 @@
 Their calibration is true: of a tenth of a pixel that it is off by otherwise, a short baseline makes per cents of depth.
 """
 
-from __future__ import annotations
-
 import os
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """The base's bars: accuracy of single and merged maps, loops, losses, CPU and memory."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from functools import partial

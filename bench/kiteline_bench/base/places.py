@@ -5,8 +5,6 @@ queries all frames of its own flight that are older than four seconds and all fr
 is accepted when P3P over its matches has enough inliers; it is right when that pose is the true one.
 """
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Precision and recall of the base's grid, beside those of the reference methods, and objects that must be in it."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """What grids cost an agent and the link: CPU of a scan and of the frames it is spread over, bytes up and down."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """A flight with a base, its grid, and the motion from the base's world to the true one."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The truth itself as a grid on the cells of a flown one: what precision and recall lose to the cells alone."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """The base's grid as a map: equal to one from scratch after corrections, and what it costs in time and memory."""
 
-from __future__ import annotations
-
 import copy
 import time
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """OBSTACLE_DISTANCE in simulated flights, against the true distances."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise

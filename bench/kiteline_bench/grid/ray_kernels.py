@@ -1,7 +1,5 @@
 """Kernel that casts rays over a dense grid. Arrays in, caller's arrays out."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """Scans that see badly: what was not seen must stay unknown, and nothing may die."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Column scans of single images, as an agent makes them, without a flight: at known poses."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 

@@ -4,8 +4,6 @@
 section 5.6: a layer of obstacle points over a layer of rays to ground points.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -128,7 +126,7 @@ class _Canvas:
         self.low, self.high = np.full(shape, np.inf), np.full(shape, -np.inf)
 
     @classmethod
-    def around(cls, sparse: SparsePoints, seen: I64, cell_m: float) -> _Canvas:
+    def around(cls, sparse: SparsePoints, seen: I64, cell_m: float) -> "_Canvas":
         """A canvas that holds all ends of rays."""
         ends = np.concatenate([sparse.cameras[seen[:, 0], :2], sparse.points[seen[:, 1], :2], np.zeros((1, 2))])
         cells = np.floor(ends / cell_m).astype(np.int64)

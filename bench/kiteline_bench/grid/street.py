@@ -1,7 +1,5 @@
 """The grid of a real street, as a picture: the road free, parked cars and walls occupied."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

@@ -1,7 +1,5 @@
 """Faults of cameras, put into a recording: single bad frames, image losses, jumps to another place."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 

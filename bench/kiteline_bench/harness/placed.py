@@ -1,7 +1,5 @@
 """Errors of a flight with a base in its world: keyframes and live poses against the truth."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """What came of a flight: of one agent in this process, with its errors, or of processes with their report."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise

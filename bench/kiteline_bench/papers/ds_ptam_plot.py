@@ -1,7 +1,5 @@
 """Figure of throttled flights: errors and frames with a pose by share of a core, and paths at the smallest share."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """`kiteline bench papers/ekf`: the Kalman filter's landmarks, trajectory, honesty and cost, beside its paper."""
 
-from __future__ import annotations
-
 import sys
 import time
 from dataclasses import dataclass, replace

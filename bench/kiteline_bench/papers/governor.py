@@ -6,8 +6,6 @@ its rivals make none either; the last one does. Errors of two flights that begin
 up to twice, so every row is a geometric mean over ten starts.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """A landmark's position by its rays against 100 particles along the first one, at the same instant."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """The initialisation that the paper compares with: particles along a landmark's first ray."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -4,8 +4,6 @@ Without `--data` the recordings of the benchmarks are flown. Beside ours stand t
 J. D. Tardos print for ORB-SLAM2 ("ORB-SLAM2", T-RO 2017, tables I to III), and those of "DS-PTAM", section 4.3.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

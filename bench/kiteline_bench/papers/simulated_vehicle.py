@@ -1,7 +1,5 @@
 """A vehicle with one camera and odometry in a world of points: a ground robot or a drone, without images."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Throttled flights: one recording in a mode of `kiteline fly` with a share of a core, and the paper's errors of it."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """One flight with a base, or without, compared with the truth; and tables and bars over several of them."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass

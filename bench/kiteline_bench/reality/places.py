@@ -6,8 +6,6 @@ with what matching against every frame finds, by the number of matches. A candid
 over its matches has enough inliers.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

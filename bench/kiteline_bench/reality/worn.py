@@ -4,8 +4,6 @@ Then the IMU of each rig flies twice more, with what its rig file keeps of it. S
 each scene. The seeds are held out: options are tuned on others.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

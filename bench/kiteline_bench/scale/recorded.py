@@ -3,8 +3,6 @@
 Descriptors of a copy are turned by a mask: distances within it stay, and places of different copies do not look alike.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any

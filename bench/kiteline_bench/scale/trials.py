@@ -3,8 +3,6 @@
 `python -m kiteline_bench.scale.trials map|day …` prints the outcome as JSON.
 """
 
-from __future__ import annotations
-
 import argparse
 import itertools
 import json

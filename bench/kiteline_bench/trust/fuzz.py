@@ -3,8 +3,6 @@
 Only the rooms' own errors may come of them, none may take long, and memory must not grow. `--inputs` sets how many.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os
@@ -68,7 +66,7 @@ class FuzzResult:
     grown_mib: float
     slowest: str = ""  # the door of the slowest input
 
-    def with_round(self, found: FuzzResult, grown_mib: float) -> FuzzResult:
+    def with_round(self, found: "FuzzResult", grown_mib: float) -> "FuzzResult":
         """This and a further round. grown_mib: of all rounds of this process."""
         slower = found.slowest_s > self.slowest_s
         return FuzzResult(

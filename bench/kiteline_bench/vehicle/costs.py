@@ -1,7 +1,5 @@
 """What a controller's IMU costs the agent's process: MAVLink at 200 Hz over a socket, beside a recording's."""
 
-from __future__ import annotations
-
 import contextlib
 import socket
 import subprocess

@@ -1,7 +1,5 @@
 """A worn rig is moved by hand as `kiteline calibrate imu` asks for: what it finds of the IMU, against the truth."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Numbers to bytes and back: variable-length integers, floats, and columns of integers."""
 
-from __future__ import annotations
-
 import struct
 
 import numpy as np

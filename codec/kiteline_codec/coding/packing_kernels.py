@@ -1,7 +1,5 @@
 """Integer columns as one stream of bits. The layout is described in SPEC.md, "Columns"."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

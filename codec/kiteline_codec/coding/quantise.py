@@ -3,8 +3,6 @@
 Decoding uses only +, -, *, / and the square root of IEEE arithmetic, so every machine gets the same bits.
 """
 
-from __future__ import annotations
-
 from math import frexp, ldexp, sqrt
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Quantisers of arrays. The codes are in SPEC.md, "Quantisers"; `quantise` passes the constants."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

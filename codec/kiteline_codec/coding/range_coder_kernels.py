@@ -4,8 +4,6 @@ Method: the range coder of G. N. N. Martin, 1979, in the binary form of LZMA. A 
 context the probability of 0, in 1/4096, and the rate at which that adapts.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

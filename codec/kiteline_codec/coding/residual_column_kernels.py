@@ -4,8 +4,6 @@ Numbers are Golomb-Rice coded with a parameter that follows their size (M. Weinb
 LOCO-I lossless image compression algorithm", 2000, section III.C), or in a fixed width where that is shorter.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

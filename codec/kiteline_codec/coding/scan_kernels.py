@@ -4,8 +4,6 @@ Walls and floors go on from column to column, and most of what is seen ends at a
 difference from the column before, unless it is that of the obstacle.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -3,8 +3,6 @@
 Method: contexts from the neighbours, as in JBIG.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

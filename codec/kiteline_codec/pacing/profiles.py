@@ -1,7 +1,5 @@
 """What a keyframe may cost on a wide and on a thin link. A profile concerns only what the agent writes."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

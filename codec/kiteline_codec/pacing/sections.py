@@ -1,7 +1,5 @@
 """A keyframe's keypoints in sections that are useful alone, best first, each short enough for one packet."""
 
-from __future__ import annotations
-
 from dataclasses import fields, replace
 from typing import TypeVar
 

@@ -1,7 +1,5 @@
 """Residual codes of new landmarks, which need no prediction, and of refined landmarks, predicted from them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Residual codes of observations: differences from the predicted projections of the landmarks."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache

@@ -4,8 +4,6 @@ Only + - * / and comparisons of IEEE doubles, each rounded by itself and in the 
 get the same integers on any machine.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """Values of the agent from which residual codes are predicted, decoded once for each version."""
 
-from __future__ import annotations
-
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field

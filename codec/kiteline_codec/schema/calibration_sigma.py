@@ -1,7 +1,5 @@
 """What a stereo rig is off by on the wire: factors, and their standard deviation."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """Arrays of a record as columns of integers, and landmark ids as a table of keyframes. See SPEC.md, "Rows"."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """Landmarks with descriptors: what new landmarks and landmarks of the map cache have in common."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar, Self
 

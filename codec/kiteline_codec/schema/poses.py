@@ -1,7 +1,5 @@
 """Poses, directions, scales and standard deviations in codes."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -3,8 +3,6 @@
 Optical frames: x right, y down, z forward. Pixel (0, 0) is the centre of the first pixel.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum

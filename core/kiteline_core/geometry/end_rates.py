@@ -1,7 +1,5 @@
 """Velocity and angular rate at the end of a row of poses."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

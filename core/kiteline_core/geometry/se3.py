@@ -7,8 +7,6 @@ What is called many times a frame computes with Python's floats: on so few numbe
 of the arithmetic. The results are the same on every machine, as no library's order of summation enters.
 """
 
-from __future__ import annotations
-
 import math
 from typing import TypeVar
 

@@ -4,8 +4,6 @@ The upper left part is a scale times a rotation; the scale converts lengths of b
 similarity of scale 1, with results bit-identical to `se3`.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

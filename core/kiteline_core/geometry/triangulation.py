@@ -1,7 +1,5 @@
 """Triangulation of points from rays of cameras with known poses."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

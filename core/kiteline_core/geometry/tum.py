@@ -3,8 +3,6 @@
 Stamps are written from integer nanoseconds, so that no digit of a stamp depends on floating point.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -5,8 +5,6 @@ darken that is somewhere else: a low camera's floor got points up to 3 m below i
 that were matched, and the next pair is matched without them.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2
@@ -51,7 +49,7 @@ class Brightness:
         right = cv2.multiply(pair[1], brighter, scale=float(np.exp(self.gain)), dtype=cv2.CV_8U)
         return np.asarray(left, np.uint8), np.asarray(right, np.uint8)
 
-    def learned(self, pair: tuple[U8, U8], disparity: F32, falloff: F32) -> Brightness:
+    def learned(self, pair: tuple[U8, U8], disparity: F32, falloff: F32) -> "Brightness":
         """What is known with another pair (h,w) as it was taken, and its disparities (h,w) in px, 0 unknown."""
         found, left, right = disparity[::_EVERY, ::_EVERY], pair[0][::_EVERY, ::_EVERY], pair[1][::_EVERY]
         rows, columns = np.nonzero(found > 0.0)
@@ -72,7 +70,7 @@ class Brightness:
         ratio = np.log(a[seen] / b[seen])
         return self._with(ratio, np.asarray(darker, np.float64))
 
-    def _with(self, ratio: F64, darker: F64) -> Brightness:
+    def _with(self, ratio: F64, darker: F64) -> "Brightness":
         """Add observed (n,) logarithms of left over right, robustly."""
         x, total = np.array([np.median(ratio - self.power * darker), self.power]), np.zeros(5)
         for _ in range(_ROUNDS):

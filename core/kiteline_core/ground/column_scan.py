@@ -1,7 +1,5 @@
 """What one keyframe saw of ground and obstacles, by columns of azimuth in the levelled camera frame."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

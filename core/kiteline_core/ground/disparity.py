@@ -1,7 +1,5 @@
 """Measures the disparity image of a rectified stereo pair, stripe by stripe, so that no frame pays for all of it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2
@@ -42,7 +40,7 @@ class DisparityCamera:
     columns: int  # of the half-size image in one of these
 
     @staticmethod
-    def of(camera: RectifiedCamera) -> DisparityCamera:
+    def of(camera: RectifiedCamera) -> "DisparityCamera":
         """That of a full-size rectified camera."""
         columns = 2 if camera.stereo and 0.5 * camera.bf > _ENOUGH_BF else 1
         scale, shift = 0.5 / columns, 0.25 * (columns - 1)

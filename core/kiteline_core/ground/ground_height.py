@@ -1,7 +1,5 @@
 """Knows how high the ground lies, by the scans of a flight, and which of these scans may be believed."""
 
-from __future__ import annotations
-
 from collections import deque
 from dataclasses import dataclass, replace
 from typing import Generic, NamedTuple, TypeVar

@@ -1,7 +1,5 @@
 """The code of a pair of images of which another machine makes a scan: one JPEG image, the right one below the left."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray

@@ -1,7 +1,5 @@
 """Kernels that correct disparities, turn them into points of the levelled camera frame, and count these by column."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from kiteline_core.jit import helper, njit

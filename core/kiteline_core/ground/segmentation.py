@@ -7,8 +7,6 @@ The method is that of "Segfloor" (u-disparity, v-disparity, B-spline), in the le
 Beyond it, what a column of azimuth sees is one disparity for each surface, refined by all of its pixels at once.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 

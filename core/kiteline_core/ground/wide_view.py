@@ -4,8 +4,6 @@ Rectification keeps the middle of each side and cuts off what lens and extrinsic
 wide image. Ground right before the vehicle, and what stands beside it, is seen there.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2

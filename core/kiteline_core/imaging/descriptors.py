@@ -7,8 +7,6 @@ corners of an image is the true one in 58.7 / 83.0 / 94.1 % of cases; with all 2
 random ones 55.3 / 80.5 / 93.4 %.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

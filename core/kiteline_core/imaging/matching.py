@@ -1,7 +1,5 @@
 """Matching of binary descriptors between two views: brute force, or guided by predicted pixels."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

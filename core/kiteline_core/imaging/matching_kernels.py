@@ -1,7 +1,5 @@
 """Kernels that match 256-bit descriptors by their Hamming distance."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

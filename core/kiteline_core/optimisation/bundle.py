@@ -4,8 +4,6 @@ Source: B. Triggs et al., "Bundle adjustment, a modern synthesis", 2000, section
 with an outlier test between them are those of ORB-SLAM2 and of "DS-PTAM: a distributed stereo PTAM".
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

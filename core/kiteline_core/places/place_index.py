@@ -6,8 +6,6 @@ of visual elements", 2009 (features of one word count by the likeness of their s
 vocabulary is trained once; consistency of successive candidates is left to the caller.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Kernels of the place index: visual words of descriptors, postings, and scores of places."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """Camera pose from matches between points and pixels: P3P in RANSAC, then robust optimisation."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

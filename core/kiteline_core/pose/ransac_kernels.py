@@ -1,7 +1,5 @@
 """Kernels shared by all RANSACs: seeded draws, their number, and the cost of a pose."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

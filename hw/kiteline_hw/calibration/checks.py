@@ -1,7 +1,5 @@
 """Checks of calibration values that all readers share. All raise SourceError; `where` names the file and entry."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

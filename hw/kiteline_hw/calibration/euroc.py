@@ -1,7 +1,5 @@
 """EuRoC's sensor.yaml of a camera or an IMU, each with its place T_BS in a frame that all share."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from kiteline_core.frame import ImuCalibration

@@ -1,7 +1,5 @@
 """Kalibr's files: the camera chain, and the IMU before or after the calibration."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Entries of a YAML file that know where they are, so that each error names file, key and what was expected."""
 
-from __future__ import annotations
-
 import re
 import reprlib
 from collections.abc import Sequence
@@ -43,7 +41,7 @@ class Node:
         """The keys of a table; none of anything else."""
         return frozenset(str(k) for k in self.value) if isinstance(self.value, dict) else frozenset()
 
-    def get(self, key: str) -> Node:
+    def get(self, key: str) -> "Node":
         """The entry of a table under a key; its value is None if there is none."""
         if self.value is not None and not isinstance(self.value, dict):
             raise self.error("a table of keys and values")

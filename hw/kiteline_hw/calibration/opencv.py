@@ -1,7 +1,5 @@
 """OpenCV's FileStorage (camera_matrix; M1, D1, M2, D2, R, T of a pair) and ROS' camera_info files, which look alike."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from kiteline_core.geometry import se3

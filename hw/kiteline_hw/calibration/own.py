@@ -1,7 +1,5 @@
 """kiteline's own calibration file: all of a rig in one YAML, exact to the last bit."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import fields
 

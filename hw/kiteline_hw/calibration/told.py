@@ -1,7 +1,5 @@
 """Content of calibration files, in one form whichever tool wrote them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Options of a live camera, written behind its devices: `v4l2:/dev/video0?fps=20&calibration=camera.yaml`."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Pairs the images of two live cameras by their stamps, and measures how far apart they are. No clock."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass

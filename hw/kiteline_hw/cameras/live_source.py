@@ -1,7 +1,5 @@
 """A LiveSource over one or two cameras: each is read, decoded and opened again by a thread of its own."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import deque

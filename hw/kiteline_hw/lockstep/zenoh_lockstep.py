@@ -5,8 +5,6 @@ repeats one that nobody may have received yet, and a repeated one gets the same 
 at once when the other's process ends.
 """
 
-from __future__ import annotations
-
 import queue
 import struct
 import threading

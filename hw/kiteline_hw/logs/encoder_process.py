@@ -4,8 +4,6 @@ Both processes map the same memory, cut into slots of one image each. A request 
 slot and the length of the PNG in it. The process ends when its input does.
 """
 
-from __future__ import annotations
-
 import contextlib
 import mmap
 import os

@@ -4,8 +4,6 @@ OpenCV encodes without Python's lock, so that tracking goes on meanwhile. Nothin
 the caller waits, or stores the image uncompressed.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor

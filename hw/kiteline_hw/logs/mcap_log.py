@@ -27,8 +27,6 @@ Read::
 `open_source("mcap:agent0/log.mcap")` yields the same Frames, ImuBatches and OdometryBatches.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from concurrent.futures import Future

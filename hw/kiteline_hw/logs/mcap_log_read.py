@@ -1,7 +1,5 @@
 """Reading logs back: messages in the order in which they were written, decoded by what their topic holds."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass

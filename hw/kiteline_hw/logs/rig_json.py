@@ -1,7 +1,5 @@
 """A camera rig and its IMU as JSON, exact to the last bit: the content of a log's topic /rig."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, fields

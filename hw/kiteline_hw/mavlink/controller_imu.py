@@ -4,8 +4,6 @@ MAVLink uses f = MAV_FRAME_BODY_FRD (x forward, y right, z down): an upright veh
 z. HIGHRES_IMU is requested, and if it does not come also the coarser RAW_IMU and SCALED_IMU.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from kiteline_core.frame import ImuBatch

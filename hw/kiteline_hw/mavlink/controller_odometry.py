@@ -5,8 +5,6 @@ orientation (`coordinate_frames.mounting`). The estimate of a controller that fu
 is odometry only if it rests on other sensors (optical flow, GNSS, wheels), which the user has to know.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum

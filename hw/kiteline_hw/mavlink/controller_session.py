@@ -4,8 +4,6 @@ Poses are sent in the continuous odometry frame, turned once (`start_frame`). Ma
 controller would see jumps. One system is served: the configured one, else that of the first autopilot found.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

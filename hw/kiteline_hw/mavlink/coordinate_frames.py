@@ -4,8 +4,6 @@ kiteline: o is continuous and right-handed with z up; b is the body frame of the
 vehicle. MAVLink: l = MAV_FRAME_LOCAL_FRD, x as in o, z down; f = MAV_FRAME_BODY_FRD, x forward, y right, z down.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """Sends poses to a flight controller over UDP, TCP or a serial port, and carries a tunnel on the same line."""
 
-from __future__ import annotations
-
 import threading
 from collections import deque
 from collections.abc import Sequence

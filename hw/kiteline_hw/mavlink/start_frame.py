@@ -7,8 +7,6 @@ controller believes itself to be, else where the last pose was sent: a controlle
 would swing to any other heading.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

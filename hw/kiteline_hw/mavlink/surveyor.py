@@ -1,7 +1,5 @@
 """Runs a survey of a flight controller over a real connection."""
 
-from __future__ import annotations
-
 import threading
 import time
 from pathlib import Path

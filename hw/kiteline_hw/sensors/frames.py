@@ -1,7 +1,5 @@
 """Turns encoded images and inertial samples into Frames and ImuBatches: pairs them by time, decodes, checks sizes."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ Grey images are (h, w) uint8. A depth image is 16-bit PNG whose format carries i
 stored value divided by 5000 is metres, 0 unknown.
 """
 
-from __future__ import annotations
-
 import struct
 import zlib
 from dataclasses import dataclass

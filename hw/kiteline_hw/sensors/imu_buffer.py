@@ -1,7 +1,5 @@
 """Buffers inertial samples until the next frame; drops and counts non-finite and out-of-order ones."""
 
-from __future__ import annotations
-
 from typing import Protocol
 
 import numpy as np

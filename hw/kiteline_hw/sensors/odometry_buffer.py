@@ -1,7 +1,5 @@
 """Buffers an odometer's velocities until the next frame; drops and counts non-finite and out-of-order ones."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Uncompressed images of ROS and Foxglove messages, and their conversion to grey values or metres."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

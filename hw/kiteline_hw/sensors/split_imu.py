@@ -3,8 +3,6 @@
 RealSense's driver publishes both apart unless it is told otherwise, at 200 to 400 Hz and at 63 to 250 Hz.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Iterable, Iterator
 from typing import Any

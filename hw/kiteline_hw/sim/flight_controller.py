@@ -4,8 +4,6 @@ Sources: ArduPilot GCS_Common handle_odometry and AP_VisualOdom; PX4 mavlink_rec
 timesync. Real controllers drop messages silently; the model counts them by reason.
 """
 
-from __future__ import annotations
-
 import math
 import socket
 import threading

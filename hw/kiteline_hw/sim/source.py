@@ -1,7 +1,5 @@
 """`sim:SCENE[?key=value&…]`: a flight through a simulated world, rendered while it is read."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -38,7 +36,7 @@ F64 = NDArray[np.float64]
 START_NS = 1_000_000_000  # stamp of flight time zero
 
 
-def open_sim(scene: str, workers: int = 1, **options: object) -> SimSource:
+def open_sim(scene: str, workers: int = 1, **options: object) -> "SimSource":
     """A simulated flight. scene: with options, as in `hall?seed=3&seconds=20&trajectory=F&mono=1`.
 
     options: fields of SimConfig. workers > 1 renders ahead in threads, with identical frames. Raises SourceError.

@@ -1,7 +1,5 @@
 """Load, memory and temperature of this computer, from /proc and /sys."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Calibrates with the lens that was asked for, or with the one that fits better."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

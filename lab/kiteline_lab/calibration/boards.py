@@ -1,7 +1,5 @@
 """Calibration boards: chessboards, and ChArUco boards, which may be seen in part; drawing and detection."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 from functools import cached_property

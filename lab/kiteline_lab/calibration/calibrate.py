@@ -1,7 +1,5 @@
 """`kiteline calibrate camera|board|imu|export`: cameras by a board, IMUs by a motion; boards and conversions."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

@@ -4,8 +4,6 @@ Rotations of the images against the gyro tell its scales and axes, the camera's 
 about an axis tell the column of that axis. Gravity along an axis tells that column of the accelerometer.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Projection by a vector of intrinsics (fx, fy, cx, cy, coefficients of the lens); its derivatives by differences."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray

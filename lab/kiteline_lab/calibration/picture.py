@@ -1,7 +1,5 @@
 """The residual picture: where corners were seen, and by how much the calibration misses them."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray

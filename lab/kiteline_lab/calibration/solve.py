@@ -4,8 +4,6 @@ Levenberg-Marquardt with Huber weights. The poses are eliminated (Schur compleme
 each camera and the place of the right one. One solver for both lenses, and for points beyond 90°.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise

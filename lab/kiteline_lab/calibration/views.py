@@ -1,7 +1,5 @@
 """Collects views of the board: which are new, which parts of the image they cover, and what is wanted next."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import cv2

@@ -4,8 +4,6 @@ ATE and RPE after J. Sturm et al., "A benchmark for the evaluation of RGB-D SLAM
 S. Umeyama (PAMI 1991); t_rel and r_rel after A. Geiger et al., the KITTI odometry benchmark (CVPR 2012).
 """
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass
 from enum import Enum
 

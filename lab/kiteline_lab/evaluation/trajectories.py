@@ -1,7 +1,5 @@
 """Read trajectories: TUM files, KITTI poses, EuRoC's data.csv, or the ground truth of a recording."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Numbers of report.json, and its table on the terminal."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What the processes of a flight left: raw reports, the base's keyframe poses, notes for the user."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any

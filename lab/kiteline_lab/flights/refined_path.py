@@ -1,7 +1,5 @@
 """The refined path of an agent: its frames, placed by the base's keyframes."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Results of a flight: refined trajectories, accuracy against the truth, plot, report.json."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

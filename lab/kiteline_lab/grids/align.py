@@ -1,7 +1,5 @@
 """Fit one occupancy grid to another by rotation and translation."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray

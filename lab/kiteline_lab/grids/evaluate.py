@@ -1,7 +1,5 @@
 """`kiteline grid eval EST.yaml TRUE.yaml`: precision and recall of an occupancy grid, and a picture of both."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

@@ -1,7 +1,5 @@
 """Read occupancy grids in the format of ROS's map_server: a YAML file and the PGM image that it names."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

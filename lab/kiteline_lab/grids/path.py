@@ -1,7 +1,5 @@
 """`kiteline grid path GRID.yaml FROM TO --radius R`: the shortest way on which a vehicle touches nothing."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import re

@@ -1,7 +1,5 @@
 """Kernel of the A* search on a grid. Arrays in, caller's arrays out."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

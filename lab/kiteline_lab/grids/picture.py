@@ -1,7 +1,5 @@
 """Pictures of occupancy grids: estimate, truth and difference side by side; a path."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 from pathlib import Path
 

@@ -6,8 +6,6 @@ Precision is the share of the estimate's roads that are free in the truth, recal
 are free in the estimate; means over draws. Seeded: two grids always give the same numbers.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2

@@ -1,7 +1,5 @@
 """Kernels of road maps on a grid: places at a distance, straight roads. Arrays in, caller's arrays out."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """Says in words what a replay computes differently from the kept text."""
 
-from __future__ import annotations
-
 import math
 import re
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The flights whose logs are kept, and how their logs are made."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import math

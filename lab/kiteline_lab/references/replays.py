@@ -1,7 +1,5 @@
 """Replays kept logs, and notes what each stage computes."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`kiteline export STORE --format tum|ply|pgm|g2o --out F`: write a base's map in the formats of other tools."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Sequence

@@ -4,8 +4,6 @@ The cameras are the rectified ones of the calibration that was told. Errors of d
 right camera that is turned, and whose focal length and centre differ.
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import json
@@ -82,7 +80,7 @@ class KnownCameras:
         self.imu = KnownImuConfig()  # of a rig file
 
     @classmethod
-    def of_base(cls, mapper: Mapper) -> KnownCameras:
+    def of_base(cls, mapper: Mapper) -> "KnownCameras":
         """Of a base."""
         out = cls()
         out.cameras.update(mapper.map.cameras)
@@ -95,7 +93,7 @@ class KnownCameras:
         return out
 
     @classmethod
-    def of_file(cls, known: KnownRigConfig) -> KnownCameras:
+    def of_file(cls, known: KnownRigConfig) -> "KnownCameras":
         """Of a rig file, as agent 0; empty if it says nothing."""
         out, agent = cls(), AgentId(0)
         camera = known.rectified()

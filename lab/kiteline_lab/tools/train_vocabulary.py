@@ -5,8 +5,6 @@ The vocabulary that ships with kiteline is trained on its own simulated scenes (
     python -m kiteline_lab.tools.train_vocabulary --out core/kiteline_core/places/words.bin
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Kernels of k-majority clustering of binary descriptors."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """Bias, scale and axes of the accelerometer, the vertical and the scale of the images, from positions by images."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -56,7 +54,7 @@ class AccelCalibration(AxesFilter):
         """True if gravity in the map is known."""
         return self._gravity is not None
 
-    def continue_map(self, other: AccelCalibration) -> None:
+    def continue_map(self, other: "AccelCalibration") -> None:
         """Take over the vertical of another filter in the same map."""
         self._gravity = other._gravity
 

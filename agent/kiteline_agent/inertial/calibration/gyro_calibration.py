@@ -1,7 +1,5 @@
 """Time offset, bias, scale and axes of the gyro, from rotations by images over short windows."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

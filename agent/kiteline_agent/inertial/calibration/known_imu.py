@@ -1,7 +1,5 @@
 """What earlier flights found of an IMU, with deviations: the prior of the next flight."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

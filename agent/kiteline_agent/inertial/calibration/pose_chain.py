@@ -5,8 +5,6 @@ time offset towards zero. A window is complete once all its samples have arrived
 camera's.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

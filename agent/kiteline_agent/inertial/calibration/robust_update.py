@@ -1,7 +1,5 @@
 """What the filters of gyro and accelerometer share: their axes and bias, and an update in which outliers weigh less."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar
 

@@ -4,8 +4,6 @@ Filters beside the smoother, at a few updates a second: these values change slow
 the filters contradict that significantly; then their estimates correct the samples.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Any
 

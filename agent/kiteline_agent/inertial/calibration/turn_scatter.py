@@ -3,8 +3,6 @@
 Within a window the gyro's bias and the time offset are fitted to the rotations between frames; what is left is neither.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """IMU samples integrated over a window between two frames."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,7 +27,7 @@ class Window:
     last_rate: F64
 
     @staticmethod
-    def of(samples: Samples, matrix: F64, bias: F64, first_rate: F64, last_rate: F64) -> Window:
+    def of(samples: Samples, matrix: F64, bias: F64, first_rate: F64, last_rate: F64) -> "Window":
         """Integrate samples. matrix (3,3), bias (3,): rate = matrix @ gyro - bias."""
         turn, by_rate, by_force, time = np.empty((3, 3)), np.empty((3, 9)), np.empty((2, 3, 9)), np.empty((2, 3, 3))
         integrate_window(samples.t_s, samples.gyro, samples.accel, matrix, bias, turn, by_rate, by_force, time)

@@ -1,7 +1,5 @@
 """Kernel of the integrals of IMU samples over a window, linear in the calibration of the accelerometer."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """Figures: the scenes from above; memory of the grid and CPU of its updates, as figure 67 of the thesis."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 

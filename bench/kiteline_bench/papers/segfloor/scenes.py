@@ -3,8 +3,6 @@
 The thesis prints sizes, not plans: areas, lengths, camera heights and objects are its own, the shapes are ours.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor

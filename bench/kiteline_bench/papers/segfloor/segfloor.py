@@ -4,8 +4,6 @@ The thesis, sections 7.3 and 7.4: maps are opened, aligned with the truth and ju
 free in truth, whether a camera could see it or not.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

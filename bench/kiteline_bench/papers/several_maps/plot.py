@@ -1,7 +1,5 @@
 """Figure: the keyframes of all robots in one world, beside the true paths."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple

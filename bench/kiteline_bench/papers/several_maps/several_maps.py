@@ -5,8 +5,6 @@ what ORB-SLAM2 reached on the same sequence (R. Mur-Artal and J. D. Tardos, "ORB
 proportion to the path: the thesis calls its own results similar to that (03, 09) or worse (05, 07).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise

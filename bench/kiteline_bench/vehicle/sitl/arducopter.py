@@ -1,7 +1,5 @@
 """The process of a built ArduCopter, driven step by step over its JSON interface."""
 
-from __future__ import annotations
-
 import os
 import signal
 import socket

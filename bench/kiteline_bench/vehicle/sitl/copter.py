@@ -1,7 +1,5 @@
 """The physics of a quadrotor, for an autopilot that is given its state."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass, field
 

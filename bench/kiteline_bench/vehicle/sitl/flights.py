@@ -1,7 +1,5 @@
 """Flights of ArduCopter in the loop: what each of them measures, as bars."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

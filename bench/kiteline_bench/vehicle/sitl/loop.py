@@ -1,7 +1,5 @@
 """The closed loop: physics, autopilot, rendered images, agent and pilot, step by step in simulated time."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack

@@ -1,7 +1,5 @@
 """The rotation that makes a submap's z axis point up."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The flight between two keyframes in short steps, each by images and by the IMU."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Self
 

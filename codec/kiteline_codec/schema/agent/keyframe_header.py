@@ -1,7 +1,5 @@
 """The header of a keyframe: time, parent, pose relative to the parent, and where gravity points."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Self
 

@@ -1,7 +1,5 @@
 """The column scans of a keyframe and of frames after it, and which of its keypoints lie on the ground."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Self
 

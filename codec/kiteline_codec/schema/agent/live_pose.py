@@ -1,7 +1,5 @@
 """The newest pose of an agent."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Self
 

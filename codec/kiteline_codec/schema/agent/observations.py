@@ -1,7 +1,5 @@
 """Observations of landmarks in a keyframe."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar
 

@@ -1,7 +1,5 @@
 """Images of a keyframe, or of a frame after it, of which the base makes a column scan."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Self
 

@@ -1,7 +1,5 @@
 """What an agent knows of its right camera."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import partial
 from typing import Any

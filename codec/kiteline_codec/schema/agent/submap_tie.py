@@ -1,7 +1,5 @@
 """How a submap lies to the one before it: over a loss of images, or where a monocular map goes on in other metres."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A keyframe that the base sends down into an agent's map cache."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

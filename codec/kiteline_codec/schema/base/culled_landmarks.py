@@ -1,7 +1,5 @@
 """Landmarks, and perhaps a whole keyframe, that the base culled."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar
 

@@ -1,7 +1,5 @@
 """Calibration of an agent's stereo disparities."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import partial
 

@@ -1,7 +1,5 @@
 """Landmarks of a keyframe that were fused into others."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A tile of the occupancy grid."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Self
 

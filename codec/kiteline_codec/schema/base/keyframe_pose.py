@@ -1,7 +1,5 @@
 """The refined pose of a keyframe."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Refined positions of a keyframe's landmarks."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar
 

@@ -1,7 +1,5 @@
 """Observations that the base rejected as outliers."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The placement of a submap in the world."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Self
 

@@ -5,8 +5,6 @@ All 24 ways in which axes can be mounted are judged by the same samples: rotatio
 common north or gravity, and the direction of gravity. The axes in use are wrong when others fit far better.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections import deque
 from dataclasses import dataclass

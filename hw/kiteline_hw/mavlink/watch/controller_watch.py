@@ -1,7 +1,5 @@
 """Watches the flight controller of a flight: what it is, whether it uses the poses, whether attitudes agree. Pure."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """Says whether a flight controller's estimator uses the poses that it is sent. Pure."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from kiteline_hw.mavlink.watch.findings import FindingLog, Level

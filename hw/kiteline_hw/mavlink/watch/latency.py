@@ -1,7 +1,5 @@
 """Measures how late poses leave, and says the delay to set in the flight controller. Pure."""
 
-from __future__ import annotations
-
 from collections import deque
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Says whether a flight controller is there, which one, and why not. Pure."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from pymavlink.dialects.v20 import common

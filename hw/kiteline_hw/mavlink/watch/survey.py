@@ -3,8 +3,6 @@
 Streams are measured on a disarmed vehicle only, and set back to their own rates at the end.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

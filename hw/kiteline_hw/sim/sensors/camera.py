@@ -1,7 +1,5 @@
 """A simulated camera: renders the world to grey values and depth."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The samples of an IMU on the body along a path."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

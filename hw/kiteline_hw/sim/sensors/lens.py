@@ -1,7 +1,5 @@
 """Lens models of the simulated cameras: distortion, projection, pixel rays and vignette."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """The velocities that wheels or a flight controller on the body would measure along a path."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

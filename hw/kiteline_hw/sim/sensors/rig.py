@@ -1,7 +1,5 @@
 """The calibrated stereo rig of a simulated vehicle (EuRoC's), and the true one that differs a little."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """From radiance to grey values: motion blur and rolling shutter, vignette, exposure, noise, quantisation."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

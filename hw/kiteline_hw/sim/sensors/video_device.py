@@ -4,8 +4,6 @@ It keeps the driver's rules: a queue of mapped buffers, sequence numbers that co
 errors by number. `device.unplug()`, `plug()`, `silence()`, `garbage()`, `lose(n)` do what happens in the field.
 """
 
-from __future__ import annotations
-
 import ctypes
 import errno
 import threading

@@ -4,8 +4,6 @@ Each kind of wear is drawn from a seed of its own, so a kind that is left out ch
 the nominal one times 0.7 to 1.3; signs and directions are random.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any

@@ -1,7 +1,5 @@
 """The true occupancy grid of a world, whether its cells were seen or not."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -32,7 +30,7 @@ class TrueGrid:
         r, c = np.indices(self.image.shape)
         return np.stack([self.corner[0] + (c + 0.5) * self.cell_m, self.corner[1] + (r + 0.5) * self.cell_m], 2)
 
-    def only(self, known: Bool) -> TrueGrid:
+    def only(self, known: Bool) -> "TrueGrid":
         """The grid with all other cells UNKNOWN. known: (rows, columns)."""
         return replace(self, image=np.where(known, self.image, np.uint8(UNKNOWN)))
 

@@ -1,7 +1,5 @@
 """What of a world true camera poses could see: cells with a line of sight, by height band."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Kernel that marks the cells of a grid which rays of sight cross. Arrays in, caller's arrays out."""
 
-from __future__ import annotations
-
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray

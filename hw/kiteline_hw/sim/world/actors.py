@@ -1,7 +1,5 @@
 """People and cars that move through a scene: where their boxes are at any time. Deterministic."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The built-in path of each scene: a closed course, flown as often as needed."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

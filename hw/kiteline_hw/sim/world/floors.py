@@ -1,7 +1,5 @@
 """Floors that are not flat, or have no texture: a ramp, waves, pits, steps, bare ground."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Objects that are hard on an occupancy grid: chairs on thin legs, tables, cylinders, half-open doors, pillars."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

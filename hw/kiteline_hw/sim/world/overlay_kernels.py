@@ -1,7 +1,5 @@
 """Draws moving solids over an image of the still ones."""
 
-from __future__ import annotations
-
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray

@@ -4,8 +4,6 @@ Position and (sign-continuous, not normalised) quaternion are splines over unifo
 (L. Piegl, W. Tiller, "The NURBS Book"). A path starts at rest: time is warped by a quintic ease-in.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from math import comb, factorial
 

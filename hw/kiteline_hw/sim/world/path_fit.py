@@ -4,8 +4,6 @@ The penalty is on third differences of the coefficients (P. Eilers, B. Marx, "Fl
 penalties", 1996).
 """
 
-from __future__ import annotations
-
 import warnings
 from pathlib import Path as FilePath
 

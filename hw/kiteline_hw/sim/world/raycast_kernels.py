@@ -14,8 +14,6 @@ are swapped, plus GLOSSY where lights are reflected.
 Faces are numbered 2 * axis + (1 where the outward normal is positive). A hit is 6 * box + face, or SKY or GROUND.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray

@@ -1,7 +1,5 @@
 """Indoor scenes, built around the paths flown in them."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

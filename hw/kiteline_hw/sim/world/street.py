@@ -1,7 +1,5 @@
 """A street along the paths: a road at their height, pavements, houses, parked cars, poles and trees."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray

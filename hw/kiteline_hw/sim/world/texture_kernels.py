@@ -1,7 +1,5 @@
 """Paints opaque shapes onto a square texture that wraps around."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

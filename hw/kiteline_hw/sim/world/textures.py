@@ -5,8 +5,6 @@ with sizes distributed as r^-3, which gives sharp edges and a power spectrum nea
 bricks, posters and windows. Every texture wraps around and has mean 128; its contrast is set by the face that uses it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """A world of textured solids: its arrays and its builder."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """`kiteline doctor --camera SOURCE`: watch cameras for some seconds, as an agent would."""
 
-from __future__ import annotations
-
 import re
 import time
 from collections.abc import Iterator
