@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from kiteline_core.geometry.se3 import F64
-from kiteline_hw.mavlink.messages import Attitude, Heartbeat, MavlinkMessage, TimeSync
+from kiteline_hw.mavlink.messages import Attitude, Heartbeat, MavlinkMessage, MessageInterval, TimeSync
 from kiteline_hw.mavlink.watch import messages as wire
 from kiteline_hw.mavlink.watch.attitude import TOPIC as AXES
 from kiteline_hw.mavlink.watch.attitude import AttitudeWatch
@@ -143,12 +143,7 @@ class ControllerWatch:
             if message in self._seen_ns and now_ns - self._seen_ns[message] < c.request_ns:
                 continue
             self._seen_ns[message] = now_ns
-            out.append(
-                wire.Command(
-                    controller.system, controller.component, wire.SET_MESSAGE_INTERVAL, float(message),
-                    float(interval_us),
-                )
-            )  # fmt: skip
+            out.append(MessageInterval(controller.system, controller.component, message, interval_us))
         return out
 
     def _on_attitude(self, m: Attitude, now_ns: int) -> None:

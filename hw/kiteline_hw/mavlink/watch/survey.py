@@ -13,6 +13,7 @@ from kiteline_hw.mavlink.messages import (
     Attitude,
     Heartbeat,
     MavlinkMessage,
+    MessageInterval,
     RadioStatus,
     TimeSync,
     VehicleImu,
@@ -22,7 +23,6 @@ from kiteline_hw.mavlink.watch import parameters
 from kiteline_hw.mavlink.watch.findings import Finding, FindingLog, Level
 from kiteline_hw.mavlink.watch.messages import (
     AutopilotVersion,
-    Command,
     CommandAck,
     EkfStatusReport,
     EstimatorStatus,
@@ -146,7 +146,7 @@ class ControllerSurvey:
             return []
         target = controller.system, controller.component
         wanted = self._wanted(controller)
-        return [Command(*target, wire.SET_MESSAGE_INTERVAL, float(message), 0.0) for _, message, _ in wanted]
+        return [MessageInterval(*target, message, 0) for _, message, _ in wanted]
 
     def _stream_requests(self, controller: Heartbeat, now_ns: int) -> list[MavlinkMessage]:
         c = self.config
@@ -156,7 +156,7 @@ class ControllerSurvey:
         self._stream_tries += 1
         target = controller.system, controller.component
         return [
-            Command(*target, wire.SET_MESSAGE_INTERVAL, float(message), round(1e6 / hz))
+            MessageInterval(*target, message, round(1e6 / hz))
             for name, message, hz in self._wanted(controller)
             if name not in self._rates
         ]
