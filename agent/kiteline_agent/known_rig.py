@@ -3,14 +3,12 @@
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.imaging.row_alignment import TERMS as ROW_TERMS
 from kiteline_agent.inertial.calibration.known_imu import KnownImuConfig
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import disparity_offset
 from kiteline_core.geometry.cameras import RectifiedCamera
-
-F64 = NDArray[np.float64]
 
 _CAMERA_NUMBERS = 7
 _SAME = 1e-6  # relative; machines round differently

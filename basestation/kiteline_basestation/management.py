@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.intake.intake import Intake
 from kiteline_basestation.map.matrices import numbers_of, similarity_from
@@ -18,6 +17,7 @@ from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.merging.map_merger import MapMerger
 from kiteline_basestation.merging.merges import NOTHING, MergeResult
 from kiteline_codec.coding.quantise import MAX_SCALE, MIN_SCALE
+from kiteline_core.arrays import F64
 from kiteline_core.errors import INPUT_FAULTS
 from kiteline_core.geometry import sim3
 from kiteline_core.ids import BOOT_BITS, SUBMAP_BITS, SubmapId, agent_of_submap, submap_id, submap_of_keyframe
@@ -62,7 +62,7 @@ class MapManager:
     """Answers commands. names, placements: those of the mapper. delete: drops submaps from all of the mapper."""
 
     def __init__(
-        self, sparse_map: SparseMap, names: dict[SubmapId, str], placements: Mapping[SubmapId, NDArray[np.float64]],
+        self, sparse_map: SparseMap, names: dict[SubmapId, str], placements: Mapping[SubmapId, F64],
         intake: Intake, merger: MapMerger | None, delete: Callable[[Collection[SubmapId]], None],
     ) -> None:  # fmt: skip
         self._map = sparse_map

@@ -4,15 +4,13 @@ import hashlib
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_core import odometry
+from kiteline_core.arrays import F64
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration, OdometryBatch
 from kiteline_core.geometry.cameras import CameraRig
 from kiteline_hw.sim.config import SimConfig
 from kiteline_hw.sim.source import START_NS, open_sim
-
-F64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

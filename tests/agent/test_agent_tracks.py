@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from kiteline_agent.agent import Agent
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_agent.step import Estimate, Identity, StepInput
+from kiteline_core.arrays import F64
 from kiteline_core.frame import Frame, ImuBatch
 from kiteline_core.geometry import se3
 from kiteline_core.ids import AgentId
@@ -45,7 +45,7 @@ def first_frames(source: FrameSource, n: int) -> list[Frame | ImuBatch]:
     return items
 
 
-def step_errors_m(source: FrameSource, estimates: list[Estimate]) -> NDArray[np.float64]:
+def step_errors_m(source: FrameSource, estimates: list[Estimate]) -> F64:
     """Error of the motion between frames that have a true pose at their time."""
     truth = source.ground_truth
     at = {int(t): T for t, T in zip(truth.t_ns, truth.T_w_b)}

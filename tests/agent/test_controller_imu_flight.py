@@ -16,7 +16,6 @@ from kiteline_hw.mavlink.messages import VehicleImu
 from kiteline_hw.ports import SourceReport
 from tests.agent.room_flight import RoomFlight
 
-F64 = np.ndarray
 BOOT_NS = 400_000_000_000  # our clock at the controller's zero
 DARK = range(60, 75)
 

@@ -4,13 +4,13 @@ import copy
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from kiteline_agent.config import AgentConfig, SmoothingConfig
 from kiteline_agent.exchange.corrections import Corrections
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.relocalisation.map_cache import MapCache
 from kiteline_codec.schema import GravityAlignment, Key, SubmapPlacement
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import AgentId, submap_id
@@ -51,7 +51,7 @@ def test_a_withdrawn_placement_recognises_nothing(corrections: Corrections) -> N
 TILTED = GravityAlignment(FIRST, se3.exp(np.array([0.2, 0.1, 0.0, 0.4, -0.2, 0.0])))
 
 
-def in_world(corrections: Corrections) -> NDArray[np.float64]:
+def in_world(corrections: Corrections) -> F64:
     """T_w_b of a body at the origin of the first submap, nothing of which was reported before."""
     placed = copy.deepcopy(corrections).in_world(FIRST, np.eye(4), np.eye(4), 0, metric=True)
     assert placed is not None

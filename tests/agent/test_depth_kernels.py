@@ -2,27 +2,25 @@
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.imaging import alignment_kernels
 from kiteline_agent.imaging.epipolar_kernels import search_segments
 from kiteline_agent.imaging.features import Pyramid, build_pyramid
 from kiteline_agent.keyframes.seed_kernels import intersect, seed_segments
 from kiteline_agent.tracking.frame_images import NO_GRID
+from kiteline_core.arrays import F64, I8, U8
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraModel, CameraRig, Lens, Rectifier
 
-F64 = NDArray[np.float64]
 
-
-def picture(seed: int = 0, blur_px: float = 2.0) -> NDArray[np.uint8]:
+def picture(seed: int = 0, blur_px: float = 2.0) -> U8:
     noise = np.random.default_rng(seed).integers(0, 256, (240, 320), np.uint8)
     return np.asarray(cv2.normalize(cv2.GaussianBlur(noise, (0, 0), blur_px), None, 10, 245, cv2.NORM_MINMAX), np.uint8)
 
 
 def search(
     pyramid: Pyramid, other: Pyramid, uv: F64, start: F64, end: F64, warp: F64 | None = None, octave: int = 0
-) -> tuple[F64, NDArray[np.int8]]:
+) -> tuple[F64, I8]:
     n = len(uv)
     octaves = np.full(n, octave, np.uint8)
     templates = np.empty((n, 3, alignment_kernels.TEMPLATE, alignment_kernels.TEMPLATE), np.uint8)

@@ -4,7 +4,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from kiteline_agent.agent import Agent
 from kiteline_agent.config import AgentConfig
@@ -15,12 +14,12 @@ from kiteline_agent.step import Identity, StepInput
 from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_agent.tracking.track import Track
 from kiteline_agent.tracking.tracker import Tracker
+from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuBatch
 from kiteline_core.geometry import se3
 from kiteline_core.ids import AgentId
 from tests.agent.room_flight import RoomFlight
 
-F64 = NDArray[np.float64]
 FRAMES = 56
 CROWDED = range(44, 50)  # frames
 SHIFT_PX = 6.0

@@ -3,14 +3,14 @@
 import cv2
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from kiteline_agent.imaging import corner_kernels, features
 from kiteline_agent.imaging import feature_kernels as kernels
 from kiteline_agent.imaging.features import DetectorConfig, build_pyramid, describe, detect
+from kiteline_core.arrays import I32, I64, U8
 
 
-def blobs(seed: int, turn_deg: float = 0.0) -> NDArray[np.uint8]:
+def blobs(seed: int, turn_deg: float = 0.0) -> U8:
     """A grey image with many distinct patches of different shape, perhaps turned about its centre."""
     rng = np.random.default_rng(seed)
     image = np.full((400, 400), 120, np.uint8)
@@ -25,7 +25,7 @@ def blobs(seed: int, turn_deg: float = 0.0) -> NDArray[np.uint8]:
     return np.asarray(image, np.uint8)
 
 
-def hamming(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> NDArray[np.int64]:
+def hamming(a: U8, b: U8) -> I64:
     return np.unpackbits(a[:, None] ^ b[None, :], axis=2).sum(axis=2).astype(np.int64)
 
 
@@ -125,14 +125,14 @@ def test_faint_corners_are_found_where_there_are_few_others(sigma: float) -> Non
     assert np.mean(corner < 4.0) > 0.8, "corners of the patches, not of the noise, of which a quarter would be so near"
 
 
-def noise(seed: int, rows: int, columns: int) -> NDArray[np.uint8]:
+def noise(seed: int, rows: int, columns: int) -> U8:
     """Grey noise, smoothed so far that it has corners of all strengths."""
     rng = np.random.default_rng(seed)
     image = cv2.GaussianBlur(rng.standard_normal((rows, columns)), (0, 0), 1.3)
     return np.asarray(np.clip(128 + 50 * image / image.std(), 0, 255), np.uint8)
 
 
-def by_opencv(image: NDArray[np.uint8], threshold: int, margin: int) -> NDArray[np.int32]:
+def by_opencv(image: U8, threshold: int, margin: int) -> I32:
     found = cv2.FastFeatureDetector.create(threshold, True).detect(image)
     xy = np.array(cv2.KeyPoint.convert(found), np.float32).astype(np.int32)
     limit = np.array([image.shape[1], image.shape[0]]) - margin

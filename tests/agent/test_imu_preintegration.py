@@ -4,16 +4,15 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from kiteline_agent.inertial import imu_kernels
 from kiteline_agent.inertial.preintegration import Preintegrated, Samples, preintegrate
 from kiteline_agent.inertial.sample_buffer import SampleBuffer
+from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuBatch, ImuCalibration
 from kiteline_core.geometry import se3
 from tests.core.helpers_from_python import from_python
 
-F64 = NDArray[np.float64]
 CALIBRATION = ImuCalibration()
 SEEDS = st.integers(0, 2**31)
 

@@ -4,7 +4,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from kiteline_agent.inertial.calibration.gyro_calibration import GyroCalibration
 from kiteline_agent.inertial.calibration.known_imu import KnownImuConfig
@@ -12,13 +11,13 @@ from kiteline_agent.inertial.calibration.self_calibration import SelfCalibration
 from kiteline_agent.inertial.calibration.window import Window
 from kiteline_agent.inertial.preintegration import Samples, preintegrate
 from kiteline_agent.inertial.sample_buffer import SampleBuffer
+from kiteline_core.arrays import F64, I64
 from kiteline_core.frame import ImuBatch, ImuCalibration
 from kiteline_core.geometry import se3
 from kiteline_hw.sim.sensors import imu as sim_imu
 from kiteline_hw.sim.world.built_in_paths import built_in_path
 from kiteline_hw.sim.world.path import Path
 
-F64 = NDArray[np.float64]
 CALIBRATION = ImuCalibration()
 T_B_C = se3.from_rt(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.array([0.1, 0.03, -0.02]))
 P_B_C = T_B_C[:3, 3].copy()
@@ -32,7 +31,7 @@ ACCEL = np.array([[0.990, -0.006, 0.005], [0.004, 1.011, 0.007], [-0.006, 0.003,
 class Flight:
     """Poses by images at the stamps of frames, and all samples."""
 
-    t_ns: NDArray[np.int64]
+    t_ns: I64
     seen: F64
     truth: F64
     samples: ImuBatch

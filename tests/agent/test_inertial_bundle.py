@@ -5,7 +5,6 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from kiteline_agent.inertial.preintegration import BiasPrior, Samples
 from kiteline_agent.inertial.sample_buffer import SampleBuffer
@@ -16,14 +15,12 @@ from kiteline_agent.initialisation.inertial_window import WarmStart, WindowSolut
 from kiteline_agent.initialisation.lens_correction import TERMS, moved
 from kiteline_agent.initialisation.window_kernels import add_observations
 from kiteline_agent.initialisation.window_noise import NoiseEvidence, WindowNoise
+from kiteline_core.arrays import F64, Bool
 from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry import se3
 from kiteline_hw.sim.sensors import imu as sim_imu
 from kiteline_hw.sim.world.built_in_paths import built_in_path
 from kiteline_hw.sim.world.path import Path
-
-F64 = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 T_B_C = se3.from_rt(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.array([0.1, 0.03, -0.02]))
 FOCAL = 450.0
@@ -180,7 +177,7 @@ def test_noise_of_the_accelerometer_is_not_believed_below_its_least() -> None:
     assert many.updated(before, 6.0, 3.0) == many.updated(before, 6.0)
 
 
-def walking(corners: CornerObservations, truth: F64, share: float, seed: int) -> tuple[CornerObservations, Bools]:
+def walking(corners: CornerObservations, truth: F64, share: float, seed: int) -> tuple[CornerObservations, Bool]:
     """The corners, a share of them on things that walk across the view from one keyframe to the next; and which."""
     rng = np.random.default_rng(seed)
     walks = rng.random(len(corners.ids)) < share

@@ -5,7 +5,6 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from kiteline_agent.inertial.calibration.self_calibration import SelfCalibrationConfig
 from kiteline_agent.inertial.fixed_lag import InertialState, VisualPoints
@@ -13,6 +12,7 @@ from kiteline_agent.inertial.imu_initialisation import InertialStartState
 from kiteline_agent.inertial.inertial_config import InertialConfig
 from kiteline_agent.inertial.inertial_tracker import InertialTracker
 from kiteline_agent.inertial.scale_filter import camera_scaled
+from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuBatch, ImuCalibration
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
@@ -20,7 +20,6 @@ from kiteline_hw.sim.sensors import imu as sim_imu
 from kiteline_hw.sim.world.built_in_paths import built_in_path
 from kiteline_hw.sim.world.path import Path
 
-F64 = NDArray[np.float64]
 CALIBRATION = ImuCalibration()
 CHEAP = ImuCalibration(gyro_noise=1e-3, gyro_walk=8e-5, accel_noise=6e-3, accel_walk=4e-3)
 T_B_C = se3.from_rt(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.array([0.1, 0.03, -0.02]))

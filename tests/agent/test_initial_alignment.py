@@ -6,17 +6,16 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from kiteline_agent.inertial import initial_alignment as imu_alignment
 from kiteline_agent.inertial.imu_initialisation import ImuInitialiser, TimedPose
 from kiteline_agent.inertial.inertial_config import InertialConfig
 from kiteline_agent.inertial.preintegration import Preintegrated, Samples, preintegrate
 from kiteline_agent.inertial.sample_buffer import SampleBuffer
+from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry import se3
 
-F64 = NDArray[np.float64]
 CALIBRATION = ImuCalibration()
 GRAVITY = np.array([0.0, 0.0, -9.81])
 P_B_C = np.array([0.15, -0.05, 0.1])

@@ -14,7 +14,8 @@ from kiteline_bench.harness.recording import Recording, load
 from kiteline_bench.harness.result import AgentRun
 from kiteline_bench.harness.run import FlyingAgent
 from kiteline_codec.schema import KeyframeHeader, Record
-from kiteline_core.frame import U8, Frame
+from kiteline_core.arrays import U8
+from kiteline_core.frame import Frame
 
 CONFIG = KeyframeConfig()
 USUAL = Situation(5, 0.25, 200, 210, 0.9, 0.01, 0.01)

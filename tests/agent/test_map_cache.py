@@ -4,18 +4,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.relocalisation.frame_features import FrameFeatures
 from kiteline_agent.relocalisation.map_cache import MapCache
 from kiteline_codec.schema import CachedKeyframe, CachedLandmarks, Key
+from kiteline_core.arrays import F64, I64, U8
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import KeyframeId, SubmapId, keyframe_id, submap_id
 from kiteline_hw.system.vocabulary import shipped_vocabulary
 
-F64 = NDArray[np.float64]
 CAMERA = RectifiedCamera(752, 480, 420.0, 420.0, 376.0, 240.0, 0.11, True, np.eye(4))
 HERE, THERE = submap_id(0, 1, 0), submap_id(3, 0, 0)
 
@@ -25,7 +24,7 @@ class World:
     """Points (n,3) on walls around the origin, with descriptors (n,32) that no two share."""
 
     points: F64
-    descriptor: NDArray[np.uint8]
+    descriptor: U8
 
     def seen(self, T_m_c: F64, rng: np.random.Generator, share: float = 0.6, noise_px: float = 0.5) -> FrameFeatures:
         """Corners of a view: some of the points in it, and as many others."""
@@ -41,7 +40,7 @@ class World:
             np.concatenate([self.descriptor[rows] ^ flips, rng.integers(0, 256, (n, 32), dtype=np.uint8)]),
         )
 
-    def in_view(self, T_m_c: F64) -> tuple[NDArray[np.int64], F64, F64]:
+    def in_view(self, T_m_c: F64) -> tuple[I64, F64, F64]:
         local = se3.transform(se3.inverse(T_m_c), self.points)
         z = np.maximum(local[:, 2], 1e-3)
         uv = local[:, :2] / z[:, None] * 420.0 + (376.0, 240.0)

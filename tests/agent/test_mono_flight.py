@@ -8,7 +8,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from kiteline_agent.agent import Agent
 from kiteline_agent.config import AgentConfig, LocalMapConfig
@@ -24,14 +23,12 @@ from kiteline_agent.tracking.frame_images import FrameImages
 from kiteline_agent.tracking.track import Track
 from kiteline_codec.channel import plain_pair
 from kiteline_codec.schema import NewLandmarks
+from kiteline_core.arrays import F64, U8
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraModel, CameraRig, Rectifier
 from kiteline_core.ids import NO_KEYFRAME, AgentId, submap_of_keyframe
 from kiteline_hw.sources.open import open_source
-
-F64 = NDArray[np.float64]
-U8 = NDArray[np.uint8]
 
 W, H, FOCAL = 320, 240, 220.0
 CAMERA = CameraModel(W, H, FOCAL, FOCAL, 159.5, 119.5)

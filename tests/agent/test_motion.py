@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from kiteline_agent.inertial.gravity_alignment import up_of
 from kiteline_agent.inertial.imu_watch import ImuWatch
@@ -10,11 +9,10 @@ from kiteline_agent.inertial.inertial_config import InertialConfig, StartDeviati
 from kiteline_agent.inertial.inertial_tracker import InertialTracker
 from kiteline_agent.motion.loss_motion import LossMotion, LossMotionEstimator, _largest
 from kiteline_agent.motion.recent_motion import RecentMotion
+from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuBatch, ImuCalibration
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
-
-F64 = NDArray[np.float64]
 
 CALIBRATION = ImuCalibration()
 CAMERA = RectifiedCamera(752, 480, 420.0, 420.0, 376.0, 240.0, 0.11, True, np.eye(4))

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from kiteline_agent.config import OdometerConfig
 from kiteline_agent.motion.odometer import Odometer
 from kiteline_core import odometry
+from kiteline_core.arrays import F64
 from kiteline_core.frame import UNMEASURED, OdometryBatch
 from kiteline_core.geometry import se3
 
-F64 = np.ndarray
 FRAME_NS, SAMPLE_NS = 50_000_000, 20_000_000
 # a camera that looks ahead from a body whose x points ahead and z up, 0.3 m in front of it
 T_B_C = se3.from_rt(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.array([0.3, 0.0, 0.1]))

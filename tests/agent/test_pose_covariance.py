@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from kiteline_agent.config import CovarianceConfig
 from kiteline_agent.covariance import calibration_error_kernels as certainty_kernels
@@ -14,11 +13,11 @@ from kiteline_agent.covariance.pose_quality import probability_good
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.tracking.pose_state import PoseState
 from kiteline_agent.tracking.track import Track
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
 from kiteline_core.ids import KeyframeId, SubmapId
 from tests.agent.seen_scenes import CAMERA, SHAPES, map_of, scene, seen_with, tracked
 
-F64 = NDArray[np.float64]
 X, NOTHING = scene(), np.zeros(SHAPES)  # points, and no error of calibration
 T_C_M = se3.exp(np.array([0.3, -0.1, 0.2, 0.05, -0.1, 0.08]))
 

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from kiteline_agent.agent import Agent
 from kiteline_agent.config import AgentConfig
@@ -16,12 +15,12 @@ from kiteline_agent.runtime.frame_reader import FrameReader
 from kiteline_agent.runtime.pose_schedule import PoseSchedule
 from kiteline_agent.step import Identity, PredictedPose, StepInput, StepOutput
 from kiteline_core import odometry
+from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuBatch, OdometryBatch
 from kiteline_core.geometry import se3
 from kiteline_core.ids import AgentId
 from tests.agent.room_flight import RoomFlight
 
-F64 = NDArray[np.float64]
 S = 1_000_000_000
 BEGIN = 20  # frames until all is initialised
 

@@ -5,13 +5,13 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from kiteline_agent.agent import Agent
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_agent.step import Identity, StepInput
 from kiteline_agent.tracking.rolling_shutter import RollingShutter
+from kiteline_core.arrays import F64
 from kiteline_core.frame import Frame, ImuBatch, OdometryBatch
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import Rectifier
@@ -19,7 +19,6 @@ from kiteline_core.ids import AgentId
 from kiteline_hw.sim.sensors.rig import make_rig
 from kiteline_hw.sim.source import SimSource, open_sim
 
-F64 = NDArray[np.float64]
 READOUT_S = 0.02
 TWIST = np.array([0.8, -0.5, 0.9, 0.6, -0.7, 0.5])
 

@@ -2,15 +2,14 @@
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from kiteline_agent.inertial import imu_kernels
 from kiteline_agent.inertial.preintegration import Samples, preintegrate
 from kiteline_agent.inertial.sample_buffer import SampleBuffer
 from kiteline_agent.initialisation.vibration_levels import vibration
+from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuBatch, ImuCalibration
 
-F64 = NDArray[np.float64]
 STEP_NS = 5_000_000
 CALIBRATION = ImuCalibration()
 

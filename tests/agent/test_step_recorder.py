@@ -5,16 +5,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from kiteline_agent.inertial.preintegration import Samples
 from kiteline_agent.motion.step_recorder import StepRecorder
 from kiteline_codec.schema import messages
+from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry import se3
 from kiteline_core.ids import AgentId, keyframe_id, submap_id
-
-F64 = NDArray[np.float64]
 
 FRAME_NS = 50_000_000
 SUBMAP = submap_id(AgentId(0), 0, 0)

@@ -4,14 +4,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from kiteline_agent.config import TwoViewConfig
 from kiteline_agent.initialisation import two_view_models
 from kiteline_agent.initialisation.two_view import TwoView, two_view
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
-
-F64 = NDArray[np.float64]
 
 CAMERA = np.array([450.0, 455.0, 372.0, 238.0])
 SIZE = np.array([752.0, 480.0])

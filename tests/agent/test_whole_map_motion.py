@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from kiteline_agent.config import AgentConfig, SmoothingConfig
 from kiteline_agent.exchange.corrections import Corrections
@@ -16,12 +15,12 @@ from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.mapping.pose_report import PoseReport
 from kiteline_agent.relocalisation.map_cache import MapCache
 from kiteline_codec.schema import KeyframeHeader, KeyframePose, SubmapPlacement
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, keyframe_id, submap_id
 from tests.agent.plain_landmarks import plain_landmarks
 
-F64 = NDArray[np.float64]
 SECOND_NS = 1_000_000_000
 SMALL = se3.exp(np.array([0.003, -0.002, 0.001, 0.0005, -0.001, 0.0015]))  # within all limits
 

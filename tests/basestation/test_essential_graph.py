@@ -4,14 +4,12 @@ import time
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.config import GraphConfig
 from kiteline_basestation.merging.essential_graph import GraphInputs, Scaled, optimise, residuals
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3, sim3
 from tests.yardstick import slowness
-
-F64 = NDArray[np.float64]
 
 
 def ring(n: int, per_turn: int, loops: int, wrong: int = 0, seed: int = 0) -> tuple[F64, GraphInputs]:

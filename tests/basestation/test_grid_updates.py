@@ -5,7 +5,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.grid.grid_view import dense
@@ -15,6 +14,7 @@ from kiteline_basestation.job_kinds import run_job
 from kiteline_basestation.jobs import JobDone
 from kiteline_basestation.mapper import Mapper, MapperInput
 from kiteline_codec.schema import CameraIntrinsics, KeyframeScan, Record, messages
+from kiteline_core.arrays import F64, I8, Bool
 from kiteline_core.geometry import se3
 from kiteline_core.ground.column_scan import level_rotation
 from kiteline_core.ids import KEYPOINT_BITS, KeyframeId, submap_of_keyframe
@@ -26,7 +26,7 @@ HEIGHT_M = 1.5
 STEP_NS = 500_000_000
 
 
-def seen(keyframe: KeyframeId, T_w_s: NDArray[np.float64], *of_scan: Any) -> KeyframeScan:
+def seen(keyframe: KeyframeId, T_w_s: F64, *of_scan: Any) -> KeyframeScan:
     """What a camera truly saw at T_w_s. of_scan: labels, and what tells a scan between keyframes."""
     up = T_w_s[2, :3]
     ahead = T_w_s[:3, :3] @ level_rotation(up)[:, 0]
@@ -89,7 +89,7 @@ def assert_equal(a: ScanGrid, b: ScanGrid) -> None:
     assert all(np.array_equal(a.log_odds(place), b.log_odds(place)) for place in a.places)
 
 
-def known(grid: ScanGrid) -> tuple[NDArray[np.int8], NDArray[np.bool_], NDArray[np.bool_]]:
+def known(grid: ScanGrid) -> tuple[I8, Bool, Bool]:
     """Cells of the main storey, those well inside the room, and those well outside."""
     cells, corner, cell = dense(grid, grid.main_storey())
     rows, columns = np.indices(cells.shape)

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from kiteline_basestation.config import GridConfig, GroundConfig
 from kiteline_basestation.grid import ground_kernels as kernels
 from kiteline_basestation.grid.ground_height import ground_heights
 from kiteline_basestation.grid.sparse_scan import GROUND, OBSTACLE, UNLABELLED, label, sparse_scan
+from kiteline_core.arrays import F64, I64
 from kiteline_core.geometry.cameras import RectifiedCamera
 from tests.basestation.flat_rooms import camera
 
@@ -63,10 +63,6 @@ def test_without_a_floor_there_is_no_scan() -> None:
     ceiling = np.column_stack([rng.uniform(-3, 3, 200), np.full(200, -1.5), rng.uniform(1, 6, 200)])
     assert sparse_scan(GridConfig(), CAMERA, camera(0.0, 0.0, 0.0), ceiling, np.ones(200, bool)) is None
     assert sparse_scan(GridConfig(), CAMERA, camera(0.0, 0.0, 0.0), np.full((3, 3), np.nan), np.ones(3, bool)) is None
-
-
-I64 = NDArray[np.int64]
-F64 = NDArray[np.float64]
 
 
 def ground_reference(count: F64, seed: int, seed_bin: int, reach: int, share: float, least: float) -> I64:

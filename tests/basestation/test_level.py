@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from kiteline_basestation.config import BaseConfig, GraphConfig, LoopConfig
 from kiteline_basestation.inertial.level import Level, level_of, tilt_between
@@ -14,11 +13,10 @@ from kiteline_basestation.merging.essential_graph import GraphInputs, Scaled, op
 from kiteline_basestation.merging.loop_consistency import keeps_level
 from kiteline_basestation.merging.loop_edges import LoopEdge
 from kiteline_codec.schema import CameraIntrinsics, KeyframeHeader, LivePose, Record, SubmapScale, SubmapTie
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, AgentId, keyframe_id, submap_id
-
-F64 = NDArray[np.float64]
 
 UP = np.array([0.0, 0.0, 1.0])
 AGENT = AgentId(1)

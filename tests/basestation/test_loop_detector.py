@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from kiteline_basestation.config import BaseConfig, LandmarkMatchingConfig
 from kiteline_basestation.exchange.sharing import SharingPolicy
@@ -17,12 +16,12 @@ from kiteline_basestation.mapper import Mapper, MapperInput
 from kiteline_basestation.merging.loop_detector import LoopClosure, LoopDetector
 from kiteline_basestation.merging.loop_verification import KeyframeObservations, same_unit
 from kiteline_codec.schema import CameraIntrinsics, KeyframePose, Record
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
 from kiteline_core.ids import NO_KEYFRAME, AgentId, keyframe_id, submap_id
 from kiteline_core.places import place_kernels
 from tests.basestation.feeding import WITHOUT_GRID
 
-F64 = NDArray[np.float64]
 MakeFlight = Callable[..., Any]
 STEP_NS = 250_000_000
 

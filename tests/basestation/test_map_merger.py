@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.job_kinds import run_job
@@ -16,11 +15,11 @@ from kiteline_basestation.mapper import Mapper, MapperInput
 from kiteline_basestation.station import Station
 from kiteline_codec.channel import plain_pair
 from kiteline_codec.schema import CameraIntrinsics, Key, SubmapPlacement
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
 from kiteline_core.ids import SEQUENCE_BITS, submap_of_keyframe
 from tests.basestation.feeding import STEP_NS, WITHOUT_GRID, feed
 
-F64 = NDArray[np.float64]
 MakeFlight = Callable[..., Any]
 ELSEWHERE = se3.exp(np.array([3.0, -1.0, 0.2, 0.02, -0.03, 1.1]))
 

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from kiteline_basestation.config import InertialScaleConfig
 from kiteline_basestation.inertial import band_kernels
@@ -15,12 +14,12 @@ from kiteline_basestation.inertial.chain import Segment, path_along
 from kiteline_basestation.inertial.map_scale import MapScale, in_metres, map_scale, tells_scale
 from kiteline_basestation.inertial.scale_drift import bent, drift_along, shared_landmarks
 from kiteline_codec.schema import InertialSteps
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
 from kiteline_core.ids import KeyframeId
 from kiteline_core.optimisation.bundle import BundleProblem, BundleResult
 from tests.basestation.inertial_maps import T_B_C, body, steps
 
-F64 = NDArray[np.float64]
 CONFIG = InertialScaleConfig()
 
 

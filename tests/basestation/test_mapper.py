@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from kiteline_basestation.config import BaseConfig, LandmarkMatchingConfig, TriangulationConfig
 from kiteline_basestation.grid.placed_map import placed_map
@@ -28,11 +27,11 @@ from kiteline_codec.schema import (
     SubmapPlacement,
     messages,
 )
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
 from kiteline_core.ids import KeyframeId, submap_of_keyframe
 from tests.basestation.feeding import STEP_NS, WITHOUT_GRID, feed_groups
 
-F64 = NDArray[np.float64]
 MakeFlight = Callable[..., Any]
 
 

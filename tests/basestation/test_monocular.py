@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.exchange.map_cache_planner import MapCachePlanner
@@ -34,12 +33,12 @@ from kiteline_codec.schema import (
     SubmapPlacement,
     SubmapScale,
 )
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import agent_of_keyframe, agent_of_submap, submap_of_keyframe
 from kiteline_core.optimisation.bundle import BundleResult
 from tests.basestation.feeding import STEP_NS, WITHOUT_GRID, feed
 
-F64 = NDArray[np.float64]
 MakeFlight = Callable[..., Any]
 ELSEWHERE = se3.exp(np.array([3.0, -1.0, 0.2, 0.02, -0.03, 1.1]))
 

@@ -6,12 +6,12 @@ from dataclasses import replace
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from kiteline_basestation.grid import scan_kernels as kernels
 from kiteline_basestation.grid.grid_view import dense, grid_files
 from kiteline_basestation.grid.kept_scan import keep
 from kiteline_basestation.grid.scan_grid import ScanGrid
+from kiteline_core.arrays import F64, I64, U8, U16
 from tests.basestation.flat_rooms import ROOM, box, camera, circle, scan_of
 from tests.basestation.grid_scans import BF, CONFIG, at, drawn, flight, kept
 
@@ -191,9 +191,7 @@ def test_a_scan_in_a_unit_of_its_submap_is_drawn_in_metres() -> None:
     assert_equal(scaled, plain)
 
 
-def reference(
-    x: float, y: float, first: float, step: float, ranges: NDArray[np.float64], bands: NDArray[np.uint8], size: int
-) -> NDArray[np.int64]:
+def reference(x: float, y: float, first: float, step: float, ranges: F64, bands: U8, size: int) -> I64:
     """Cells (size, size) with the bands of obstacles, sampled densely on the surface in each column. ranges: (n,3)."""
     out = np.zeros((size, size), np.int64)
     for i, (lower, middle, upper) in enumerate(ranges):
@@ -233,9 +231,9 @@ def test_hits_are_marked_as_in_the_reference_and_leave_no_trace(seed: int) -> No
 
 
 def freed(
-    x: float, y: float, first: float, step: float, columns: dict[str, NDArray[np.float64]], camera_band: int,
-    weights: tuple[int, int, int], hits: NDArray[np.uint16],
-) -> NDArray[np.int64]:  # fmt: skip
+    x: float, y: float, first: float, step: float, columns: dict[str, F64], camera_band: int,
+    weights: tuple[int, int, int], hits: U16,
+) -> I64:  # fmt: skip
     """What `draw_free` takes from the planes (4,rows,columns): each cell asked for its column and its range."""
     rows, cells = np.indices(hits.shape)
     dx, dy = cells + 0.5 - x, rows + 0.5 - y

@@ -4,17 +4,17 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from kiteline_basestation.map.map_tables import CULLED, OBSERVATION, REMOVED, LandmarkDescriptors
 from kiteline_basestation.map.sparse_map import SparseMap
+from kiteline_core.arrays import I32
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, keyframe_id, point_id, submap_id
 
 CAMERA = RectifiedCamera(640, 480, 400.0, 410.0, 320.0, 240.0, 0.1, True, np.eye(4))
 SUBMAP = submap_id(3, 1, 0)
-Slots = NDArray[np.int32]
+Slots = I32
 
 
 def kf(n: int) -> KeyframeId:

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.inertial.ties import InertialTie, InertialTies, moved
@@ -21,8 +20,6 @@ from kiteline_codec.schema import CameraIntrinsics, InertialSteps, SubmapScale
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, keyframe_id, submap_id, submap_of_keyframe
-
-F64 = NDArray[np.float64]
 
 T_B_C = se3.from_rt(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.array([0.1, 0.02, -0.05]))
 AGENT = AgentId(0)

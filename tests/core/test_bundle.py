@@ -2,13 +2,12 @@
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
 from kiteline_core.optimisation import bundle_kernels as kernels
 from kiteline_core.optimisation.bundle import BundleConfig, BundleProblem, bundle, pack, unpack
 
-F64 = NDArray[np.float64]
 LENS = np.array([400.0, 410.0, 320.0, 240.0, 44.0])
 
 

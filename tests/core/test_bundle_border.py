@@ -4,12 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
 from kiteline_core.optimisation.bundle import Border, BundleConfig, BundleProblem, BundleResult, bundle
 
-F64 = NDArray[np.float64]
 LENS = np.array([400.0, 410.0, 320.0, 240.0, 44.0])
 TRUE = np.array([[0.3, -0.4], [-0.2, 0.0]])  # px: constant, and by the x of the image; of two agents
 EASY = BundleConfig(robust_trials=60, final_trials=0, stop=0.0, chi2_mono=1e9, chi2_stereo=1e9)

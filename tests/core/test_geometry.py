@@ -5,14 +5,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.geometry.end_rates import end_rates
 from kiteline_core.geometry.triangulation import nearest_point, parallax, project, rays
 from kiteline_core.order_statistics import median, quantiles
-
-F64 = NDArray[np.float64]
 
 
 def _matrix_exponential(a: F64) -> F64:

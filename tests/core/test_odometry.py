@@ -5,10 +5,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kiteline_core import odometry
+from kiteline_core.arrays import F64
 from kiteline_core.frame import UNMEASURED, OdometryBatch
 from kiteline_core.geometry import se3
-
-F64 = np.ndarray
 
 # A body whose axes are a camera's (right, down, forward) above and ahead of a rover's axle (forward, left, up).
 R_B_D = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import KeyframeId, SubmapId
 from kiteline_lab.flights import flight_report
@@ -17,8 +17,6 @@ from kiteline_lab.flights.flight_report import statistic, table, without_timing,
 from kiteline_lab.flights.fly import fly
 from kiteline_lab.flights.plan import Options
 from kiteline_lab.flights.refined_path import refined_path
-
-F64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

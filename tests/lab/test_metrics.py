@@ -2,14 +2,13 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64, I64
 from kiteline_core.frame import Trajectory
 from kiteline_core.geometry import se3
 from kiteline_lab.evaluation import metrics
 from kiteline_lab.evaluation.metrics import TrajectoryAlignment, associate, evaluate, match, truth_at, umeyama
 
-F64 = NDArray[np.float64]
 PERIOD_NS = 50_000_000
 
 tangents = st.lists(st.floats(-2.0, 2.0), min_size=6, max_size=6).map(np.array)
@@ -30,7 +29,7 @@ def moved(trajectory: Trajectory, T: F64, scale: float = 1.0) -> Trajectory:
     return Trajectory(trajectory.t_ns, T @ poses)
 
 
-def part(trajectory: Trajectory, keep: NDArray[np.int64]) -> Trajectory:
+def part(trajectory: Trajectory, keep: I64) -> Trajectory:
     return Trajectory(trajectory.t_ns[keep], trajectory.T_w_b[keep])
 
 
@@ -178,7 +177,7 @@ def test_a_standing_estimate_has_no_scale() -> None:
 def test_dense_truth_is_met_between_its_stamps() -> None:
     """A fast steady motion, truth at 50 Hz, frames at 20 Hz: every second frame lies midway between two true poses."""
 
-    def at(t_ns: NDArray[np.int64]) -> Trajectory:
+    def at(t_ns: I64) -> Trajectory:
         poses = np.stack([se3.exp(np.array([0.0, 0.0, 0.0, 0.1, 0.2, 1.5]) * t) for t in t_ns / 1e9])
         poses[:, :3, 3] = np.outer(t_ns / 1e9, [2.0, 1.0, -0.5])
         return Trajectory(t_ns, poses)

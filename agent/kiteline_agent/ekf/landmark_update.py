@@ -3,15 +3,11 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.ekf import covariance_kernels as kernels
 from kiteline_agent.ekf.filter_state import FilterState
 from kiteline_agent.ekf_config import EkfConfig
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-Bools = NDArray[np.bool_]
+from kiteline_core.arrays import F64, I64, Bool
 
 _FIRST_MATCHES = 6  # matches with which a compatible set is begun before the largest set is taken
 _AGREE = 0.6  # share of the matches in a set at which no other set is tried
@@ -26,7 +22,7 @@ class Innovation:
     M: F64
 
 
-def innovation(state: FilterState, slots: I64, xy: F64) -> tuple[Innovation, Bools]:
+def innovation(state: FilterState, slots: I64, xy: F64) -> tuple[Innovation, Bool]:
     """Residuals of sightings (n,2) of landmarks (n,), and which of them lie before the camera (n,)."""
     R = state.T_o_c[:3, :3]
     local = (state.points[slots] - state.T_o_c[:3, 3]) @ R
@@ -44,7 +40,7 @@ def divided(found: Innovation, factor: F64) -> Innovation:
     return Innovation(found.slots, found.residual / factor[:, None], found.M / factor[:, None, None])
 
 
-def compatible(state: FilterState, found: Innovation, sigma: float, config: EkfConfig) -> Bools:
+def compatible(state: FilterState, found: Innovation, sigma: float, config: EkfConfig) -> Bool:
     """Mask (m,) of matches that are jointly compatible with the state.
 
     Each is taken if it fits given those taken before: a wrong one that the prior allows no longer fits then. As it may
@@ -62,7 +58,7 @@ def compatible(state: FilterState, found: Innovation, sigma: float, config: EkfC
     order = np.argsort(alone, kind="stable")
     order = order[alone[order] <= config.gate]
     L, white, taken = np.zeros((2 * m, 2 * m)), np.zeros(2 * m), np.zeros(m, np.int64)
-    best: Bools = np.zeros(m, np.bool_)
+    best: Bool = np.zeros(m, np.bool_)
     for seed in range(min(_FIRST_MATCHES, len(order))):
         begun = np.concatenate([order[seed : seed + 1], order[:seed], order[seed + 1 :]])
         count = kernels.compatible_set(S, residual, begun, config.gate, L, white, taken)

@@ -14,12 +14,10 @@ from kiteline_agent.inertial import fixed_lag_kernels as kernels
 from kiteline_agent.inertial import inertial_kernels
 from kiteline_agent.inertial.inertial_config import FixedLagConfig, StartDeviations
 from kiteline_agent.inertial.preintegration import Preintegrated, Samples, preintegrate
+from kiteline_core.arrays import F64, Bool
 from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
-
-F64 = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +32,7 @@ class VisualPoints:
     ray: F64
     observed: F64
     sigma_px: F64
-    inlier: Bools
+    inlier: Bool
 
 
 @dataclass(frozen=True, slots=True)

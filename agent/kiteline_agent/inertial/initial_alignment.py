@@ -10,12 +10,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.inertial.preintegration import Preintegrated
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
-
-F64 = NDArray[np.float64]
 
 # Columns of the unknowns: first position, then these. With the length of gravity imposed, its two turns and q = 1 / s.
 _VELOCITY, _BIAS, _GRAVITY, _TURNS, _Q = slice(3, 6), slice(6, 9), slice(9, 12), slice(9, 11), 11

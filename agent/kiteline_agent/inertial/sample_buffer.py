@@ -3,16 +3,12 @@
 from copy import copy
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.inertial import imu_kernels
 from kiteline_agent.inertial.preintegration import Samples
+from kiteline_core.arrays import F64, I64, Bool
 from kiteline_core.frame import ImuBatch
 from kiteline_core.order_statistics import median
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 
 _NOISE_MEMORY_S = 0.5  # over which the noise is averaged: rotors change speed faster than biases do
 _AT_ONCE = 20  # samples whose noise is measured together
@@ -42,7 +38,7 @@ class SampleBuffer:
         self._gap_ns = int(max_gap_s * 1e9)
         self._t: I64 = np.zeros(0, np.int64)
         self._values = np.zeros((0, 6))
-        self._clipped: Bools = np.zeros((0, 2), np.bool_)
+        self._clipped: Bool = np.zeros((0, 2), np.bool_)
         self._largest = np.array([_RANGE_GYRO_RAD_S, _RANGE_ACCEL_M_S2])  # magnitudes so far
         self._unmeasured = 0  # new samples whose noise was not measured yet
         self._step_ns: float | None = None  # usual time between two samples

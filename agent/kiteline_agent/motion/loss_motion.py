@@ -8,14 +8,12 @@ error of the position, as in a Kalman smoother.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.inertial.inertial_config import LossMotionConfig
 from kiteline_agent.inertial.inertial_tracker import InertialTracker
 from kiteline_agent.inertial.preintegration import preintegrate
+from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuCalibration
-
-F64 = NDArray[np.float64]
 
 _LEAST_VARIANCE = 1e-12  # a record holds no deviation of 0
 

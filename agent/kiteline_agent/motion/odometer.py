@@ -8,17 +8,15 @@ stamps or swapped axes raise that noise; above a tolerance the odometer is not u
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.config import OdometerConfig
 from kiteline_agent.inertial.fixed_lag import BodyVelocity
 from kiteline_agent.motion.extrapolation import Extrapolation, MotionSource, along_twist
 from kiteline_agent.motion.odometer_samples import MeanVelocity, OdometerSamples, measured_part
 from kiteline_agent.motion.unit_scale import WINDOW_S, UnitScale
+from kiteline_core.arrays import F64
 from kiteline_core.frame import OdometryBatch
 from kiteline_core.geometry import se3
-
-F64 = NDArray[np.float64]
 
 _UNMATCHED = 10  # windows without a sample, after which the stamps are reported to be wrong
 _WELL = 0.09  # (m/s)^2 or (rad/s)^2; directions measured worse than this count less and less

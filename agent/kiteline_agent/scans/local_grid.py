@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.scan_config import LocalGridConfig
 from kiteline_agent.scans import local_grid_kernels as kernels
@@ -14,10 +13,8 @@ from kiteline_agent.scans.range_error import RangeError
 from kiteline_agent.scans.scan_stage import Scanned
 from kiteline_codec.schema import GridTile
 from kiteline_codec.schema.base.grid_tile import FREE, TILE_CELLS
+from kiteline_core.arrays import F64, I8
 from kiteline_core.ground.column_scan import ColumnScan, level_rotation
-
-F64 = NDArray[np.float64]
-I8 = NDArray[np.int8]
 
 SECTORS = 72  # of 5 degrees
 _CELLS = 512  # along each side of the local grid

@@ -3,12 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64
 from kiteline_core.geometry.disparity_offset import TERMS, terms
 from kiteline_core.ground.column_scan import ColumnScan, level_rotation
-
-F64 = NDArray[np.float64]
 
 _LEAST_CHANGE_PX, _LEAST_CHANGE = 0.05, 0.2  # of the offset, and in the logarithm of the deviation
 _LEAST_FORWARD = 0.1  # of a column's direction along the optical axis: farther to the side nothing is in the image

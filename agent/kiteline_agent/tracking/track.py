@@ -3,14 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.config import PoseConfig
+from kiteline_core.arrays import F64, I64, Bool
 from kiteline_core.geometry import se3
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +24,7 @@ class Track:
     observed: F64
     sigma_px: F64
     depth_m: F64
-    inlier: Bools
+    inlier: Bool
     inliers: int
     rms: float
     tried: int

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.grid.kept_scan import KeptScan, keep
@@ -15,13 +14,9 @@ from kiteline_basestation.grid.sparse_scan import sparse_scan
 from kiteline_basestation.map.map_tables import LANDMARK
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_codec.schema import KeyframeScan
+from kiteline_core.arrays import F64, I32, U8
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import AgentId, KeyframeId, SubmapId, agent_of_keyframe, agent_of_submap, submap_of_keyframe
-
-F64 = NDArray[np.float64]
-I32 = NDArray[np.int32]
-U8 = NDArray[np.uint8]
-
 
 _LOOKED = 16  # keyframes looked at for each that one step may draw: most may not have moved
 

@@ -23,7 +23,6 @@ from math import floor
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.config import GridConfig
 from kiteline_basestation.grid import scan_kernels as kernels
@@ -31,11 +30,7 @@ from kiteline_basestation.grid.kept_scan import KeptScan, Lattice, position_cell
 from kiteline_basestation.grid.scan_kernels import ALL, BANDS, SIDE
 from kiteline_basestation.grid.sectors import Sectors, sectors_of
 from kiteline_basestation.grid.tile_store import Place, TileStore
-
-F64 = NDArray[np.float64]
-I8 = NDArray[np.int8]
-I32 = NDArray[np.int32]
-U16 = NDArray[np.uint16]
+from kiteline_core.arrays import F64, I8, I16, I32, U16
 
 Name = int | tuple[int, int]
 
@@ -157,7 +152,7 @@ class ScanGrid:
         main = self.main_storey()
         return sorted({s for storeys in self._storeys if main not in storeys for s in storeys if s != main})
 
-    def log_odds(self, place: Place) -> NDArray[np.int16]:
+    def log_odds(self, place: Place) -> I16:
         """Log-odds (BANDS, 64, 64) int16 of a tile."""
         slot = int(self._store.open_box(place.storey, place.row, place.column, 1, 1)[0, 0])
         if slot < 0:

@@ -5,16 +5,12 @@ a ray over a box clears neither the box nor the floor below.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.config import GridConfig
 from kiteline_basestation.grid.ground_height import ground_heights
+from kiteline_core.arrays import F64, U8, Bool
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ground.column_scan import ColumnScan, level_rotation
-
-F64 = NDArray[np.float64]
-U8 = NDArray[np.uint8]
-Bool = NDArray[np.bool_]
 
 UNLABELLED, GROUND, OBSTACLE = 0, 1, 2  # labels of landmarks
 

@@ -5,12 +5,9 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.grid.scan_kernels import PLANES, SIDE
-
-I16 = NDArray[np.int16]
-I32 = NDArray[np.int32]
+from kiteline_core.arrays import I16, I32
 
 _SHAPE = (PLANES, SIDE, SIDE)
 

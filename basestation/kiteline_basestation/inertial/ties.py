@@ -8,15 +8,13 @@ from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.inertial.units import units_of
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_codec.schema import InertialSteps
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import SubmapId, agent_of_keyframe, submap_of_keyframe
-
-F64 = NDArray[np.float64]
 
 _RUN = 20  # keyframes before a tie whose steps tell how long the agent's unit is there
 

@@ -4,16 +4,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.refinement.bundle_window import BundleWindow
+from kiteline_core.arrays import F64, I64
 from kiteline_core.ids import SEQUENCE_BITS, KeyframeId, SubmapId
 from kiteline_core.optimisation.bundle import BundleResult
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 _MIN_KEPT = 0.5  # share of inliers among observations that a merge fused: below it the merge is undone
 

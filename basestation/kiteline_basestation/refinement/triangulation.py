@@ -5,7 +5,6 @@ reprojection tests of ORB-SLAM2.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.config import TriangulationConfig
 from kiteline_basestation.exchange.publisher import Publisher
@@ -14,13 +13,10 @@ from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.refinement import landmark_matching_kernels as kernels
 from kiteline_basestation.refinement.landmark_matching import descriptors, fuse_landmarks
 from kiteline_codec.schema import RefinedLandmarks
+from kiteline_core.arrays import F64, I32, Bool
 from kiteline_core.geometry.se3 import skew
 from kiteline_core.geometry.triangulation import nearest_point, parallax, project, rays
 from kiteline_core.ids import KeyframeId
-
-F64 = NDArray[np.float64]
-I32 = NDArray[np.int32]
-Bool = NDArray[np.bool_]
 
 _MAX_COVISIBLE = 6  # covisible keyframes searched
 _MIN_BASELINE_RATIO = 0.01  # baseline over median depth: below it two keyframes have one viewpoint

@@ -11,15 +11,12 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.grid.grid_view import GridView
 from kiteline_basestation.grid.tile_store import Place
 from kiteline_basestation.web.numbers import AGENT_COUNTS, TOTALS, as_json
 from kiteline_basestation.web.snapshot import AgentStatus, PageSnapshot
-
-F64 = NDArray[np.float64]
-U8 = NDArray[np.uint8]
+from kiteline_core.arrays import F64, U8
 
 POINTS, TILES, PATH = 1, 2, 3  # kinds of binary messages
 

@@ -5,13 +5,13 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.config import GridConfig
 from kiteline_basestation.grid.grid_view import dense
 from kiteline_basestation.grid.kept_scan import keep
 from kiteline_basestation.grid.scan_grid import ScanGrid
 from kiteline_bench.harness.recording import Recording
+from kiteline_core.arrays import F32, F64
 from kiteline_core.frame import Frame
 from kiteline_core.geometry.cameras import CameraRig, Rectifier
 from kiteline_core.ground.column_scan import ColumnScan
@@ -21,9 +21,6 @@ from kiteline_core.ground.ground_height import GroundHeight, Seen, without_groun
 from kiteline_core.ground.segmentation import GroundSegmenter
 from kiteline_core.ground.wide_view import WideView
 from kiteline_lab.grids.files import FREE, OCCUPIED, GridFile
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

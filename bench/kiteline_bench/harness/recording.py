@@ -5,9 +5,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_core import odometry as odometer
+from kiteline_core.arrays import F64
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration, OdometryBatch, Trajectory, joined
 from kiteline_core.geometry.cameras import CameraRig
 from kiteline_hw.logs.mcap_log import GROUND_TRUTH, IMU, LogWriter
@@ -15,8 +15,6 @@ from kiteline_hw.ports import FrameSource
 from kiteline_hw.sources.open import open_source
 from kiteline_lab.evaluation import metrics
 from kiteline_lab.flights.simulate import encode
-
-F64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

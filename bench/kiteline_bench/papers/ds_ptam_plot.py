@@ -4,12 +4,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_bench.papers.throttled import MODES, Throttled, medians
+from kiteline_core.arrays import F64
 from kiteline_lab.plots.plot import COLOURS, TRUTH_COLOUR
-
-F64 = NDArray[np.float64]
 
 _MARKERS = ("^", "s", "o", "D")
 

@@ -4,14 +4,12 @@ import time
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.ekf.ray_kernels import position_by_rays
 from kiteline_bench.papers import simulated_vehicle as vehicle
 from kiteline_bench.papers.particle_kernels import position_by_particles
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
-
-F64 = NDArray[np.float64]
 
 PARTICLES = 100
 _DRAWS = 300

@@ -1,11 +1,9 @@
 """The initialisation that the paper compares with: particles along a landmark's first ray."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64
 from kiteline_core.jit import njit
-
-F64 = NDArray[np.float64]
 
 
 @njit

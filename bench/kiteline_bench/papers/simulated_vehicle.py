@@ -3,15 +3,12 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.ekf.filter_state import Motion
 from kiteline_agent.ekf.odometer_motion import camera_motion
+from kiteline_core.arrays import F64, I64
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 # forward, left, up -> right, down, forward
 _R_B_C = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])

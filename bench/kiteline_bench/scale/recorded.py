@@ -8,7 +8,6 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.step import Identity
 from kiteline_bench.harness.recording import items_of
@@ -24,6 +23,7 @@ from kiteline_codec.schema import (
     StereoAlignment,
     messages,
 )
+from kiteline_core.arrays import F64, U8
 from kiteline_core.geometry import se3
 from kiteline_core.ids import (
     KEYPOINT_BITS,
@@ -36,9 +36,6 @@ from kiteline_core.ids import (
     submap_id,
 )
 from kiteline_hw.sources.open import open_source
-
-F64 = NDArray[np.float64]
-U8 = NDArray[np.uint8]
 
 _AGENT_FIELDS, _SUBMAP_FIELDS, _KEYFRAME_FIELDS = ("agent",), ("submap",), ("keyframe", "since", "parent")
 _AFTER_NS = 1_000_000_000  # between the last keyframe of a round and the first one of the next

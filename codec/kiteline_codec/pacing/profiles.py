@@ -3,15 +3,12 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_codec.coding import quantise
 from kiteline_codec.pacing.sections import split, take
 from kiteline_codec.schema import CachedLandmarks, NewLandmarks, Observations
+from kiteline_core.arrays import F32, F64
 from kiteline_core.imaging.descriptors import narrowed
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,9 +5,8 @@ and practice of projective rectification").
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
-F64 = NDArray[np.float64]
+from kiteline_core.arrays import F64
 
 TERMS = 5
 

@@ -11,9 +11,9 @@ import math
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-F64 = NDArray[np.float64]
+from kiteline_core.arrays import F64
+
 _Number = TypeVar("_Number", float, F64)
 
 _SMALL_RAD = 1e-7  # below this angle the series is exact to double precision

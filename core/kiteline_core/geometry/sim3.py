@@ -5,11 +5,9 @@ similarity of scale 1, with results bit-identical to `se3`.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
-
-F64 = NDArray[np.float64]
 
 _ONE = 1e-9  # a scale closer to 1 is 1, given the accuracy of orthonormal rotations
 

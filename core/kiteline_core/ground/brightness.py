@@ -9,11 +9,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-U8 = NDArray[np.uint8]
+from kiteline_core.arrays import F32, F64, U8
 
 _EVERY = 4  # pixels of which one is compared
 _DARK, _BRIGHT = 15, 240  # greys between which an image is neither noise nor saturated

@@ -8,17 +8,13 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F32, F64, I16, U8, U16, Bool
 from kiteline_core.geometry.cameras import RawSide, RectifiedCamera, Rectifier, undistortion_maps
 from kiteline_core.ground.config import GroundConfig
 from kiteline_core.ground.disparity import DisparityCamera
 
-Bool = NDArray[np.bool_]
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-U8 = NDArray[np.uint8]
-Fixed = tuple[NDArray[np.int16], NDArray[np.uint16]]  # OpenCV's fastest maps
+Fixed = tuple[I16, U16]  # OpenCV's fastest maps
 
 _ROWS_SEEN = 1  # of a disparity image above and below a pixel: ground in the rest of a block is alike in both eyes
 _STEP_PX = 8  # of the full image: whole pixels of any disparity image

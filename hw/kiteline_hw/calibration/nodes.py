@@ -8,12 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64
 from kiteline_core.errors import INPUT_FAULTS
 from kiteline_hw.ports import SourceError
-
-F64 = NDArray[np.float64]
 
 _MOST_BYTES = 1 << 16  # calibration files are a few kB
 _MOST_NESTED = 16  # brackets in brackets: calibrations have two; a YAML reader takes time by the square of them

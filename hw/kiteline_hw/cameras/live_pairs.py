@@ -5,8 +5,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from statistics import median
 
+from kiteline_core.arrays import U8
 from kiteline_core.frame import EncodedImage
-from kiteline_hw.sensors.images import U8
 
 _SKEWS = 100  # pairs over which the skew is told
 _FIRST_SKEWS = 20  # pairs after which it is told first

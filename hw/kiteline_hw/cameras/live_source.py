@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from kiteline_core.arrays import U8
 from kiteline_core.frame import EncodedImage, Frame, ImuCalibration, Trajectory
 from kiteline_core.geometry.cameras import CameraRig
 from kiteline_hw.cameras.camera import Camera, CameraError, Capture
@@ -14,7 +15,6 @@ from kiteline_hw.cameras.camera_watch import CameraWatch
 from kiteline_hw.cameras.live_pairs import Eye, LivePairs, Pair
 from kiteline_hw.ports import SourceReport
 from kiteline_hw.sensors.frames import PAIR_TOLERANCE_NS
-from kiteline_hw.sensors.images import U8
 from kiteline_hw.sensors.raw_pixels import BadImage
 from kiteline_hw.sensors.sensor_bits import SensorBits
 from kiteline_hw.system.clock import MonotonicClock

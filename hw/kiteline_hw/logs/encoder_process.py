@@ -17,8 +17,9 @@ from concurrent.futures import Future
 
 import numpy as np
 
+from kiteline_core.arrays import U8
 from kiteline_core.frame import EncodedImage
-from kiteline_hw.sensors.images import U8, encode_image, store_image
+from kiteline_hw.sensors.images import encode_image, store_image
 
 _REQUEST, _ANSWER = struct.Struct("<III"), struct.Struct("<II")
 END_S = 2.0  # s in which the process ends once its input has

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from kiteline_core import odometry
+from kiteline_core.arrays import F64
 from kiteline_core.frame import OdometryBatch
 from kiteline_core.geometry import se3
-from kiteline_core.geometry.se3 import F64
 from kiteline_hw.mavlink.messages import (
     Attitude,
     Heartbeat,

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuBatch, OdometryBatch
 from kiteline_core.geometry.end_rates import end_rates
-from kiteline_core.geometry.se3 import F64
 from kiteline_hw.mavlink.codec import MavlinkCodec
 from kiteline_hw.mavlink.controller_imu import ControllerImu
 from kiteline_hw.mavlink.controller_odometry import ControllerOdometry

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
-from kiteline_core.geometry.se3 import F64
 
 # Rotates vectors from o to l: x stays, left becomes right, up becomes down.
 R_L_O: F64 = np.diag([1.0, -1.0, -1.0])

@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
-from kiteline_core.geometry.se3 import F64
 from kiteline_hw.mavlink.messages import Attitude, Heartbeat, LocalPosition, MessageInterval
 from kiteline_hw.ports import PoseSample
 

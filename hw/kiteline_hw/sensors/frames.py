@@ -8,6 +8,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from kiteline_core.arrays import I64
 from kiteline_core.frame import EncodedImage, Frame, ImuBatch
 from kiteline_core.geometry.cameras import CameraModel, CameraRig
 from kiteline_hw.ports import SourceError, SourceReport
@@ -36,7 +37,7 @@ class EncodedFrame:
     depth: ImageRef | None = None
 
 
-def pair_tolerance_ns(stamps_ns: NDArray[np.int64], most_ns: int = PAIR_TOLERANCE_NS) -> int:
+def pair_tolerance_ns(stamps_ns: I64, most_ns: int = PAIR_TOLERANCE_NS) -> int:
     """Largest time difference of a pair: half the frame period at most, so that an image never fits two frames."""
     if len(stamps_ns) < 2:
         return most_ns

@@ -9,8 +9,9 @@ from itertools import islice
 
 import numpy as np
 
+from kiteline_core.arrays import U8
 from kiteline_core.frame import EncodedImage
-from kiteline_hw.sensors.images import U8, ImageRef, decode_grey, decode_words, read_encoded
+from kiteline_hw.sensors.images import ImageRef, decode_grey, decode_words, read_encoded
 from kiteline_hw.sensors.raw_pixels import SENSOR_BITS, BadImage, RawPixels, grey_of_words
 
 _LOOKED_AT = 60  # images: two or three seconds, in which an automatic exposure settles

@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 
 from kiteline_core import odometry
+from kiteline_core.arrays import F64
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration, OdometryBatch, Trajectory
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraModel
-from kiteline_core.geometry.se3 import F64
 from kiteline_hw.calibration.told import ToldCalibration
 from kiteline_hw.ports import FrameSource, LiveSource, SourceError, is_live
 

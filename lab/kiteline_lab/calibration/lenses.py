@@ -2,11 +2,9 @@
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64
 from kiteline_core.geometry.cameras import Lens
-
-F64 = NDArray[np.float64]
 
 _NEWTON_STEPS = 12
 

@@ -8,13 +8,10 @@ from dataclasses import asdict, dataclass
 from enum import Enum
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64, I64
 from kiteline_core.frame import Trajectory
 from kiteline_core.geometry import se3
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 MAX_DIFFERENCE_NS = 10_000_000  # largest difference in time of two poses that are compared (as in evo and TUM's tools)
 MAX_BRIDGE_NS = 50_000_000  # ground truth at 20 Hz or more is interpolated; the error on a drone is below 1 mm

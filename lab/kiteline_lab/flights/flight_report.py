@@ -6,11 +6,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import tum
 
-F64 = NDArray[np.float64]
 Report = dict[str, Any]
 
 

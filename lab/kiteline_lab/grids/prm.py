@@ -10,15 +10,10 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64, I64, U8, Bool
 from kiteline_lab.grids.files import FREE, GridFile
 from kiteline_lab.grids.prm_kernels import roads_free, spaced_places
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-Bool = NDArray[np.bool_]
-U8 = NDArray[np.uint8]
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.mapper import Mapper
@@ -18,11 +17,10 @@ from kiteline_basestation.store.restore import restore
 from kiteline_basestation.store.store import read
 from kiteline_codec.channel import CodedChannel
 from kiteline_codec.sync.config import SyncConfig
+from kiteline_core.arrays import I64
 from kiteline_core.errors import KitelineError
 from kiteline_core.geometry import sim3
 from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, agent_of_keyframe
-
-I64 = NDArray[np.int64]
 
 FORMATS = ("tum", "ply", "pgm", "g2o")
 ESSENTIAL_LANDMARKS = 100  # shared by two keyframes of an edge of the essential graph (ORB-SLAM2)

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.imaging import row_alignment
 from kiteline_agent.inertial.calibration.known_imu import KnownImuConfig
@@ -21,13 +20,12 @@ from kiteline_agent.known_rig import KnownRigConfig, known_rig
 from kiteline_agent.runtime import rig_file
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.mapper import Mapper
+from kiteline_core.arrays import F64
 from kiteline_core.errors import KitelineError
 from kiteline_core.geometry import disparity_offset, se3
 from kiteline_core.geometry.cameras import CameraModel, CameraRig, RectifiedCamera
 from kiteline_core.ids import AgentId
 from kiteline_lab.tools.export import load
-
-F64 = NDArray[np.float64]
 
 FORMATS = ("kalibr", "euroc", "kiteline")
 _LIKELY = np.array([1.0, 1.0, 0.5, 1e-3, 1e-3, 1e-3])  # px, px, px, rad: what mounts and lenses change by

@@ -3,7 +3,6 @@
 import cv2
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from kiteline_agent.config import AgentConfig, AlignConfig
 from kiteline_agent.ekf.corner_flow import CornerFlow
@@ -16,6 +15,7 @@ from kiteline_agent.onboard import onboard_agent
 from kiteline_agent.runtime.controller import pose_sample
 from kiteline_agent.runtime.options import agent_config
 from kiteline_agent.step import Estimate, Identity, StepInput
+from kiteline_core.arrays import U8
 from kiteline_core.frame import UNMEASURED, Frame, OdometryBatch
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraModel, CameraRig, RectifiedCamera
@@ -131,7 +131,7 @@ def test_tracker_is_chosen_by_option() -> None:
     assert agent_config("", tracker="ekf").tracker == "ekf"
 
 
-def _flow() -> tuple[CornerFlow, NDArray[np.uint8]]:
+def _flow() -> tuple[CornerFlow, U8]:
     """Corners of an image of squares."""
     rng = np.random.default_rng(0)
     image = np.kron(rng.integers(0, 256, (60, 80)), np.ones((4, 4))).astype(np.uint8)

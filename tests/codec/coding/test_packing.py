@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from kiteline_codec.coding import packing_kernels
 from kiteline_codec.coding.packing import Reader, Writer, unzigzag, varint_bytes, zigzag
 from kiteline_codec.coding.scan_kernels import BANDS, FREE, FREE_FROM, MAX_CODE, OBSTACLE, code_scan
 from kiteline_codec.schema import WireError
 from kiteline_codec.sync import ranges
+from kiteline_core.arrays import I64
 
 
 @given(st.integers(0, (1 << 63) - 1), st.integers(-(1 << 62), 1 << 62))
@@ -158,7 +158,7 @@ def test_the_first_column_outside_its_limits(seed: int, n: int) -> None:
 MOST = 895
 
 
-def some_columns(seed: int, n: int, smooth: int) -> NDArray[np.int64]:
+def some_columns(seed: int, n: int, smooth: int) -> I64:
     """Rows (5,n): ranges that walk by up to `smooth`, none in places, and masks that hold for a while."""
     rng = np.random.default_rng(seed)
     walk = np.clip(np.cumsum(rng.integers(-smooth, smooth + 1, (4, n)), 1) + rng.integers(1, MOST, (4, 1)), 1, MOST)

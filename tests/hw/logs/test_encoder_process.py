@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import U8
 from kiteline_core.frame import Frame
 from kiteline_hw.logs import encoder_process
 from kiteline_hw.logs.encoder_process import EncoderProcess
@@ -17,7 +17,7 @@ from kiteline_hw.logs.mcap_log import LEFT, RIGHT, LogReader, LogWriter
 from kiteline_hw.sensors.images import decode_grey, encode_image
 
 
-def picture(seed: int, shape: tuple[int, int] = (48, 75)) -> NDArray[np.uint8]:
+def picture(seed: int, shape: tuple[int, int] = (48, 75)) -> U8:
     return np.random.default_rng(seed).integers(0, 256, shape, np.uint8)
 
 

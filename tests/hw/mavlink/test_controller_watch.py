@@ -7,8 +7,8 @@ from math import radians, sin
 import numpy as np
 import pytest
 
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
-from kiteline_core.geometry.se3 import F64
 from kiteline_hw.mavlink.codec import MavlinkCodec
 from kiteline_hw.mavlink.controller_session import ControllerSession
 from kiteline_hw.mavlink.coordinate_frames import R_L_O, mounting

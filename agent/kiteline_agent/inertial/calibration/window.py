@@ -3,12 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.inertial.calibration.window_kernels import integrate_window
 from kiteline_agent.inertial.preintegration import Samples
-
-F64 = NDArray[np.float64]
+from kiteline_core.arrays import F64
 
 
 @dataclass(frozen=True, slots=True)

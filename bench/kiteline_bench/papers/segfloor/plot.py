@@ -4,11 +4,9 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64
 from kiteline_hw.sim.truth.occupancy import TrueGrid
-
-F64 = NDArray[np.float64]
 
 
 def plot_updates(path: Path, costs: Mapping[str, tuple[F64, F64]], their_mb: float) -> None:

@@ -11,7 +11,6 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_bench.harness.bars import Bar, Bench, at_most, is_true, table
 from kiteline_bench.harness.placed import KeyframesInWorld
@@ -20,11 +19,10 @@ from kiteline_bench.harness.run import Part, Scenario, fly_with_base
 from kiteline_bench.papers.sequences import find_sequences
 from kiteline_bench.papers.several_maps.plot import Drawn, plot_experiments
 from kiteline_bench.papers.several_maps.street import street_recording
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
 from kiteline_hw.ports import SourceError
 from kiteline_lab.evaluation import metrics
-
-F64 = NDArray[np.float64]
 
 TITLE = "Several maps of one path, and the thesis"
 

@@ -7,12 +7,12 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_bench.vehicle.sitl.arducopter import STEP_S, ArduCopter
 from kiteline_bench.vehicle.sitl.copter import Copter
 from kiteline_bench.vehicle.sitl.ground_station import GroundStation
 from kiteline_bench.vehicle.sitl.onboard import Onboard, Setting, SimulatedClock
+from kiteline_core.arrays import F64
 from kiteline_core.frame import Frame
 from kiteline_core.geometry import se3
 from kiteline_hw.mavlink.coordinate_frames import mounting
@@ -21,8 +21,6 @@ from kiteline_hw.sim.sensors.camera import Shutter
 from kiteline_hw.sim.source import SimSource
 from kiteline_hw.sim.world.scenes import build_indoor
 from kiteline_hw.system.closing import Closing
-
-F64 = NDArray[np.float64]
 
 AXES = "urf"  # of the simulated rig's body
 _START_NS = 1_000_000_000_000  # clock at simulated time zero

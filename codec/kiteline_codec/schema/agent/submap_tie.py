@@ -2,12 +2,10 @@
 
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
 from kiteline_codec.coding.packing import Writer
 from kiteline_codec.schema.poses import read_deviation, read_pose, write_deviation, write_pose
 from kiteline_codec.schema.record import MAX_KEYFRAME_ID, Field, IdOf, Priority, Record, register
+from kiteline_core.arrays import F64
 from kiteline_core.ids import KeyframeId, SubmapId
 
 
@@ -33,6 +31,6 @@ class SubmapTie(Record):
 
     submap: SubmapId
     since: KeyframeId
-    T_k_f: NDArray[np.float64]
+    T_k_f: F64
     sigma_m: float
     sigma_rad: float

@@ -12,8 +12,8 @@ from math import cos, sin
 
 import numpy as np
 
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
-from kiteline_core.geometry.se3 import F64
 from kiteline_hw.mavlink.controller_odometry import StampClock
 from kiteline_hw.mavlink.coordinate_frames import R_L_O, mounting
 from kiteline_hw.mavlink.messages import Attitude

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from kiteline_core.geometry.se3 import F64
+from kiteline_core.arrays import F64
 from kiteline_hw.mavlink.messages import Attitude, Heartbeat, MavlinkMessage, MessageInterval, TimeSync
 from kiteline_hw.mavlink.watch import messages as wire
 from kiteline_hw.mavlink.watch.attitude import TOPIC as AXES

@@ -5,13 +5,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64, U8, Bool
 from kiteline_hw.sim.world.world import World
-
-F64 = NDArray[np.float64]
-U8 = NDArray[np.uint8]
-Bool = NDArray[np.bool_]
 
 OCCUPIED, FREE, UNKNOWN = 0, 254, 205  # grey values of map_server images
 MARGIN_M = 0.3  # m of unknown cells around the walls

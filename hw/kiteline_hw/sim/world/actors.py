@@ -3,13 +3,12 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64
 from kiteline_hw.sim.world.path import Path
 from kiteline_hw.sim.world.textures import TEXEL_M, TexturePool
 from kiteline_hw.sim.world.world import World
 
-F64 = NDArray[np.float64]
 Rng = np.random.Generator
 
 PASS_S = 4.0  # s before and after a person crosses the view

@@ -8,13 +8,11 @@ import warnings
 from pathlib import Path as FilePath
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
 from kiteline_hw.ports import SourceError
 from kiteline_hw.sim.world.path import BASIS, ORDER, Path
-
-F64 = NDArray[np.float64]
 
 # Rotates KITTI's world (x right, y down, z forward) to a world with z up.
 _R_UP = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])

@@ -2,13 +2,10 @@
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F32, F64
 from kiteline_hw.sim.world.textures import make_pool
 from kiteline_hw.sim.world.world import Builder, World, bilinear
-
-F64 = NDArray[np.float64]
-F32 = NDArray[np.float32]
 
 CAMERA_HEIGHT_M = 1.65  # m of the path above the road
 CLEARANCE_M = 0.6
