@@ -22,7 +22,7 @@ from kiteline_core.arrays import F64, I64, U8, Bool
 from kiteline_core.geometry.cameras import RectifiedCamera
 
 _VIEW_M = 0.15  # m between two camera poses in the state: nearer ones add no parallax indoors
-_LEAST_RAYS = 4  # sightings from which a landmark is positioned
+_LEAST_RAYS = 4  # observations from which a landmark is positioned
 _RAY_PX = 10.0  # px from the point that two views give beyond which a third one's ray is a wrong match
 _PARALLAX_RAD = 0.05  # rad: three degrees between a landmark's first and last ray, at least
 _DEPTH_SHARE = (
@@ -108,9 +108,9 @@ class EkfSlam:
     # steps
 
     def _update_landmarks(self, slots: I64, xy: F64, coarse: F64) -> tuple[Bool, Bool]:
-        """Update by the sightings of landmarks; masks (n,) of the compatible and of the rejected ones.
+        """Update by the observations of landmarks; masks (n,) of the compatible and of the rejected ones.
 
-        coarse: (n,) factors of their deviations. Divided by them, all sightings have the same.
+        coarse: (n,) factors of their deviations. Divided by them, all observations have the same.
         """
         good, bad = np.zeros(len(slots), np.bool_), np.zeros(len(slots), np.bool_)
         at = np.flatnonzero(slots >= 0)
@@ -189,8 +189,8 @@ class EkfSlam:
         out = []
         for k in order[enough[order]][:_ENTRIES].tolist():
             views = np.flatnonzero(seen[k, :-1])
-            sightings = points[k, np.append(views, config.views)]
-            out.append((int(known[k]), Track(views, sightings, self._sigma * float(coarse[known[k]]))))
+            observations = points[k, np.append(views, config.views)]
+            out.append((int(known[k]), Track(views, observations, self._sigma * float(coarse[known[k]]))))
         return out
 
     def _may_enter(self, track: Track) -> bool:

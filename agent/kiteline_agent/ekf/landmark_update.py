@@ -23,7 +23,7 @@ class Innovation:
 
 
 def innovation(state: FilterState, slots: I64, xy: F64) -> tuple[Innovation, Bool]:
-    """Residuals of sightings (n,2) of landmarks (n,), and which of them lie before the camera (n,)."""
+    """Residuals of observations (n,2) of landmarks (n,), and which of them lie before the camera (n,)."""
     R = state.T_o_c[:3, :3]
     local = (state.points[slots] - state.T_o_c[:3, 3]) @ R
     ahead = local[:, 2] > 1e-2
@@ -36,7 +36,7 @@ def innovation(state: FilterState, slots: I64, xy: F64) -> tuple[Innovation, Boo
 
 
 def divided(found: Innovation, factor: F64) -> Innovation:
-    """The same sightings in units (m,) of their own."""
+    """The same observations in units (m,) of their own."""
     return Innovation(found.slots, found.residual / factor[:, None], found.M / factor[:, None, None])
 
 
@@ -71,7 +71,7 @@ def compatible(state: FilterState, found: Innovation, sigma: float, config: EkfC
 
 
 def update(state: FilterState, found: Innovation, sigma: float) -> None:
-    """Update the state by sightings."""
+    """Update the state by observations."""
     m = len(found.slots)
     if m == 0:
         return

@@ -77,8 +77,8 @@ def project(xy: F64, T_o_c: F64, point: F64) -> tuple[F64, F64, F64]:
 
 @dataclass(frozen=True, slots=True)
 class Track:
-    """Sightings of one track. views: (v,) past views. xy: (v,2) x/z, y/z in them, or (v+1,2) with the camera of now at
-    the end. sigma: deviation of these.
+    """Observations of one track. views: (v,) past views. xy: (v,2) x/z, y/z in them, or (v+1,2) with the camera of now
+    at the end. sigma: deviation of these.
     """
 
     views: I64
@@ -88,7 +88,7 @@ class Track:
 
 @dataclass(frozen=True, slots=True)
 class Rays:
-    """A track's rays, linearised and split by the point where they meet, in deviations of a sighting.
+    """A track's rays, linearised and split by the point where they meet, in deviations of an observation.
 
     0 = by_point error of the point + by_state error of the state + white noise, and told = H error of the state + white
     noise, where the point is eliminated. point: (3,). columns: (k,) of the state. by_point: (3,3). by_state: (3,k). H:

@@ -6,7 +6,7 @@ from kiteline_core.arrays import F64, I64, Bool
 
 
 class RayTracks:
-    """Sightings of each track by each past view."""
+    """Observations of each track by each past view."""
 
     def __init__(self, views: int) -> None:
         self._views = views

@@ -103,7 +103,7 @@ class GridUpdates:
             drawn += self._draw(self.grid, keyframe)
 
     def _is_scanless(self, agent: AgentId) -> bool:
-        """True if an agent's landmarks are to be drawn: it has one eye, or would have sent a scan by now."""
+        """True if an agent's landmarks are to be drawn: it has one camera, or would have sent a scan by now."""
         camera = self._map.cameras.get(agent)
         own = (len(keyframes) for submap, keyframes in self._map.submaps.items() if agent_of_submap(submap) == agent)
         return camera is None or not camera.stereo or sum(own) > self._config.scanless_keyframes

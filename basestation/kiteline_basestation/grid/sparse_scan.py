@@ -1,4 +1,4 @@
-"""A column scan from sparse landmarks, where an agent sends none: with one eye, or with the grid turned off.
+"""A column scan from sparse landmarks, where an agent sends none: with one camera, or with the grid turned off.
 
 Method: "Segfloor", section 5.6, points above the ground and rays to points of the ground, with the heights of the rays:
 a ray over a box clears neither the box nor the floor below.

@@ -43,7 +43,7 @@ class Outcome:
 
 
 def compare(setting: Setting) -> Outcome:
-    """Both, on the same sightings."""
+    """Both, on the same observations."""
     rng, cam = np.random.default_rng(0), vehicle.camera()
     model = vehicle.VehicleModel(setting.planar)
     poses, sigma = vehicle.loop(setting.planar), model.sigma_px / cam.fx
@@ -85,7 +85,7 @@ def _way(setting: Setting, model: vehicle.VehicleModel, poses: F64, rng: np.rand
 
 
 def _landmark(setting: Setting, T_o_c: F64, sigma: float, rng: np.random.Generator) -> tuple[F64, F64]:
-    """A point (3,) that all poses see under enough parallax, and its noisy sightings (n,2)."""
+    """A point (3,) that all poses see under enough parallax, and its noisy observations (n,2)."""
     cam = vehicle.camera()
     half = np.array([cam.cx / cam.fx, cam.cy / cam.fy])
     while True:

@@ -119,7 +119,7 @@ def run(bench: Bench) -> list[Bar]:
 
 
 def judged(sequence: DataSequence, flown: FlownProcesses) -> SequenceResult:
-    """Compare the refined path with the truth; one eye without IMU is aligned with scale."""
+    """Compare the refined path with the truth; one camera without IMU is aligned with scale."""
     source = open_source(sequence.source)
     truth, monocular = source.ground_truth, source.rig.right is None and not source.rig.has_depth
     has_imu = source.imu is not None

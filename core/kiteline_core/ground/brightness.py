@@ -1,4 +1,4 @@
-"""Brightness of a stereo pair: eyes differ in gain, and lenses darken to the corners, so a point has two greys.
+"""Brightness of a stereo pair: cameras differ in gain, and lenses darken to the corners, so a point has two greys.
 
 Semi-global matching compares greys. On plain ground it moves a disparity until the greys agree, and where lenses
 darken that is somewhere else: a low camera's floor got points up to 3 m below it. Both numbers are learned from pairs
@@ -18,14 +18,14 @@ _UNSATURATED, _TOP = 0.995, 250.0  # share of pixels that stay below this grey: 
 _LEAST = 200  # pixels that tell
 _ROUNDS = 4  # of reweighting
 _LEAST_SIGMA = 0.01  # of a grey's logarithm: noise of images
-_KEPT = 0.8  # of what is known, when another pair is added: exposures of eyes drift apart
+_KEPT = 0.8  # of what is known, when another pair is added: exposures of cameras drift apart
 _STIFFNESS = 1e-5  # for each pixel: what holds the power at 0 where disparities are too small to tell it
 _MOST_POWER, _MOST_GAIN = 6.0, 0.7  # cos^4 is that of a simple lens; the logarithm of 2
 
 
 @dataclass(frozen=True, slots=True)
 class Brightness:
-    """Differences in brightness of a pair's eyes.
+    """Differences in brightness of a pair's cameras.
 
     gain: natural logarithm of left over right. power: of the cosine of the angle to the optical axis, by which both
     images darken. sums: a00, a01, a11, b0, b1 of the normal equations of gain and power.

@@ -121,7 +121,7 @@ class DisparityStripes:
         return disparity
 
     def learn_brightness(self, disparity: F32) -> None:
-        """Learn how bright the eyes are from the last pair and its disparities (h,w), with 0 for what is masked."""
+        """Learn how bright the cameras are from the last pair and its disparities (h,w), with 0 for what is masked."""
         assert self._taken is not None
         self.brightness = self.brightness.learned(self._taken, disparity, self._falloff)
 

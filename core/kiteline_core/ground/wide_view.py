@@ -16,7 +16,7 @@ from kiteline_core.ground.disparity import DisparityCamera
 
 Fixed = tuple[I16, U16]  # OpenCV's fastest maps
 
-_ROWS_SEEN = 1  # of a disparity image above and below a pixel: ground in the rest of a block is alike in both eyes
+_ROWS_SEEN = 1  # of a disparity image above and below a pixel: ground in the rest of a block is alike in both images
 _STEP_PX = 8  # of the full image: whole pixels of any disparity image
 
 
@@ -30,7 +30,7 @@ class WideView:
         self._rectifier = rectifier
         self._reach = config.block_px // 2 + 1  # px of a matched block beyond its middle, and of what was interpolated
         self.camera, self._corner = rectifier.camera, np.zeros(2)
-        self._maps: list[Fixed] = []  # of both eyes' half-size images; empty: those of the rectified images
+        self._maps: list[Fixed] = []  # of both cameras' half-size images; empty: those of the rectified images
         self._left_seen: Bool | None = None  # (h,w) of a disparity image: there is a raw pixel
         self._right_seen = np.zeros((0, 1), np.bool_)  # (h,1+w) the same, and a first column beyond the view
         self._rows = rectifier.right_rows  # those of the right image in its map

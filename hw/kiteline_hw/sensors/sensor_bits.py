@@ -21,7 +21,7 @@ _MOST_BITS = 16
 class SensorBits:
     """Decodes grey images, and scales those of 16 bits by the fewest bits that hold the brightest pixel so far.
 
-    After 60 such images the bits stay; both eyes of a pair share them.
+    After 60 such images the bits stay; both cameras of a pair share them.
     """
 
     def __init__(self, bits: int | None = None) -> None:

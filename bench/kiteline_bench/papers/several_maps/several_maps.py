@@ -190,7 +190,7 @@ def indoors(bench: Bench) -> list[Experiment]:
 
 
 def real(bench: Bench) -> list[Experiment]:
-    """Recordings of real cameras: a street in stereo, and a flight with one eye and IMU."""
+    """Recordings of real cameras: a street in stereo, and a flight with one camera and IMU."""
     street, flight = bench.source("kitti_straight"), bench.source("euroc_mh01_air")
     return [
         Experiment("kitti_straight, two robots", SEQUENCE_03, robots(f"kitti:{street}", 10.0, overlapping(51, 2)), 1),
