@@ -19,6 +19,8 @@ from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 
+_BY_DEFINITION = 1e-4  # m and rad: deviation of a pose that defines its map
+
 
 @dataclass(frozen=True, slots=True)
 class VisualPoints:
@@ -221,7 +223,7 @@ class FixedLagSmoother:
         self._imu_bias[: self._n, 3:] += change
         self._prior_s[9:] += change
 
-    def begin_map(self, T_m_b: F64, position_sigma_m: float = 1e-4, turn_sigma_rad: float = 1e-4) -> None:
+    def begin_map(self, T_m_b: F64) -> None:
         """Begin a new map, in which the newest body pose is T_m_b (4,4) by definition.
 
         Velocity, biases and gravity are kept; the uncertainty of the old attitude is added to theirs.
@@ -235,7 +237,7 @@ class FixedLagSmoother:
         carry[:3, :3] = se3.skew(old.velocity) @ r
         carry[9:, :3] = np.linalg.pinv(self._gravity * jac) @ se3.skew(gravity) @ r
         cov = np.zeros((17, 17))
-        cov[:3, :3], cov[3:6, 3:6] = turn_sigma_rad**2 * np.eye(3), position_sigma_m**2 * np.eye(3)
+        cov[:6, :6] = _BY_DEFINITION**2 * np.eye(6)
         cov[6:, 6:] = carry @ old.cov @ carry.T
         T_new_old = T_m_b @ se3.inverse(old.T_m_b)
         self.start(old.T_m_b, old.velocity, old.bias, gravity, StartDeviations())

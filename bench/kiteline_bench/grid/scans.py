@@ -77,9 +77,9 @@ class Scanner:
         ]
 
 
-def scans_of(recording: Recording, every: int, damage: Callable[[F32], F32] | None = None) -> list[PosedScan]:
+def scans_of(recording: Recording, every: int) -> list[PosedScan]:
     """Scans of every n-th frame of a recording that has a right image and a true pose."""
-    scanner = Scanner(recording.rig, damage)
+    scanner = Scanner(recording.rig)
     for item in recording.items[::every]:
         if item.frame.right is not None and item.T_w_b is not None:
             scanner.scan(item.frame, item.T_w_b)

@@ -91,9 +91,9 @@ def mask_of(number: int) -> U8:
     return np.random.default_rng([number, 9]).integers(0, 256, 32, np.uint8)
 
 
-def record_flight(source: str, most: int, *, imu: bool = True) -> RecordedFlight:
+def record_flight(source: str, most: int) -> RecordedFlight:
     """Fly a recording over a perfect link without a base, until it has `most` keyframes or ends. Raises SourceError."""
-    opened = open_source(source, imu=imu)
+    opened = open_source(source)
     number = AgentId(0)
     ours, theirs = coded_channel(1, 0, "wifi"), coded_channel(1, 0, "wifi", peer=number)
     ours.noting = True

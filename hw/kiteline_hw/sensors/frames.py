@@ -37,11 +37,11 @@ class EncodedFrame:
     depth: ImageRef | None = None
 
 
-def pair_tolerance_ns(stamps_ns: I64, most_ns: int = PAIR_TOLERANCE_NS) -> int:
+def pair_tolerance_ns(stamps_ns: I64) -> int:
     """Largest time difference of a pair: half the frame period at most, so that an image never fits two frames."""
     if len(stamps_ns) < 2:
-        return most_ns
-    return min(most_ns, int(np.median(np.diff(stamps_ns))) // 2)
+        return PAIR_TOLERANCE_NS
+    return min(PAIR_TOLERANCE_NS, int(np.median(np.diff(stamps_ns))) // 2)
 
 
 class SkewNote:

@@ -197,13 +197,13 @@ def relative_errors(matched: Matched, i: I64, j: I64) -> tuple[F64, F64]:
     return np.asarray(np.linalg.norm(error[:, :3, 3], axis=1)), _angles(error[:, :3, :3])
 
 
-def kitti_drift(matched: Matched, lengths_m: tuple[float, ...] = KITTI_LENGTHS_M) -> KittiDrift | None:
-    """Drift over segments of the given lengths; None if the path is shorter than the shortest of them."""
+def kitti_drift(matched: Matched) -> KittiDrift | None:
+    """Drift over segments of KITTI's lengths; None if the path is shorter than the shortest of them."""
     path = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(matched.truth[:, :3, 3], axis=0), axis=1))])
     step_ns = float(np.median(np.diff(matched.t_ns)))
     stride = max(1, round(KITTI_STEP_S * 1e9 / step_ns))
     translation, rotation = [], []
-    for length in lengths_m:
+    for length in KITTI_LENGTHS_M:
         start = np.arange(0, len(path), stride)
         end = np.searchsorted(path, path[start] + length, side="right")
         start, end = start[end < len(path)], end[end < len(path)]

@@ -89,12 +89,10 @@ def score(
     )  # fmt: skip
 
 
-def draw_roads(
-    mine: GridFile, other: GridFile, T_other_mine: F64, config: GridEvalConfig, draw: int = 0, stream: int = 0
-) -> Roads:
-    """One of the road maps that `score` draws: on the estimate (stream 0) or on the truth (1)."""
+def draw_roads(mine: GridFile, other: GridFile, T_other_mine: F64, config: GridEvalConfig, stream: int = 0) -> Roads:
+    """The first of the road maps that `score` draws: on the estimate (stream 0) or on the truth (1)."""
     A = np.asarray(np.linalg.inv(other.T_map_cell) @ T_other_mine @ mine.T_map_cell)
-    nodes, pairs, kept = _roads(free_cells(mine, config), free_cells(other, config), A, config, draw, stream)
+    nodes, pairs, kept = _roads(free_cells(mine, config), free_cells(other, config), A, config, 0, stream)
     return Roads(mine.points(nodes), pairs, kept)
 
 

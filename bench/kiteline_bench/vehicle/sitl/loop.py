@@ -1,7 +1,7 @@
 """The closed loop: physics, autopilot, rendered images, agent and pilot, step by step in simulated time."""
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -27,6 +27,7 @@ _START_NS = 1_000_000_000_000  # clock at simulated time zero
 _LEGS_M = 0.15  # of the controller above the ground
 _PACE = 1.0  # simulated over wall time, at most: threads of the connection need their turn
 _POLL_STEPS = 8  # between two looks at the ground station
+_SEED = 1  # of world, rig and wind
 _SCALE = 0.5  # of a 752x480 image: a quarter of the rendering
 _GAIN = 185.0  # grey values per unit of radiance
 _R_W_N = np.diag([1.0, -1.0, -1.0])  # from NED to the world, whose z is up
@@ -48,20 +49,17 @@ class Truth:
 
 
 class Loop(Closing):
-    """Everything that flies. program: a built ArduCopter. seed: of world, rig and wind."""
+    """Everything that flies. program: a built ArduCopter."""
 
-    def __init__(
-        self, program: Path, folder: Path, *, seed: int = 1, tunnel: bool = False,
-        changes: Mapping[str, float] | None = None,
-    ) -> None:  # fmt: skip
+    def __init__(self, program: Path, folder: Path, *, tunnel: bool = False) -> None:
         self._files = ExitStack()
-        self.copter = Copter(seed)
-        self.autopilot = self._files.enter_context(ArduCopter(program, folder / "autopilot", self.copter, changes))
+        self.copter = Copter(_SEED)
+        self.autopilot = self._files.enter_context(ArduCopter(program, folder / "autopilot", self.copter))
         self.pilot = self._files.enter_context(GroundStation(self.autopilot.serial[0]))
         self.clock = SimulatedClock(_START_NS)
         self.truth = Truth()
         source = SimSource(
-            SimConfig("room", seed, seconds=1.0, scale=_SCALE), world=build_indoor("room", _volume(), seed, 10)
+            SimConfig("room", _SEED, seconds=1.0, scale=_SCALE), world=build_indoor("room", _volume(), _SEED, 10)
         )
         self._cameras, self._noise = source.cameras(), (source.config.read_noise, source.config.shot_noise)
         self._shutter, self._frame_ns = Shutter(source.config.exposure_s), source.config.frame_ns

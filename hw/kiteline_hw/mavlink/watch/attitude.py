@@ -79,8 +79,8 @@ def attitude_rotation(angles_rad: tuple[float, float, float]) -> F64:
 class AttitudeWatch:
     """Poses and ATTITUDE messages in, findings out. R_b_f: (3,3) of the controller's axes (FRD) in the body, in use."""
 
-    def __init__(self, R_b_f: F64, log: FindingLog, config: AttitudeWatchConfig | None = None) -> None:
-        self.config = config or AttitudeWatchConfig()
+    def __init__(self, R_b_f: F64, log: FindingLog) -> None:
+        self.config = AttitudeWatchConfig()
         self._log = log
         self._in_use = int(np.argmax([np.trace(r @ R_b_f) for r in _R_F_B]))
         self._clock = StampClock()

@@ -43,8 +43,8 @@ class ControllerWatch:
     T_b_f: (4,4) flight controller in the body. url: of the connection, for messages. baud: of its serial port, else 0.
     """
 
-    def __init__(self, T_b_f: F64, url: str = "", baud: int = 0, config: ControllerWatchConfig | None = None) -> None:
-        self.config = config or ControllerWatchConfig()
+    def __init__(self, T_b_f: F64, url: str = "", baud: int = 0) -> None:
+        self.config = ControllerWatchConfig()
         self._log = FindingLog()
         self.presence = PresenceWatch(url, self._log)
         self.estimator = EstimatorWatch(self._log)

@@ -34,8 +34,8 @@ class EstimatorConfig:
 class EstimatorWatch:
     """Poses and reports of the estimator in, findings out."""
 
-    def __init__(self, log: FindingLog, config: EstimatorConfig | None = None) -> None:
-        self.config = config or EstimatorConfig()
+    def __init__(self, log: FindingLog) -> None:
+        self.config = EstimatorConfig()
         self._log = log
         self._first_pose_ns: int | None = None
         self._last_pose_ns: int | None = None

@@ -48,8 +48,8 @@ def autopilot_name(kind: int) -> str:
 class PresenceWatch:
     """Heartbeats and the connection's state in, findings out. url: of the connection, for messages."""
 
-    def __init__(self, url: str, log: FindingLog, config: PresenceConfig | None = None) -> None:
-        self.config = config or PresenceConfig()
+    def __init__(self, url: str, log: FindingLog) -> None:
+        self.config = PresenceConfig()
         self._url, self._log = url, log
         self._start_ns: int | None = None
         self.heartbeat: Heartbeat | None = None  # the last one of the controller

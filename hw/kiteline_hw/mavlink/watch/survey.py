@@ -62,8 +62,8 @@ class SurveyConfig:
 class ControllerSurvey:
     """Messages and times in, messages to send out, and at the end findings. url: for messages."""
 
-    def __init__(self, url: str, config: SurveyConfig | None = None) -> None:
-        self.config = config or SurveyConfig()
+    def __init__(self, url: str) -> None:
+        self.config = SurveyConfig()
         self._log = FindingLog()
         self.presence = PresenceWatch(url, self._log)
         self._presence_findings: list[Finding] = []
