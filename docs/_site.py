@@ -1,7 +1,5 @@
 """Hooks of `make docs`: pages that lie outside of docs/ or are made from the code, and links to them."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import posixpath

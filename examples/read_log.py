@@ -3,8 +3,6 @@
 python examples/read_log.py out/agent0/log.mcap
 """
 
-from __future__ import annotations
-
 import sys
 
 import numpy as np

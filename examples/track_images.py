@@ -5,8 +5,6 @@
 FOLDER/left and FOLDER/right hold the images of a rectified stereo camera, named in order of time.
 """
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

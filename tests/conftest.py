@@ -1,7 +1,5 @@
 """What all tests share: one thread, a reproducible hypothesis in CI, and where the recordings lie."""
 
-from __future__ import annotations
-
 import gc
 import os
 import sys

@@ -1,7 +1,5 @@
 """Counts what an object holds, to find containers that grow with time."""
 
-from __future__ import annotations
-
 from collections import Counter, deque
 
 from kiteline_codec.schema import Key

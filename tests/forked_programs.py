@@ -4,8 +4,6 @@ Loading modules and kernels takes an agent or a base 2 s of CPU, a flight of the
 follows the loading is the same as in a process of its own: arguments, environment, pipes, signals, exit status.
 """
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import gc

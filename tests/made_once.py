@@ -1,7 +1,5 @@
 """What is costly to make is made once for all processes of a run of the tests."""
 
-from __future__ import annotations
-
 import fcntl
 import os
 import pickle

@@ -1,7 +1,5 @@
 """How slow this machine is at the moment, so that a bound on CPU time is about the code, not about the machine."""
 
-from __future__ import annotations
-
 import time
 
 _LOOPS = 200_000

@@ -3,12 +3,9 @@
 Agent._process is the algorithm of one frame; its numbered steps are those of ARCHITECTURE.md.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.exchange.corrections import Corrections
@@ -42,12 +39,11 @@ from kiteline_agent.tracking.track import Track
 from kiteline_agent.tracking.tracker import Tracker
 from kiteline_codec.channel import RecordChannel
 from kiteline_codec.schema import CameraIntrinsics, GridTile, Record
+from kiteline_core.arrays import F64
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration, joined
 from kiteline_core.geometry.cameras import CameraRig, Rectifier
 from kiteline_core.ids import SubmapId
 from kiteline_core.places.place_index import Vocabulary
-
-F64 = NDArray[np.float64]
 
 # Forward, right, down of a vehicle that flies where its camera looks.
 _T_C_F = np.array([[0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])

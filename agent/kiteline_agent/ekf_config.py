@@ -1,7 +1,5 @@
 """Configuration of the Kalman filter."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 

@@ -1,7 +1,5 @@
 """An agent for use as a library: it runs without a base, a log or a flight controller."""
 
-from __future__ import annotations
-
 from kiteline_agent.agent import Agent
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.exchange.no_base import NoBaseChannel

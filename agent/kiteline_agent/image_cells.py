@@ -1,7 +1,5 @@
 """Sizes of image cells, which spread corners and landmarks over the image, for images that are small."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Options of the start of a monocular map in metres, from corners and IMU."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 

@@ -1,18 +1,14 @@
 """What earlier flights found of a rig, as options of the agent: the next flight begins with it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.imaging.row_alignment import TERMS as ROW_TERMS
 from kiteline_agent.inertial.calibration.known_imu import KnownImuConfig
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import disparity_offset
 from kiteline_core.geometry.cameras import RectifiedCamera
-
-F64 = NDArray[np.float64]
 
 _CAMERA_NUMBERS = 7
 _SAME = 1e-6  # relative; machines round differently
@@ -51,8 +47,8 @@ class KnownRigConfig:
         return self.is_of(camera) and bool(self.T_b_c) and np.allclose(self.T_b_c, camera.T_b_c.ravel(), atol=_SAME)
 
     def updated(
-        self, camera: RectifiedCamera, right: KnownRigConfig | None, imu: KnownImuConfig | None
-    ) -> KnownRigConfig | None:
+        self, camera: RectifiedCamera, right: "KnownRigConfig | None", imu: KnownImuConfig | None
+    ) -> "KnownRigConfig | None":
         """This, with what a flight found of the right camera and the IMU; None if that is nothing."""
         if right is None and imu is None:
             return None

@@ -1,7 +1,5 @@
 """Builds the onboard half that a configuration asks for."""
 
-from __future__ import annotations
-
 from kiteline_agent.agent import Agent
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.ekf.ekf_agent import EkfAgent

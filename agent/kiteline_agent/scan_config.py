@@ -1,7 +1,5 @@
 """Configuration of scans and of the local grid."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 

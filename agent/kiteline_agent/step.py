@@ -1,16 +1,12 @@
 """What enters one step of the agent and what leaves it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64
 from kiteline_core.frame import Frame, ImuBatch, OdometryBatch
 from kiteline_core.ids import AgentId, KeyframeId, SubmapId
-
-F64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

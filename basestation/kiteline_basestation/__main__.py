@@ -1,7 +1,5 @@
 """The base station as a process: `kiteline base`, or a child of `kiteline fly` (--spec)."""
 
-from __future__ import annotations
-
 import secrets
 import time
 from collections.abc import Sequence

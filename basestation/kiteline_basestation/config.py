@@ -1,7 +1,5 @@
 """Configuration of the base station: one frozen section per stage."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 from kiteline_core.ground.config import GroundConfig as ScanConfig

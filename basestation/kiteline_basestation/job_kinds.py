@@ -1,7 +1,5 @@
 """All kinds of jobs; a new kind is a file with its inputs and its `JobKind`, and its name in `KINDS`."""
 
-from __future__ import annotations
-
 from kiteline_basestation.grid.scan_job import SCAN
 from kiteline_basestation.jobs import Job, JobDone
 from kiteline_basestation.merging.graph_job import POSE_GRAPH

@@ -1,7 +1,5 @@
 """Jobs: long work done outside the state machine, by a worker process or in modelled time."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any

@@ -4,15 +4,12 @@ A command is an input of the mapper's step, logged and replayed with it; see doc
 named AGENT.BOOT.NUMBER; a map by any of its submaps, or by a name that a user gave it.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.intake.intake import Intake
 from kiteline_basestation.map.matrices import numbers_of, similarity_from
@@ -20,16 +17,10 @@ from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.merging.map_merger import MapMerger
 from kiteline_basestation.merging.merges import NOTHING, MergeResult
 from kiteline_codec.coding.quantise import MAX_SCALE, MIN_SCALE
+from kiteline_core.arrays import F64
 from kiteline_core.errors import INPUT_FAULTS
 from kiteline_core.geometry import sim3
-from kiteline_core.ids import (
-    BOOT_BITS,
-    SUBMAP_BITS,
-    SubmapId,
-    agent_of_submap,
-    submap_id,
-    submap_of_keyframe,
-)
+from kiteline_core.ids import BOOT_BITS, SUBMAP_BITS, SubmapId, agent_of_submap, submap_id, submap_of_keyframe
 
 _NAME_CHARS = 64
 _TEXT_CHARS = 1 << 14  # of a command
@@ -71,7 +62,7 @@ class MapManager:
     """Answers commands. names, placements: those of the mapper. delete: drops submaps from all of the mapper."""
 
     def __init__(
-        self, sparse_map: SparseMap, names: dict[SubmapId, str], placements: Mapping[SubmapId, NDArray[np.float64]],
+        self, sparse_map: SparseMap, names: dict[SubmapId, str], placements: Mapping[SubmapId, F64],
         intake: Intake, merger: MapMerger | None, delete: Callable[[Collection[SubmapId]], None],
     ) -> None:  # fmt: skip
         self._map = sparse_map

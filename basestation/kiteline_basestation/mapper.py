@@ -3,8 +3,6 @@
 Method: "DS-PTAM: a distributed stereo PTAM", the mapper of chapter 3, with the culling of ORB-SLAM2.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections import Counter, deque
@@ -12,7 +10,6 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.exchange.publisher import Published, Publisher
@@ -36,11 +33,10 @@ from kiteline_basestation.refinement import culling, landmark_matching, triangul
 from kiteline_basestation.refinement.bundle_job import FULL_BUNDLE, LOCAL_BUNDLE
 from kiteline_basestation.refinement.local_bundles import LocalBundles
 from kiteline_codec.schema import DisparityCalibration, Key, LivePose, Record, SubmapPlacement
+from kiteline_core.arrays import F64, I32, U8
 from kiteline_core.geometry import sim3
 from kiteline_core.ids import AgentId, KeyframeId, SubmapId, agent_of_keyframe, agent_of_submap, submap_of_keyframe
 from kiteline_core.places.place_index import Vocabulary
-
-F64 = NDArray[np.float64]
 
 _TIMED_UPDATES = 10_000  # newest updates of the grid whose CPU times are kept
 
@@ -185,7 +181,7 @@ class Mapper:
         """The grid with all keyframes drawn where they are now; the mapper goes on with its own."""
         return self.grid_updates.settled()
 
-    def labels(self, landmarks: NDArray[np.int32]) -> NDArray[np.uint8]:
+    def labels(self, landmarks: I32) -> U8:
         """Labels (n,) of landmarks: 0 unlabelled, 1 ground, 2 obstacle."""
         return self.grid_updates.labels(landmarks)
 

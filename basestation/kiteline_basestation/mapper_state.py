@@ -3,23 +3,19 @@
 Keyframes, submaps and landmarks are named by their ids, because slots are numbered anew in each process.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.grid.image_scans import MadeScan
 from kiteline_basestation.intake.intake import IntakeState
 from kiteline_basestation.intake.placements import PlacementState
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.merging.map_merger import MergerState
+from kiteline_core.arrays import F64
 from kiteline_core.geometry.disparity_offset import TERMS
 from kiteline_core.ids import AgentId, KeyframeId, SubmapId
-
-F64 = NDArray[np.float64]
 
 
 @dataclass(slots=True)

@@ -1,7 +1,5 @@
 """The station: the mapper with one channel to each agent. Packets enter, packets leave."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 

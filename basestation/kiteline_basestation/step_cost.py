@@ -4,8 +4,6 @@ Fitted to the measured steps of a rendered drone's flight, with the codec and wi
 in units of the modelled core of the agent that flew beside them (`kiteline_agent.governor.cost_model`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

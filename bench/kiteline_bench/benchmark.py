@@ -4,8 +4,6 @@ A benchmark is a module with `TITLE` and `run(bench) -> list[Bar]`, entered in B
 PARTS: by name, the title and the function of each; NAME/PART runs one of them.
 """
 
-from __future__ import annotations
-
 import argparse
 import importlib
 import os

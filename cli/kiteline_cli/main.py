@@ -3,8 +3,6 @@
 Only argparse is loaded here, so that `kiteline --help` answers at once. Each subcommand parses its own arguments.
 """
 
-from __future__ import annotations
-
 import argparse
 import difflib
 import errno

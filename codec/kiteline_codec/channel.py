@@ -1,7 +1,5 @@
 """The channel that agent and base use to share records: through the codec and a link, or directly in one process."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import partial
 from typing import Protocol
@@ -125,7 +123,7 @@ class PlainChannel:
         return []
 
     @staticmethod
-    def _join(a: PlainChannel, b: PlainChannel) -> None:
+    def _join(a: "PlainChannel", b: "PlainChannel") -> None:
         a._partner, b._partner = b, a
 
 

@@ -1,7 +1,5 @@
 """Compiles all kernels of the codec before the first packet, by sharing three small keyframes."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from kiteline_codec.channel import coded_channel

@@ -1,7 +1,5 @@
 """Types of command-line arguments that several programs take."""
 
-from __future__ import annotations
-
 import argparse
 
 

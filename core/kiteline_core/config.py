@@ -3,8 +3,6 @@
 The unit and the reason of a value are in the comment beside its default; a table only replaces values that exist.
 """
 
-from __future__ import annotations
-
 import difflib
 import json
 import math

@@ -1,7 +1,5 @@
 """The base class of every error that a user can mend."""
 
-from __future__ import annotations
-
 import struct
 
 

@@ -1,14 +1,11 @@
 """Sensor data: images at one instant, IMU samples, odometer velocities."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-U8 = NDArray[np.uint8]
+from kiteline_core.arrays import F32, F64, I64, U8
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +28,7 @@ class Frame:
     t_ns: int
     left: U8
     right: U8 | None = None
-    depth_m: NDArray[np.float32] | None = None
+    depth_m: F32 | None = None
     encoded: tuple[EncodedImage, ...] = ()
 
 
@@ -42,9 +39,9 @@ class ImuBatch:
     t_ns: (n,) int64, strictly increasing. gyro: (n, 3) rad/s. accel: (n, 3) m/s^2 (specific force: +9.8 up at rest).
     """
 
-    t_ns: NDArray[np.int64]
-    gyro: NDArray[np.float64]
-    accel: NDArray[np.float64]
+    t_ns: I64
+    gyro: F64
+    accel: F64
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,19 +69,19 @@ class OdometryBatch:
     value is meaningless.
     """
 
-    t_ns: NDArray[np.int64]
-    velocity: NDArray[np.float64]
-    rate: NDArray[np.float64]
-    velocity_cov: NDArray[np.float64]
-    rate_cov: NDArray[np.float64]
+    t_ns: I64
+    velocity: F64
+    rate: F64
+    velocity_cov: F64
+    rate_cov: F64
 
 
 @dataclass(frozen=True, slots=True)
 class Trajectory:
     """Poses over time. t_ns: (n,) int64 strictly increasing. T_w_b: (n, 4, 4) float64."""
 
-    t_ns: NDArray[np.int64]
-    T_w_b: NDArray[np.float64]
+    t_ns: I64
+    T_w_b: F64
 
 
 def joined(batches: Sequence[ImuBatch]) -> ImuBatch | None:

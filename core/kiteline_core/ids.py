@@ -6,8 +6,6 @@ landmark is named by the keyframe and keypoint at which it was new, so its id co
 first boot of an agent is drawn at random: numbers of a lost or a cloned card are most likely others.
 """
 
-from __future__ import annotations
-
 from typing import NewType
 
 AgentId = NewType("AgentId", int)

@@ -1,7 +1,5 @@
 """The decorator that compiles kernels: cached on disk, without the interpreter lock, with strict arithmetic."""
 
-from __future__ import annotations
-
 import gc
 import sys
 from collections.abc import Callable

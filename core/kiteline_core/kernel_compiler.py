@@ -3,8 +3,6 @@
 They reach into numba, so a version that they were not tried with compiles without them. Their tests compare results.
 """
 
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import os

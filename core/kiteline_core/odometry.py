@@ -1,17 +1,12 @@
 """Odometer velocities: conversion to the body frame, checks, concatenation."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64, Bool
 from kiteline_core.frame import UNMEASURED, OdometryBatch
 from kiteline_core.geometry import se3
-
-F64 = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 _MAX_SPEED = 1e3  # m/s and rad/s; more is a device fault
 _MAX_VARIANCE = 1e12  # (m/s)^2 and (rad/s)^2; more only loses precision
@@ -52,14 +47,14 @@ def joined(batches: Sequence[OdometryBatch]) -> OdometryBatch | None:
     )
 
 
-def chosen(batch: OdometryBatch, keep: Bools | slice) -> OdometryBatch:
+def chosen(batch: OdometryBatch, keep: Bool | slice) -> OdometryBatch:
     """Select samples by a mask (n,) or a slice."""
     return OdometryBatch(
         batch.t_ns[keep], batch.velocity[keep], batch.rate[keep], batch.velocity_cov[keep], batch.rate_cov[keep]
     )  # fmt: skip
 
 
-def usable(batch: OdometryBatch) -> Bools:
+def usable(batch: OdometryBatch) -> Bool:
     """Mask (n,) of samples with plausible values, and covariances in which no two axes correlate by more than 1."""
     moving = np.concatenate([batch.velocity, batch.rate], axis=1)
     good = np.asarray((np.abs(moving) < _MAX_SPEED).all(axis=1))

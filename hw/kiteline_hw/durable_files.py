@@ -1,7 +1,5 @@
 """Files that are whole, and the newest, after a crash or a loss of power. It imports nothing but the system's calls."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 from pathlib import Path
@@ -36,8 +34,8 @@ def sync_folder(folder: Path) -> None:
         os.close(fd)
 
 
-def next_number(path: Path, least: int = 1) -> int:
-    """The number in a file, plus one, and at least `least`; the new number is stored. Survives a crash at any moment.
+def next_number(path: Path) -> int:
+    """The number in a file, plus one, and at least 1; the new number is stored. Survives a crash at any moment.
 
     Raises OSError if the folder cannot be written, ValueError if the file holds no number.
     """
@@ -47,6 +45,6 @@ def next_number(path: Path, least: int = 1) -> int:
         last = 0
     except ValueError as error:
         raise ValueError(f"{path} holds no number: write one there that is higher than any used before") from error
-    number = max(last + 1, least)
+    number = max(last + 1, 1)
     write_atomically(path, f"{number}\n".encode())
     return number

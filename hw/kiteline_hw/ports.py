@@ -1,14 +1,10 @@
 """The interfaces of sources, links, flight controllers and clocks, and the errors that they raise."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol, TypeGuard
 
-import numpy as np
-from numpy.typing import NDArray
-
+from kiteline_core.arrays import F64
 from kiteline_core.errors import KitelineError
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration, OdometryBatch, Trajectory
 from kiteline_core.geometry.cameras import CameraRig
@@ -153,13 +149,13 @@ class PoseSample:
     """
 
     t_ns: int
-    T_o_b: NDArray[np.float64]
+    T_o_b: F64
     tracked: bool
     quality: int
     epoch: int = 0
-    cov: NDArray[np.float64] | None = None
-    velocity: NDArray[np.float64] | None = None
-    rate: NDArray[np.float64] | None = None
+    cov: F64 | None = None
+    velocity: F64 | None = None
+    rate: F64 | None = None
 
 
 class PoseSink(Protocol):
@@ -188,7 +184,7 @@ class ControllerLink(PoseSink, Protocol):
         ...
 
     @property
-    def T_b_f(self) -> NDArray[np.float64]:
+    def T_b_f(self) -> F64:
         """(4,4) flight controller (forward, right, down) in the body."""
         ...
 

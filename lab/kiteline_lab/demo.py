@@ -1,7 +1,5 @@
 """`make demo`: simulate a short flight, run agent and base on it over a real link, and evaluate the result."""
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import json

@@ -1,19 +1,16 @@
 """Flights of a fixed-lag smoother among points, with images and samples made of the truth."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.inertial.fixed_lag import VisualPoints
 from kiteline_agent.inertial.preintegration import Samples
+from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 
-F64 = NDArray[np.float64]
 CALIBRATION = ImuCalibration()
 T_B_C = se3.from_rt(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.array([0.1, 0.03, -0.02]))
 CAMERA = RectifiedCamera(752, 480, 450.0, 450.0, 375.5, 239.5, 0.11, True, T_B_C)

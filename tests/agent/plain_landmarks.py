@@ -1,13 +1,9 @@
 """New landmarks of a keyframe in tests that look at places alone."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.local_map.keyframe_landmarks import KeyframeLandmarks
-
-F64 = NDArray[np.float64]
+from kiteline_core.arrays import F64
 
 
 def plain_landmarks(uv: F64, rho: F64 | float, sigma_rho: float = 1e-3) -> KeyframeLandmarks:

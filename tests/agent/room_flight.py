@@ -1,20 +1,16 @@
 """A rendered flight that many tests fly: whole, or its first seconds."""
 
-from __future__ import annotations
-
 import hashlib
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_core import odometry
+from kiteline_core.arrays import F64
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration, OdometryBatch
 from kiteline_core.geometry.cameras import CameraRig
 from kiteline_hw.sim.config import SimConfig
 from kiteline_hw.sim.source import START_NS, open_sim
-
-F64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -28,7 +24,7 @@ class RoomFlight:
     driven: OdometryBatch
     truth: F64
 
-    def first(self, seconds: float) -> RoomFlight:
+    def first(self, seconds: float) -> "RoomFlight":
         """The first seconds of the flight."""
         frames = self.frames[: round(seconds * 1e9) // SimConfig().frame_ns]
         felt, driven = (batch.t_ns <= frames[-1].t_ns for batch in (self.samples, self.driven))
@@ -54,7 +50,6 @@ def render() -> RoomFlight:
     """6.5 s in full motion along the room's own course, at half the usual size."""
     source = open_sim("room", seconds=6.5, seed=5, scale=0.5, texture_bits=9, rest=0.0, odometry=50.0)
     truth, driven = source.ground_truth, source.odometry()
-    assert truth is not None
     assert driven is not None
     assert source.imu is not None
     frames = [item for item in source if isinstance(item, Frame)]

@@ -1,22 +1,19 @@
 """Landmarks as a camera sees them whose calibration is off."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.covariance import calibration_error_kernels as certainty_kernels
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.tracking.track import Track
 from kiteline_codec.schema import KeyframeHeader
+from kiteline_core.arrays import F64
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, KeyframeId
 from kiteline_core.pose import pose_kernels
 from tests.agent.plain_landmarks import plain_landmarks
 from tests.core.helpers_from_python import from_python
 
-F64 = NDArray[np.float64]
 CAMERA = RectifiedCamera(752, 480, 450.0, 450.0, 370.0, 240.0, 0.11, True, np.eye(4))
 SHAPES = certainty_kernels.SHAPES
 

@@ -1,7 +1,5 @@
 """The agent on recordings and on bad frames: it follows the truth, survives faults, and stays continuous."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import replace
 from itertools import pairwise
@@ -9,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from kiteline_agent.agent import Agent
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_agent.step import Estimate, Identity, StepInput
+from kiteline_core.arrays import F64
 from kiteline_core.frame import Frame, ImuBatch
 from kiteline_core.geometry import se3
 from kiteline_core.ids import AgentId
@@ -47,15 +45,13 @@ def first_frames(source: FrameSource, n: int) -> list[Frame | ImuBatch]:
     return items
 
 
-def step_errors_m(source: FrameSource, estimates: list[Estimate]) -> NDArray[np.float64]:
+def step_errors_m(source: FrameSource, estimates: list[Estimate]) -> F64:
     """Error of the motion between frames that have a true pose at their time."""
     truth = source.ground_truth
-    assert truth is not None
     at = {int(t): T for t, T in zip(truth.t_ns, truth.T_w_b)}
     known = [e for e in estimates if e.t_ns in at and e.T_m_b is not None]
     errors = []
     for a, b in pairwise(known):
-        assert a.T_m_b is not None and b.T_m_b is not None
         true = se3.inverse(at[a.t_ns]) @ at[b.t_ns]
         errors.append(np.linalg.norm((se3.inverse(true) @ se3.inverse(a.T_m_b) @ b.T_m_b)[:3, 3]))
     return np.array(errors)
@@ -92,16 +88,6 @@ def test_frames_without_their_right_image_are_tracked(data_dir: Path, with_imu: 
     estimates = fly(source, frames)
     assert all(e.tracked for e in estimates) and len({e.submap for e in estimates}) == 1
     assert np.sqrt(np.mean(step_errors_m(source, estimates) ** 2)) < 0.005
-
-
-def test_two_runs_give_the_same_bits(data_dir: Path) -> None:
-    runs = []
-    for _ in range(2):
-        source = open_source(str(data_dir / "room_flight.mcap"))
-        runs.append(fly(source, first_frames(source, 15)))
-    assert len(runs[0]) == 15
-    for a, b in zip(*runs, strict=True):
-        assert a.T_o_b.tobytes() == b.T_o_b.tobytes()
 
 
 def jump_m(estimates: list[Estimate]) -> float:
@@ -171,5 +157,5 @@ def test_nothing_to_see_is_no_error() -> None:
     grey = np.full((240, 320), 100, np.uint8)
     for k in range(6):
         estimate = agent.step(StepInput(Frame(k * 50_000_000, grey, grey)), k * 50_000_000).estimate
-        assert estimate is not None and not estimate.tracked
+        assert not estimate.tracked
         assert estimate.quality == -1 and estimate.T_m_b is None

@@ -1,20 +1,18 @@
 """Template alignment: it finds known displacements to a fraction of a pixel, whatever brightness does."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from kiteline_agent.imaging import alignment_kernels as kernels
 from kiteline_agent.imaging.features import build_pyramid
 from kiteline_agent.tracking.frame_images import NO_GRID
+from kiteline_core.arrays import F64, U8, Bool
 from kiteline_core.geometry.cameras import CameraModel, CameraRig, Lens, Rectifier
 from tests.core.helpers_from_python import from_python
 
 
-def texture(seed: int, shape: tuple[int, int] = (240, 320)) -> NDArray[np.float64]:
+def texture(seed: int, shape: tuple[int, int] = (240, 320)) -> F64:
     """A smooth random image with detail at many scales, 40..215."""
     rng = np.random.default_rng(seed)
     out = np.zeros(shape)
@@ -24,7 +22,7 @@ def texture(seed: int, shape: tuple[int, int] = (240, 320)) -> NDArray[np.float6
     return 127.0 + 30.0 * out / out.std()
 
 
-def warped(image: NDArray[np.float64], matrix: NDArray[np.float64]) -> NDArray[np.uint8]:
+def warped(image: F64, matrix: F64) -> U8:
     """The image as seen when its pixel p moves to matrix @ (p, 1)."""
     h, w = image.shape
     moved = cv2.warpAffine(image, matrix, (w, h), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
@@ -32,12 +30,12 @@ def warped(image: NDArray[np.float64], matrix: NDArray[np.float64]) -> NDArray[n
 
 
 def run(
-    first: NDArray[np.uint8],
-    second: NDArray[np.uint8],
-    uv: NDArray[np.float64],
-    warp: NDArray[np.float64],
-    guess: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    first: U8,
+    second: U8,
+    uv: F64,
+    warp: F64,
+    guess: F64,
+) -> tuple[F64, Bool]:
     n = len(uv)
     octave = np.zeros(n, np.uint8)
     templates = np.empty((n, kernels.TEMPLATE_LEVELS, kernels.TEMPLATE, kernels.TEMPLATE), np.uint8)
@@ -114,7 +112,7 @@ def test_templates_are_cut_as_one_would_by_hand() -> None:
             np.testing.assert_allclose(templates[i, j], above * (1 - fy) + below * fy, atol=0.501)
 
 
-def bilinear(image: NDArray[np.uint8], x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+def bilinear(image: U8, x: F64, y: F64) -> F64:
     grey = image.astype(np.float64)
     left, top = np.floor(x).astype(int), np.floor(y).astype(int)
     fx, fy = x - left, y - top
@@ -176,7 +174,7 @@ def test_the_greatest_contrast_does_not_overflow() -> None:
     assert found[0] and abs(out - uv).max() < 0.05 and ncc[0] > 0.99
 
 
-def through_lens(scene: NDArray[np.float64], camera: CameraModel, shift: tuple[float, float]) -> NDArray[np.uint8]:
+def through_lens(scene: F64, camera: CameraModel, shift: tuple[float, float]) -> U8:
     """A raw image of a scene (h + 120, w + 120), moved by `shift` in the rectified image."""
     rectified = Rectifier(CameraRig(camera, None, np.eye(4), None)).camera
     x, y = np.meshgrid(np.arange(float(camera.width)), np.arange(float(camera.height)))
@@ -193,7 +191,7 @@ def test_a_raw_image_is_aligned_as_well_as_the_rectified_one() -> None:
     model = CameraModel(320, 240, 220.0, 221.0, 158.0, 121.0, Lens.RADTAN, (-0.28, 0.07, 1e-4, 2e-5))
     rectifier = Rectifier(CameraRig(model, None, np.eye(4), None))
     assert rectifier.left_grid is not None
-    n, off = len(POINTS), dict[str, list[NDArray[np.float64]]](whole=[], raw=[])
+    n, off = len(POINTS), dict[str, list[F64]](whole=[], raw=[])
     for seed, shift in enumerate([(2.6, -2.2), (1.25, 0.4), (0.5, 0.5), (-3.3, 1.8)]):
         scene = texture(seed, (360, 440))
         before = rectifier.left(through_lens(scene, model, (0.0, 0.0)))

@@ -1,7 +1,5 @@
 """What the base finds of a pair's disparities: depths that the pair measured follow, what is shared stays raw."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from kiteline_agent.config import LocalMapConfig

@@ -1,20 +1,17 @@
 """What residuals tell of errors of the calibration, and how they widen the covariance."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from kiteline_agent.config import CovarianceConfig
 from kiteline_agent.covariance import calibration_error_kernels as certainty_kernels
 from kiteline_agent.covariance.calibration_evidence import CalibrationEvidence
 from kiteline_agent.covariance.pose_covariance import PoseCovariance
 from kiteline_agent.tracking.pose_state import PoseState
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
 from tests.agent.seen_scenes import SHAPES, map_of, scene, seen_with, tracked
 
-F64 = NDArray[np.float64]
 VIEWS = [np.array([0.3 * x, 0.2 * y, 0.4 * z, 0.05 * y, -0.1 * x, 0.08 * z])
          for x, y, z in np.random.default_rng(5).uniform(-1.0, 1.0, (12, 3))]  # fmt: skip
 

@@ -1,7 +1,5 @@
 """Images and IMU that contradict each other: no map in metres begins, and the user is told what to check."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
@@ -9,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.governor.cost_model import Work
@@ -20,6 +17,7 @@ from kiteline_agent.initialisation.contradiction import ContradictionWatch, cont
 from kiteline_agent.initialisation.corner_tracks import CornerObservations
 from kiteline_agent.initialisation.inertial_start import InertialStart
 from kiteline_agent.initialisation.window_noise import WindowNoise
+from kiteline_core.arrays import F64
 from tests.agent.test_inertial_bundle import CALIBRATION, PRIOR, window
 from tests.agent.test_inertial_start import CAMERA, Tracks
 
@@ -55,7 +53,7 @@ def longer_focal_length(corners: CornerObservations, samples: list[Samples]) -> 
     return replace(corners, xy=1.1 * corners.xy), samples
 
 
-def turned(R: NDArray[np.float64]) -> Change:
+def turned(R: F64) -> Change:
     def change(corners: CornerObservations, samples: list[Samples]) -> Any:
         return corners, [replace(s, gyro=s.gyro @ R.T, accel=s.accel @ R.T) for s in samples]
 

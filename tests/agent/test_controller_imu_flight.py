@@ -1,7 +1,5 @@
 """Whole flights of an agent on the IMU of a flight controller, whose samples come late and with another clock."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -18,7 +16,6 @@ from kiteline_hw.mavlink.messages import VehicleImu
 from kiteline_hw.ports import SourceReport
 from tests.agent.room_flight import RoomFlight
 
-F64 = np.ndarray
 BOOT_NS = 400_000_000_000  # our clock at the controller's zero
 DARK = range(60, 75)
 
@@ -73,6 +70,5 @@ def test_samples_that_come_late_carry_the_pose_all_the_same(
     assert off_m(5, DARK.start - 1) < 0.03
     assert off_m(DARK.start - 1, DARK.stop - 1) < 0.05  # 0.75 s without images
     level = found[59].R_l_o
-    assert level is not None
     up = level @ found[59].T_o_b[:3, :3] @ flight.truth[59, :3, :3].T @ [0.0, 0.0, 1.0]
     np.testing.assert_allclose(up, [0.0, 0.0, 1.0], atol=0.05)

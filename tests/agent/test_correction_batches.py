@@ -1,7 +1,5 @@
 """Batches of corrections: applied whole, in any order of arrival, and nothing waits for ever."""
 
-from __future__ import annotations
-
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st

@@ -1,25 +1,23 @@
 """How much of a correction of the live pose is taken over, by the deviation that the base tells."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from kiteline_agent.config import SmoothingConfig
 from kiteline_agent.exchange.correction_filter import CorrectionFilter
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3, sim3
 
 CONFIG = SmoothingConfig()
 HERE = np.array([4.0, 0.0, 1.0])
 
 
-def scaled(scale: float) -> NDArray[np.float64]:
+def scaled(scale: float) -> F64:
     """T_w_o of a map that is `scale` times as long in w."""
     return sim3.of(scale, np.eye(4))
 
 
-def place(T_w_o: NDArray[np.float64], here_o: NDArray[np.float64]) -> NDArray[np.float64]:
+def place(T_w_o: F64, here_o: F64) -> F64:
     return np.asarray(se3.transform(T_w_o, here_o[None])[0])
 
 

@@ -1,7 +1,5 @@
 """The virtual CPU's prices: every kind of work has one, and flights cost the same wherever they are flown."""
 
-from __future__ import annotations
-
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -82,7 +80,7 @@ def test_a_search_enters_a_few_keyframes_the_newest_first(recording: Path) -> No
         agent.work.clear()
         relocaliser.enter_keyframes()
         assert agent.work.places == (entered <= len(held))
-        assert relocaliser._index is not None and relocaliser._index.keys == held[:entered]
+        assert relocaliser._index.keys == held[:entered]
 
 
 def test_less_effort_is_counted_as_less(recording: Path) -> None:

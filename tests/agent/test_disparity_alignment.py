@@ -1,7 +1,5 @@
 """The offset of disparities is found on board, by the parallax of landmarks; kernels against numpy."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from types import SimpleNamespace
@@ -11,7 +9,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from kiteline_agent.config import AgentConfig, DisparityConfig, LocalMapConfig
 from kiteline_agent.exchange.no_base import NoBaseChannel
@@ -20,13 +17,13 @@ from kiteline_agent.local_map.disparity_alignment import DisparityAlignment
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.mapping.right_camera import RightCamera
 from kiteline_codec.schema import KeyframeHeader
+from kiteline_core.arrays import F64, I64
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraModel, CameraRig, RectifiedCamera, Rectifier
 from kiteline_core.geometry.disparity_offset import TERMS, terms
 from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId
 from tests.agent.plain_landmarks import plain_landmarks
 
-F64 = NDArray[np.float64]
 CAMERA = RectifiedCamera(752, 480, 430.0, 430.0, 376.0, 240.0, 0.11, True, np.eye(4))
 WORN = np.array([-0.6, 0.1, -0.3, -0.5, 0.3])
 NOTHING = np.zeros(5)
@@ -104,7 +101,7 @@ class Flight:
         header = KeyframeHeader(KeyframeId(0), 0, NO_KEYFRAME, np.eye(4), len(uv))
         self.map.add(header, np.eye(4), plain_landmarks(uv, np.maximum(disparity, 0.1) / CAMERA.bf, 0.01), 0)
 
-    def frames(self, count: int) -> Iterator[tuple[F64, NDArray[np.int64], F64]]:
+    def frames(self, count: int) -> Iterator[tuple[F64, I64, F64]]:
         """Pose, rows and observations of frames."""
         for k in range(count):
             T = se3.inverse(se3.exp(np.concatenate([k * self.step, [0.0, 0.002 * k, 0.0]])))

@@ -1,18 +1,16 @@
 """Corners and descriptors: spread, repeatable, and the same as written plainly."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from kiteline_agent.imaging import corner_kernels, features
 from kiteline_agent.imaging import feature_kernels as kernels
-from kiteline_agent.imaging import features
 from kiteline_agent.imaging.features import DetectorConfig, build_pyramid, describe, detect
+from kiteline_core.arrays import I32, I64, U8
 
 
-def blobs(seed: int, turn_deg: float = 0.0) -> NDArray[np.uint8]:
+def blobs(seed: int, turn_deg: float = 0.0) -> U8:
     """A grey image with many distinct patches of different shape, perhaps turned about its centre."""
     rng = np.random.default_rng(seed)
     image = np.full((400, 400), 120, np.uint8)
@@ -27,7 +25,7 @@ def blobs(seed: int, turn_deg: float = 0.0) -> NDArray[np.uint8]:
     return np.asarray(image, np.uint8)
 
 
-def hamming(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> NDArray[np.int64]:
+def hamming(a: U8, b: U8) -> I64:
     return np.unpackbits(a[:, None] ^ b[None, :], axis=2).sum(axis=2).astype(np.int64)
 
 
@@ -125,3 +123,42 @@ def test_faint_corners_are_found_where_there_are_few_others(sigma: float) -> Non
     assert len(found.uv) > 80
     corner = np.abs((found.uv + 0.5 + 8.0) % 16.0 - 8.0).max(axis=1)
     assert np.mean(corner < 4.0) > 0.8, "corners of the patches, not of the noise, of which a quarter would be so near"
+
+
+def noise(seed: int, rows: int, columns: int) -> U8:
+    """Grey noise, smoothed so far that it has corners of all strengths."""
+    rng = np.random.default_rng(seed)
+    image = cv2.GaussianBlur(rng.standard_normal((rows, columns)), (0, 0), 1.3)
+    return np.asarray(np.clip(128 + 50 * image / image.std(), 0, 255), np.uint8)
+
+
+def by_opencv(image: U8, threshold: int, margin: int) -> I32:
+    found = cv2.FastFeatureDetector.create(threshold, True).detect(image)
+    xy = np.array(cv2.KeyPoint.convert(found), np.float32).astype(np.int32)
+    limit = np.array([image.shape[1], image.shape[0]]) - margin
+    return xy[((xy >= margin) & (xy < limit)).all(axis=1)]
+
+
+@pytest.mark.parametrize(("rows", "columns", "margin"), [(90, 121, 20), (64, 80, 5), (41, 43, 18), (30, 200, 20)])
+@pytest.mark.parametrize("threshold", [7, 12, 40])
+def test_the_corners_of_opencv(rows: int, columns: int, margin: int, threshold: int) -> None:
+    image = noise(rows + threshold, rows, columns)
+    free = np.zeros((1, 1), np.bool_)
+    xy = np.empty((image.size // 4, 2), np.int32)
+    n = corner_kernels.fast_corners(image, threshold, margin, 1, 1000.0, free, xy)
+    np.testing.assert_array_equal(xy[:n], by_opencv(image, threshold, margin))
+
+
+def test_no_corner_in_an_occupied_cell_and_none_beyond_the_buffer() -> None:
+    image = noise(1, 100, 140)
+    cell_px, scale = 32.0, 2  # cells of 16 px of this level
+    occupied = np.random.default_rng(2).random((7, 9)) < 0.5
+    xy = np.empty((image.size // 4, 2), np.int32)
+    n = corner_kernels.fast_corners(image, 12, 18, scale, cell_px, occupied, xy)
+    every = by_opencv(image, 12, 18)
+    cells = (every * scale / cell_px).astype(int)
+    np.testing.assert_array_equal(xy[:n], every[~occupied[cells[:, 1], cells[:, 0]]])
+    assert 10 < n < len(every)
+    few = np.empty((5, 2), np.int32)
+    assert corner_kernels.fast_corners(image, 12, 18, scale, cell_px, occupied, few) == 5
+    np.testing.assert_array_equal(few, xy[:5])

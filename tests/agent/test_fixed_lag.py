@@ -1,20 +1,17 @@
 """The fixed-lag smoother: marginalisation against the whole problem, honesty, dead reckoning, maps that move."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from kiteline_agent.inertial.fixed_lag import BodyVelocity, FixedLagSmoother, InertialState, tilt_of
 from kiteline_agent.inertial.inertial_config import FixedLagConfig, StartDeviations
 from kiteline_agent.inertial.preintegration import Samples
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
 from tests.agent.lag_flights import CALIBRATION, CAMERA, FRAME_STEPS, GRAVITY, STEP_S, Flight, make_flight, see
 
-F64 = NDArray[np.float64]
 EXACT = FixedLagConfig(
     visual_inflation=1.0, imu_inflation=1.0, turn_floor_rad=1e-7, velocity_floor_m_s=1e-6, position_floor_m=1e-6,
     tilt_walk_rad=0.0,

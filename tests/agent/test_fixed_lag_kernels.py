@@ -1,24 +1,21 @@
 """Terms of the fixed-lag smoother: Jacobians against differences, sums and elimination against plain references."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from kiteline_agent.inertial import fixed_lag_kernels as kernels
 from kiteline_agent.inertial import inertial_kernels
 from kiteline_agent.inertial.fixed_lag import tilt_of
 from kiteline_agent.inertial.preintegration import preintegrate
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
 from tests.agent.lag_flights import CALIBRATION, CAMERA, T_B_C, make_flight, see
 from tests.core.helpers_from_python import from_python
 
-F64 = NDArray[np.float64]
 SEEDS = st.integers(0, 2**31)
 
 

@@ -1,7 +1,5 @@
 """The source read ahead, the tally, the virtual core, and estimates that pass through a log unchanged."""
 
-from __future__ import annotations
-
 import itertools
 import json
 from collections.abc import Iterator
@@ -45,7 +43,6 @@ def test_frames_come_with_the_samples_before_them() -> None:
     assert camera.next_ns == 100
     frame, batch, _ = camera.take()
     assert frame.t_ns == 100
-    assert batch is not None
     assert batch.t_ns.tolist() == [50, 100]
     assert camera.period_ns == 100
 
@@ -55,7 +52,6 @@ def test_samples_of_a_dropped_frame_go_with_the_next() -> None:
     camera.drop()
     frame, batch, _ = camera.take()
     assert frame.t_ns == 200
-    assert batch is not None
     assert batch.t_ns.tolist() == [50, 100, 150, 200]
     assert batch.gyro.shape == (4, 3)
 

@@ -1,18 +1,16 @@
 """A submap whose ids of keyframes are used up is continued in another one: neither tracker nor base lose anything."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from kiteline_agent.keyframes import reference
 from kiteline_agent.mapping.submaps import Submaps
 from kiteline_bench.harness.recording import Item, Recording
 from kiteline_bench.harness.run import RecordingRun, fly_recording
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
 from kiteline_core.ids import MAX_KEYFRAMES
 from tests.agent.room_flight import RoomFlight
@@ -50,7 +48,7 @@ def test_a_full_submap_is_continued_and_the_base_merges_the_two(
     assert largest_error_m([sparse_map.world_pose(k) @ T_c_b for k in held], true[frames]) < 0.02
 
 
-def largest_error_m(found: Sequence[Any], true: NDArray[np.float64]) -> float:
+def largest_error_m(found: Sequence[Any], true: F64) -> float:
     """The largest error of positions of the body, with the first poses as one."""
     T_true_found = true[0] @ se3.inverse(found[0])
     return max(float(np.linalg.norm((T_true_found @ T - T_w_b)[:3, 3])) for T, T_w_b in zip(found, true, strict=True))

@@ -1,12 +1,9 @@
 """Calibration of the IMU in flight, on simulated samples of worn and true IMUs."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from kiteline_agent.inertial.calibration.gyro_calibration import GyroCalibration
 from kiteline_agent.inertial.calibration.known_imu import KnownImuConfig
@@ -14,13 +11,13 @@ from kiteline_agent.inertial.calibration.self_calibration import SelfCalibration
 from kiteline_agent.inertial.calibration.window import Window
 from kiteline_agent.inertial.preintegration import Samples, preintegrate
 from kiteline_agent.inertial.sample_buffer import SampleBuffer
+from kiteline_core.arrays import F64, I64
 from kiteline_core.frame import ImuBatch, ImuCalibration
 from kiteline_core.geometry import se3
 from kiteline_hw.sim.sensors import imu as sim_imu
 from kiteline_hw.sim.world.built_in_paths import built_in_path
 from kiteline_hw.sim.world.path import Path
 
-F64 = NDArray[np.float64]
 CALIBRATION = ImuCalibration()
 T_B_C = se3.from_rt(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.array([0.1, 0.03, -0.02]))
 P_B_C = T_B_C[:3, 3].copy()
@@ -34,7 +31,7 @@ ACCEL = np.array([[0.990, -0.006, 0.005], [0.004, 1.011, 0.007], [-0.006, 0.003,
 class Flight:
     """Poses by images at the stamps of frames, and all samples."""
 
-    t_ns: NDArray[np.int64]
+    t_ns: I64
     seen: F64
     truth: F64
     samples: ImuBatch
@@ -214,7 +211,6 @@ def left(calibration: SelfCalibration, gyro: F64) -> float:
 def test_the_next_flight_begins_with_what_was_found_and_adds_to_it() -> None:
     short = [calibrated(flight(6.0, seed, GYRO, ACCEL, 4_000_000)) for seed in (4, 5)]
     known = short[0].known()
-    assert known is not None
     begun = SelfCalibration(CALIBRATION, SelfCalibrationConfig(), P_B_C, 9.81)
     begun.begin_with(known)
     np.testing.assert_allclose(applied(begun)[0], short[0].gyro.matrix, atol=1e-5)
@@ -222,7 +218,6 @@ def test_the_next_flight_begins_with_what_was_found_and_adds_to_it() -> None:
     second = calibrated(flight(6.0, 5, GYRO, ACCEL, 4_000_000), known=known)
     assert left(second, GYRO) < min(left(flown, GYRO) for flown in short)
     found = second.known()
-    assert found is not None
     assert np.mean(np.square(found.gyro_sigma)) < np.mean(np.square(known.gyro_sigma))
 
 
@@ -249,13 +244,10 @@ def test_a_true_imu_is_left_alone_in_later_flights() -> None:
 
 def test_what_a_flight_cannot_tell_is_kept() -> None:
     known = calibrated(flight(25.0, 0, GYRO, ACCEL)).known()
-    assert known is not None
     assert SelfCalibration(CALIBRATION, SelfCalibrationConfig(), P_B_C, 9.81).known() is None
     monocular = calibrated(flight(12.0, 1, GYRO, ACCEL), known=known, metric=False).known()
-    assert monocular is not None
     assert monocular.accel == known.accel
     resting = calibrated(flight(6.0, 1, GYRO, ACCEL, at_rest=True), known=known).known()
-    assert resting is not None
     np.testing.assert_allclose(resting.gyro, known.gyro, atol=5e-4)
     assert np.all(np.array(resting.gyro_sigma) > 0.9 * np.array(known.gyro_sigma))
 
@@ -263,11 +255,11 @@ def test_what_a_flight_cannot_tell_is_kept() -> None:
 def test_a_refuted_imu_leaves_nothing_behind() -> None:
     """Monocular, whose flights do not calibrate the accelerometer: what the file said of it was of another IMU."""
     known = calibrated(flight(25.0, 0, GYRO, ACCEL, 4_000_000)).known()
-    assert known is not None and known.accel
+    assert known.accel
     replaced = calibrated(flight(25.0, 1, np.linalg.inv(GYRO), late_ns=-3_000_000), known=known, metric=False)
     assert any("calibrated anew" in event for event in replaced.take_events())
     found = replaced.known()
-    assert found is not None and found.accel == ()
+    assert found.accel == ()
 
 
 def test_what_no_imu_can_be_is_not_kept() -> None:
@@ -277,7 +269,7 @@ def test_what_no_imu_can_be_is_not_kept() -> None:
     assert known is not None
     calibration.accel._x[0] = 0.5
     found = calibration.known()
-    assert found is not None and found.accel == () and found.gyro == known.gyro
+    assert found.accel == () and found.gyro == known.gyro
     for index, value in ((0, 0.3), (9, -0.7), (4, np.nan)):
         calibration.gyro._x[:] = 0.0
         calibration.gyro._x[index] = value

@@ -1,7 +1,5 @@
 """People are told when an IMU stays silent, once, when it speaks again, and when it does not measure gravity."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

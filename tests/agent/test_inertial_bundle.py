@@ -1,13 +1,10 @@
 """The window of a monocular start in metres: scale, gravity, biases and honest deviations, from simulated corners."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from kiteline_agent.inertial.preintegration import BiasPrior, Samples
 from kiteline_agent.inertial.sample_buffer import SampleBuffer
@@ -16,15 +13,14 @@ from kiteline_agent.initialisation.corner_tracks import CornerObservations
 from kiteline_agent.initialisation.inertial_bundle import InertialBundle
 from kiteline_agent.initialisation.inertial_window import WarmStart, WindowSolution
 from kiteline_agent.initialisation.lens_correction import TERMS, moved
+from kiteline_agent.initialisation.window_kernels import add_observations
 from kiteline_agent.initialisation.window_noise import NoiseEvidence, WindowNoise
+from kiteline_core.arrays import F64, Bool
 from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry import se3
 from kiteline_hw.sim.sensors import imu as sim_imu
 from kiteline_hw.sim.world.built_in_paths import built_in_path
 from kiteline_hw.sim.world.path import Path
-
-F64 = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 T_B_C = se3.from_rt(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.array([0.1, 0.03, -0.02]))
 FOCAL = 450.0
@@ -72,7 +68,6 @@ def scale_of(solution: WindowSolution, truth: F64) -> float:
 def test_scale_gravity_and_motion_are_found_without_a_first_guess(seed: int) -> None:
     corners, samples, truth = window(seed)
     found = bundle(corners, samples).solve()
-    assert found is not None
     assert abs(np.log(scale_of(found, truth))) < max(4.0 * found.scale_sigma, 0.01)
     assert found.scale_sigma < 0.05
     down_b = found.T_w_b[:3, :3].T @ found.gravity / 9.81
@@ -90,7 +85,6 @@ def test_deviations_of_the_scale_are_honest() -> None:
     for seed in range(12):
         corners, samples, truth = window(seed, keyframes=11)
         found = bundle(corners, samples).solve()
-        assert found is not None
         ratios.append(np.log(scale_of(found, truth)) / found.scale_sigma)
     assert 0.05 < np.sqrt(np.mean(np.square(ratios))) < 1.5
 
@@ -134,13 +128,12 @@ def test_a_warm_start_of_another_size_ends_at_the_scale_that_a_vibrating_imu_tel
     args = (corners, samples, CALIBRATION, T_B_C, FOCAL, 9.81, PRIOR, CONFIG, noise)
     solver = InertialBundle(*args)
     right = solver.solve()
-    assert right is not None
     xyz, _ = solver.landmarks_of(right.state)
     camera = right.state.p + right.state.R @ T_B_C[:3, 3]
     away = (factor - 1.0) * (camera - camera[0])
     wrong = replace(right.state, p=right.state.p + away, v=factor * right.state.v)
     found = InertialBundle(*args).solve(WarmStart(wrong, camera[0] + factor * (xyz - camera[0])))
-    assert found is not None and found.converged
+    assert found.converged
     assert found.cost < right.cost + 0.5
     ratio = np.linalg.norm(found.state.p - found.state.p[0]) / np.linalg.norm(right.state.p - right.state.p[0])
     assert abs(np.log(ratio)) < 0.5 * right.scale_sigma
@@ -169,7 +162,6 @@ def test_noise_of_the_accelerometer_is_found_from_more_than_there_is(factor: flo
     noise, config = WindowNoise(accel=20.0), replace(CONFIG, sigma_px=0.5, huber=1.5)  # corners are as good as said
     for _ in range(3):
         found = InertialBundle(corners, shaken, CALIBRATION, T_B_C, FOCAL, 9.81, PRIOR, config, noise).solve()
-        assert found is not None
         noise = found.evidence.updated(noise, 6.0)
     assert 0.5 * factor < noise.accel < 2.0 * factor
     assert noise.gyro < 3.0
@@ -185,7 +177,7 @@ def test_noise_of_the_accelerometer_is_not_believed_below_its_least() -> None:
     assert many.updated(before, 6.0, 3.0) == many.updated(before, 6.0)
 
 
-def walking(corners: CornerObservations, truth: F64, share: float, seed: int) -> tuple[CornerObservations, Bools]:
+def walking(corners: CornerObservations, truth: F64, share: float, seed: int) -> tuple[CornerObservations, Bool]:
     """The corners, a share of them on things that walk across the view from one keyframe to the next; and which."""
     rng = np.random.default_rng(seed)
     walks = rng.random(len(corners.ids)) < share
@@ -208,7 +200,6 @@ def test_corners_that_walk_are_left_out(seed: int) -> None:
     assert found.reprojection_px < 1.2 * still.reprojection_px
     # and they become no landmarks of the map
     placed = bundle(crowd, samples).place_landmarks(found.state)
-    assert placed is not None
     newest = corners.seen[-1]
     assert (placed.depth_sigma[walks & newest] > 0.25).mean() > 0.9
     assert (placed.depth_sigma[~walks & newest] < 0.25).mean() > 0.7
@@ -219,7 +210,6 @@ def test_costs_with_and_without_walking_corners_can_be_compared() -> None:
     corners, samples, truth = window(1)
     crowd, walks = walking(corners, truth, 0.3, 1)
     with_them, without = bundle(crowd, samples).solve(), bundle(crowd.part(np.flatnonzero(~walks)), samples).solve()
-    assert with_them is not None and without is not None
     observations = np.count_nonzero(corners.seen[:, walks])
     each = CONFIG.huber * (CONFIG.max_rms - 0.5 * CONFIG.huber)
     assert with_them.cost - without.cost == pytest.approx(observations * each, rel=0.2)  # some corners that stay, too
@@ -245,7 +235,6 @@ def test_a_warm_start_ends_where_a_cold_one_does() -> None:
     corners, samples, truth = window(4, keyframes=14)
     first = bundle(replace(corners, xy=corners.xy[:12], seen=corners.seen[:12]), samples[:11])
     before = first.solve()
-    assert before is not None
     xyz, _ = first.landmarks_of(before.state)
     xyz[::7] = np.nan  # new corners
     warm, cold = bundle(corners, samples).solve(WarmStart(before.state, xyz)), bundle(corners, samples).solve()
@@ -256,7 +245,6 @@ def test_a_warm_start_ends_where_a_cold_one_does() -> None:
 def test_the_state_is_that_of_the_newest_keyframe() -> None:
     corners, samples, truth = window(5)
     found = bundle(corners, samples).solve()
-    assert found is not None
     xyz = np.full(3, np.nan)
     assert found.cov.shape == (17, 17) and np.linalg.eigvalsh(found.cov).min() > 0.0 and np.isnan(xyz).all()
     speed = np.linalg.norm(truth[-1, :3, 3] - truth[-2, :3, 3]) / 0.25
@@ -266,9 +254,7 @@ def test_the_state_is_that_of_the_newest_keyframe() -> None:
 def test_landmarks_are_placed_with_known_poses() -> None:
     corners, samples, truth = window(2)
     few = bundle(corners.part(np.arange(min(60, len(corners.ids)))), samples).solve()
-    assert few is not None
     every = bundle(corners, samples).place_landmarks(few.state)
-    assert every is not None
     known = (every.depth_sigma < 0.1) & corners.seen[-1]
     assert known.sum() > 10
     # true depths by the observations themselves: the ray through the newest pixel at that depth meets the others
@@ -291,3 +277,48 @@ def test_a_landmark_that_diverges_is_not_computed_with_beyond_all_bounds() -> No
     system = problem._linearise(found.state, inertial=True)
     far = problem._moved(found.state, np.zeros(len(system.b)), replace(system, bp=np.full_like(system.bp, 1e200)))
     assert np.isfinite(problem._cost(far, inertial=True))
+
+
+def test_normal_equations_of_observations_are_those_of_their_jacobians() -> None:
+    """Beside sums of outer products of each observation's Jacobian, taken by matrices of numpy."""
+    rng = np.random.default_rng(3)
+    n, m, sigma = 4, 7, 0.002
+    xy, error, y = rng.normal(size=(n, m, 2)), rng.normal(size=(n, m, 2)), rng.normal(size=(n, m, 3))
+    z, rho = rng.uniform(0.5, 2.0, (n, m)), rng.uniform(0.1, 1.0, m)
+    weight = rng.uniform(0.2, 1.0, (n, m)) * (rng.uniform(size=(n, m)) < 0.7)
+    R = np.array([se3.so3_exp(v) for v in rng.normal(size=(n, 3))])
+    axes = np.array([se3.so3_exp(v) for v in rng.normal(size=(m, 3))])
+    R_bc, t_bc, p, origin = (
+        se3.so3_exp(rng.normal(size=3)),
+        rng.normal(size=3),
+        rng.normal(size=(n, 3)),
+        np.ones((m, 3)),
+    )
+    seen = 6 * n + TERMS
+    start = rng.normal(size=(seen, seen))  # what was summed before is kept
+    hpp, bp, hpk = np.zeros((m, 3, 3)), np.zeros((m, 3)), np.zeros((m, 3, seen))
+    hkk, bk, lens = start.copy(), np.zeros(seen), slice(6 * n, seen)
+    add_observations(xy, error, weight, sigma, y, z, R_bc, R, p, t_bc, rho, origin, axes, hpp, bp, hpk, hkk, bk)
+    point_h, point_b, mixed = np.zeros_like(hpp), np.zeros_like(bp), np.zeros_like(hpk)
+    pose_h, pose_b = start.copy(), np.zeros_like(bk)
+    for k in range(n):
+        for i in range(m):
+            slope = (R_bc[:, :2].T - xy[k, i][:, None] * R_bc[:, 2]) / z[k, i] / sigma
+            place = np.column_stack([R[k].T @ axes[i][:, :2], R[k].T @ (origin[i] - p[k]) - t_bc])
+            of_point = slope @ place
+            of_pose = np.column_stack([slope @ se3.skew(y[k, i]), -rho[i] * slope @ R[k].T])
+            w, at = weight[k, i], slice(6 * k, 6 * k + 6)
+            unit = np.eye(TERMS)
+            of_lens = np.stack([moved(xy[k, i], a) - xy[k, i] for a in unit], axis=1) / sigma  # linear in the factors
+            point_h[i] += w * of_point.T @ of_point
+            point_b[i] += w * of_point.T @ error[k, i]
+            mixed[i][:, at] += w * of_point.T @ of_pose
+            pose_h[at, at] += w * of_pose.T @ of_pose
+            pose_b[at] += w * of_pose.T @ error[k, i]
+            mixed[i][:, lens] += w * of_point.T @ of_lens
+            pose_h[lens, at] += w * of_lens.T @ of_pose
+            pose_h[lens, lens] += w * of_lens.T @ of_lens
+            pose_b[lens] += w * of_lens.T @ error[k, i]
+    for found, wanted in ((hpp, point_h), (bp, point_b), (hpk, mixed), (hkk, pose_h), (bk, pose_b)):
+        assert np.allclose(found, wanted, rtol=1e-9, atol=1e-9 * np.abs(wanted).max())
+        assert np.abs(found).max() > 0.0

@@ -1,24 +1,21 @@
 """Start in motion: gyro bias, velocity, gravity, scale; and the camera's time offset."""
 
-from __future__ import annotations
-
 from typing import cast
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from kiteline_agent.inertial import initial_alignment as imu_alignment
 from kiteline_agent.inertial.imu_initialisation import ImuInitialiser, TimedPose
 from kiteline_agent.inertial.inertial_config import InertialConfig
 from kiteline_agent.inertial.preintegration import Preintegrated, Samples, preintegrate
 from kiteline_agent.inertial.sample_buffer import SampleBuffer
+from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry import se3
 
-F64 = NDArray[np.float64]
 CALIBRATION = ImuCalibration()
 GRAVITY = np.array([0.0, 0.0, -9.81])
 P_B_C = np.array([0.15, -0.05, 0.1])
@@ -73,7 +70,6 @@ def test_velocity_and_gravity_in_a_map_of_any_tilt(seed: int, tilt: float) -> No
     found = imu_alignment.align(
         se3.from_rt(turn, np.array([1.0, 2.0, 3.0])) @ poses, P_B_C, motions, np.zeros(6), 9.81, with_scale=False
     )
-    assert found is not None
     np.testing.assert_allclose(found.gravity, turn @ GRAVITY, atol=0.03)
     np.testing.assert_allclose(found.velocities, velocities @ turn.T, atol=0.01)
     assert found.residual_m < 1e-3 and found.gravity_error < 0.01
@@ -89,7 +85,6 @@ def test_scale_of_a_map_without_one(seed: int) -> None:
     offset = poses[:, :3, :3] @ P_B_C
     mono[:, :3, 3] = (poses[:, :3, 3] + offset + 0.002 * rng.normal(size=(41, 3))) / scale - offset
     found = imu_alignment.align(mono, P_B_C, motions, np.zeros(6), 9.81, with_scale=True)
-    assert found is not None
     assert found.scale == pytest.approx(scale, rel=0.03)
     assert abs(found.scale - scale) < 5.0 * found.scale_sigma
     np.testing.assert_allclose(found.velocities[-1], velocities[-1], atol=0.08)

@@ -1,13 +1,11 @@
 """Errors of a calibrated lens as a map of pixels, and images that are read through it."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from kiteline_agent.initialisation.lens_correction import TERMS, moved, rms_px, true_place
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraModel, CameraRig, Lens, Rectifier
 
@@ -15,7 +13,7 @@ LENS = np.array([0.004, 0.002, -0.002, -0.015, 0.02, -0.004, 0.003, 0.002])
 RADTAN = (-0.28, 0.07, 2e-4, 2e-5)
 
 
-def places() -> NDArray[np.float64]:
+def places() -> F64:
     x, y = np.meshgrid(np.linspace(-0.8, 0.8, 9), np.linspace(-0.5, 0.5, 7))
     return np.stack([x, y], axis=-1)
 
@@ -44,7 +42,7 @@ def test_a_corrected_image_shows_true_places(kind: Lens, distortion: tuple[float
     focal, centre = np.array([200.0, 198.0]), np.array([158.0, 121.0])
     for lens in (0.5 * LENS, -1.5 * LENS):
 
-        def corrected(uv: NDArray[np.float64], lens: NDArray[np.float64] = lens) -> NDArray[np.float64]:
+        def corrected(uv: F64, lens: F64 = lens) -> F64:
             return moved((uv - centre) / focal, lens) * focal + centre
 
         rectifier.correct_left(corrected)

@@ -1,14 +1,11 @@
 """Corrections of keyframes of the local map: taken over together, once they differ by more than errors."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.keyframes.reference import ReferenceKeyframe
@@ -27,7 +24,6 @@ from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import KEYPOINT_BITS, NO_KEYFRAME, KeyframeId, SubmapId
 from tests.agent.plain_landmarks import plain_landmarks
 
-F64 = NDArray[np.float64]
 CAMERA = RectifiedCamera(752, 480, 400.0, 400.0, 370.0, 240.0, 0.11, True, np.eye(4))
 CONFIG = AgentConfig()
 DEPTH_M = 4.0

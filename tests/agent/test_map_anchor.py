@@ -1,14 +1,11 @@
 """How far corrections move the map under the camera: with the landmarks in view, not with one keyframe."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.exchange.corrections import Corrections
@@ -17,12 +14,12 @@ from kiteline_agent.relocalisation.map_cache import MapCache
 from kiteline_agent.tracking.map_anchor import MapAnchor
 from kiteline_agent.tracking.track import Track
 from kiteline_codec.schema import CulledLandmarks, KeyframeHeader, KeyframePose, RefinedLandmarks
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, KeyframeId
 from tests.agent.plain_landmarks import plain_landmarks
 
-F64 = NDArray[np.float64]
 CAMERA = RectifiedCamera(752, 480, 450.0, 450.0, 370.0, 240.0, 0.11, True, np.eye(4))
 CONFIG = AgentConfig()
 LANDMARKS, IN_VIEW = 80, 60  # of each of three keyframes; the last one's are not tracked

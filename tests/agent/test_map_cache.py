@@ -1,23 +1,20 @@
 """The base's copies: kept within bounds, met by corners, and enough to find a lost frame."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.relocalisation.frame_features import FrameFeatures
 from kiteline_agent.relocalisation.map_cache import MapCache
 from kiteline_codec.schema import CachedKeyframe, CachedLandmarks, Key
+from kiteline_core.arrays import F64, I64, U8
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import KeyframeId, SubmapId, keyframe_id, submap_id
 from kiteline_hw.system.vocabulary import shipped_vocabulary
 
-F64 = NDArray[np.float64]
 CAMERA = RectifiedCamera(752, 480, 420.0, 420.0, 376.0, 240.0, 0.11, True, np.eye(4))
 HERE, THERE = submap_id(0, 1, 0), submap_id(3, 0, 0)
 
@@ -27,7 +24,7 @@ class World:
     """Points (n,3) on walls around the origin, with descriptors (n,32) that no two share."""
 
     points: F64
-    descriptor: NDArray[np.uint8]
+    descriptor: U8
 
     def seen(self, T_m_c: F64, rng: np.random.Generator, share: float = 0.6, noise_px: float = 0.5) -> FrameFeatures:
         """Corners of a view: some of the points in it, and as many others."""
@@ -43,7 +40,7 @@ class World:
             np.concatenate([self.descriptor[rows] ^ flips, rng.integers(0, 256, (n, 32), dtype=np.uint8)]),
         )
 
-    def in_view(self, T_m_c: F64) -> tuple[NDArray[np.int64], F64, F64]:
+    def in_view(self, T_m_c: F64) -> tuple[I64, F64, F64]:
         local = se3.transform(se3.inverse(T_m_c), self.points)
         z = np.maximum(local[:, 2], 1e-3)
         uv = local[:, :2] / z[:, None] * 420.0 + (376.0, 240.0)
@@ -104,7 +101,6 @@ def test_corners_match_cached_landmarks_and_give_the_camera_pose(world: World) -
     guess = true @ se3.exp(np.array([0.005, -0.004, 0.005, 0.001, 0.001, -0.0005]))
     seen = world.seen(true, rng)
     met = box.match_landmarks(se3.inverse(guess), HERE, seen)
-    assert met is not None
     assert len(met.corner) > 40
     error = se3.log(met.T_c_m @ true)
     assert np.linalg.norm(error[:3]) < 0.005
@@ -131,7 +127,6 @@ def test_a_lost_frame_is_found(world: World, turn: float) -> None:
     true = look(turn, (0.3, 0.2))
     seen = world.seen(true, rng)
     found = box.find(seen, {HERE}, 0)
-    assert found is not None
     assert found[0] == HERE
     assert np.linalg.norm(se3.log(found[1].T_c_m @ true)[:3]) < 0.02
     assert box.find(seen, {THERE}, 0) is None, "a submap that the agent cannot go on in"

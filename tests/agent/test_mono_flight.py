@@ -1,7 +1,5 @@
 """A monocular flight: it begins when two views give depth, keeps its own scale, and landmarks find their true depth."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 from itertools import pairwise
@@ -10,7 +8,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from kiteline_agent.agent import Agent
 from kiteline_agent.config import AgentConfig, LocalMapConfig
@@ -26,14 +23,12 @@ from kiteline_agent.tracking.frame_images import FrameImages
 from kiteline_agent.tracking.track import Track
 from kiteline_codec.channel import plain_pair
 from kiteline_codec.schema import NewLandmarks
+from kiteline_core.arrays import F64, U8
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraModel, CameraRig, Rectifier
 from kiteline_core.ids import NO_KEYFRAME, AgentId, submap_of_keyframe
 from kiteline_hw.sources.open import open_source
-
-F64 = NDArray[np.float64]
-U8 = NDArray[np.uint8]
 
 W, H, FOCAL = 320, 240, 220.0
 CAMERA = CameraModel(W, H, FOCAL, FOCAL, 159.5, 119.5)
@@ -171,7 +166,6 @@ def test_depths_follow_the_pose_by_images_not_the_fused_one(monkeypatch: pytest.
 
     monkeypatch.setattr(fused._camera.motion, "fuse", ahead)
     a, b = (step(one, frame(41)) for one in flights)
-    assert a.T_m_b is not None and b.T_m_b is not None
     assert np.linalg.norm(a.T_m_b[:3, 3] - b.T_m_b[:3, 3]) == pytest.approx(0.02, abs=1e-9)
     np.testing.assert_array_equal(alone.map.rho[known], fused.map.rho[known])
     assert (alone.map.rho[known] != before).any()
@@ -221,7 +215,7 @@ def test_a_second_start_takes_on_the_scale_of_the_first() -> None:
     opening = None
     for k in range(3, 20):
         opening = opening or start.add(context(k, FrameImages(build_pyramid(frame(k).left, 4), None, None)))
-    assert opening is not None and opening.median_depth_m == 14.0
+    assert opening.median_depth_m == 14.0
     depths = Rectifier(RIG).camera.bf / opening.points.disparity
     assert np.median(depths) == pytest.approx(14.0, rel=0.1)
     assert opening.t_ns == 3
@@ -280,7 +274,7 @@ def test_a_still_camera_with_an_imu_has_no_pose() -> None:
             stamps, 1e-3 * noise.normal(size=(10, 3)), np.array([0.0, -9.81, 0.0]) + 0.02 * noise.normal(size=(10, 3))
         )
         estimate = one.step(StepInput(Frame(t_ns, image), imu), t_ns).estimate
-        assert estimate is not None and estimate.initialising and not estimate.tracked
+        assert estimate.initialising and not estimate.tracked
 
 
 def test_without_samples_a_monocular_map_keeps_its_own_unit() -> None:

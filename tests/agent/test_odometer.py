@@ -1,7 +1,5 @@
 """The odometer against poses that are known: when it is believed, what it is worth, where it says that one is."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 
@@ -13,10 +11,10 @@ from hypothesis import strategies as st
 from kiteline_agent.config import OdometerConfig
 from kiteline_agent.motion.odometer import Odometer
 from kiteline_core import odometry
+from kiteline_core.arrays import F64
 from kiteline_core.frame import UNMEASURED, OdometryBatch
 from kiteline_core.geometry import se3
 
-F64 = np.ndarray
 FRAME_NS, SAMPLE_NS = 50_000_000, 20_000_000
 # a camera that looks ahead from a body whose x points ahead and z up, 0.3 m in front of it
 T_B_C = se3.from_rt(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.array([0.3, 0.0, 0.1]))
@@ -98,7 +96,6 @@ def test_a_good_odometer_is_believed_within_a_second_or_so_of_motion() -> None:
     assert len(flown.events) == 1
     assert flown.events[0].startswith("odometer: agrees with what is seen, its scale is ")
     report = flown.odometer.report()
-    assert report is not None
     assert report["scale"] == pytest.approx(1.0, abs=0.01)
     assert report["noise_m_s"] < 0.04
 
@@ -317,11 +314,9 @@ def test_wheels_tell_what_they_measure_alone() -> None:
 def test_the_monocular_unit_becomes_known(unit_m: float) -> None:
     flown = Flown(driven(6.0, 0.05), 6.0, unit_m=unit_m, metric=False)
     found = flown.odometer.metres_per_unit()
-    assert found is not None
     assert found[0] == pytest.approx(unit_m, rel=0.01)
     assert found[1] < 0.02 * unit_m
     early = Flown(driven(6.0, 0.05), 2.5, unit_m=unit_m, metric=False).odometer.metres_per_unit()
-    assert early is not None
     assert early[0] == pytest.approx(unit_m, rel=0.02)
     assert flown.odometer.predict(flown.pose, 6_000_000_000) is None  # not before the map is in metres
 
@@ -331,7 +326,6 @@ def test_a_slip_does_not_move_the_unit() -> None:
     velocity = batch.velocity.copy()
     velocity[(batch.t_ns > 3e9) & (batch.t_ns < 5e9)] *= 2.0
     found = Flown(replace(batch, velocity=velocity), 8.0, unit_m=2.0, metric=False).odometer.metres_per_unit()
-    assert found is not None
     assert found[0] == pytest.approx(2.0, rel=0.02)
 
 

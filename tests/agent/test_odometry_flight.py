@@ -1,7 +1,5 @@
 """Whole flights of an agent through a simulated room, with an odometer and without."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -14,12 +12,12 @@ from kiteline_agent.step import Estimate, Identity, StepInput
 from kiteline_codec.channel import RecordChannel, plain_pair
 from kiteline_codec.schema import KeyframeHeader, SubmapTie
 from kiteline_core import odometry
+from kiteline_core.arrays import F64
 from kiteline_core.frame import OdometryBatch
 from kiteline_core.geometry import se3
 from kiteline_core.ids import AgentId
 from tests.agent.room_flight import RoomFlight
 
-F64 = np.ndarray
 DARK = range(70, 110)  # 2 s
 
 

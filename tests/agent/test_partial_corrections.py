@@ -1,7 +1,5 @@
 """A disparity offset that was found has moved the local map: a part of the base's poses would tear it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,97 +1,96 @@
 """How certain poses are: errors of calibration carried along, noise that adds up, times without images."""
 
-from __future__ import annotations
-
 import math
-from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from kiteline_agent.config import CovarianceConfig
 from kiteline_agent.covariance import calibration_error_kernels as certainty_kernels
 from kiteline_agent.covariance.pose_covariance import PoseCovariance, adjoint
 from kiteline_agent.covariance.pose_quality import probability_good
+from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.tracking.pose_state import PoseState
+from kiteline_agent.tracking.track import Track
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
 from kiteline_core.ids import KeyframeId, SubmapId
 from tests.agent.seen_scenes import CAMERA, SHAPES, map_of, scene, seen_with, tracked
 
-F64 = NDArray[np.float64]
+X, NOTHING = scene(), np.zeros(SHAPES)  # points, and no error of calibration
+T_C_M = se3.exp(np.array([0.3, -0.1, 0.2, 0.05, -0.1, 0.08]))
+
+
+def begun(error: F64 = NOTHING, T_m_k: F64 | None = None, has_body: bool = False, **config: float) -> Any:
+    """A map of one keyframe as a rig with an error sees it, and the covariance of poses in it."""
+    local_map = map_of(seen_with(error, X, np.eye(4)), T_m_k)
+    of_poses = PoseCovariance(local_map, np.eye(4), CovarianceConfig(**config), has_body=has_body, has_depth=True)
+    return local_map, of_poses
+
+
+def tracked_at(local_map: LocalMap, T_c_m: F64, error: F64 = NOTHING) -> Track:
+    return tracked(local_map, seen_with(error, X, T_c_m), T_c_m)
 
 
 @pytest.mark.parametrize("shape", range(certainty_kernels.CALIBRATION))
 def test_what_an_error_of_calibration_does_to_a_pose_is_foreseen(shape: int) -> None:
-    X = scene()
-    T_c_m = se3.exp(np.array([0.3, -0.1, 0.2, 0.05, -0.1, 0.08]))
     error = np.zeros(SHAPES)
     error[shape] = 0.05
-    local_map = map_of(seen_with(error, X, np.eye(4)))
-    track = tracked(local_map, seen_with(error, X, T_c_m), T_c_m)
-    covariance = PoseCovariance(local_map, np.eye(4), CovarianceConfig(), has_body=False, has_depth=True)
+    local_map, covariance = begun(error)
+    track = tracked_at(local_map, T_C_M, error)
     covariance.update(track)
-    moved = se3.log(se3.inverse(track.T_c_m) @ T_c_m)  # on the left of T_m_c
+    moved = se3.log(se3.inverse(track.T_c_m) @ T_C_M)  # on the left of T_m_c
     np.testing.assert_allclose(covariance._shift @ error, moved, atol=0.04 * np.abs(moved).max() + 2e-6)
     assert np.abs(moved).max() > 1e-5
 
 
 def test_a_disparity_offset_that_was_found_moves_the_camera_to_where_it_is() -> None:
-    X, T_c_m = scene(), se3.exp(np.array([0.3, -0.1, 0.2, 0.05, -0.1, 0.08]))
     offset = np.array([0.3, -0.1, 0.2, 0.15, 0.1])
     error, edge = np.zeros(SHAPES), 376.0 / CAMERA.fx
     error[:5] = offset * [1.0, edge, edge, edge**2, edge**2]
-    local_map = map_of(seen_with(error, X, np.eye(4)))
-    track = tracked(local_map, seen_with(error, X, T_c_m), T_c_m)
-    covariance = PoseCovariance(local_map, np.eye(4), CovarianceConfig(), has_body=False, has_depth=True)
+    local_map, covariance = begun(error)
+    track = tracked_at(local_map, T_C_M, error)
     covariance.update(track)
     T_m_c = se3.exp(covariance.correct_disparities(offset)) @ track.T_m_c
-    before, after = (np.linalg.norm(se3.log(T_c_m @ T)) for T in (track.T_m_c, T_m_c))
+    before, after = (np.linalg.norm(se3.log(T_C_M @ T)) for T in (track.T_m_c, T_m_c))
     assert after < 0.1 * before
     np.testing.assert_allclose(local_map.T_m_k[0], np.eye(4), atol=1e-12)  # the first keyframe has no error
 
 
 def test_a_rig_that_may_be_worn_is_less_certain_until_it_is_known() -> None:
-    X, pose = scene(), PoseState()
-    local_map = map_of(seen_with(np.zeros(SHAPES), X, np.eye(4)))
-    T_c_m = se3.exp(np.array([0.3, -0.1, 0.2, 0.05, -0.1, 0.08]))
-    covariance = PoseCovariance(local_map, np.eye(4), CovarianceConfig(), has_body=False, has_depth=True)
-    covariance.update(tracked(local_map, seen_with(np.zeros(SHAPES), X, T_c_m), T_c_m))
-    good = covariance.of_poses(pose, se3.inverse(T_c_m))[0]
+    pose, (local_map, covariance) = PoseState(), begun()
+    covariance.update(tracked_at(local_map, T_C_M))
+    good = covariance.of_poses(pose, se3.inverse(T_C_M))[0]
     covariance.set_disparity_error(0.2 * np.eye(5), 0.5)
-    doubtful = covariance.of_poses(pose, se3.inverse(T_c_m))[0]
+    doubtful = covariance.of_poses(pose, se3.inverse(T_C_M))[0]
     covariance.set_disparity_error(np.zeros((5, 5)), 0.0)
     assert np.trace(doubtful[:3, :3]) > 4.0 * np.trace(good[:3, :3])
     assert np.linalg.eigvalsh(doubtful - good)[0] > -1e-12
-    np.testing.assert_allclose(covariance.of_poses(pose, se3.inverse(T_c_m))[0], good)
+    np.testing.assert_allclose(covariance.of_poses(pose, se3.inverse(T_C_M))[0], good)
 
 
 def test_rows_without_a_slope_rule_out_a_roll_and_nothing_else() -> None:
-    X, pose, T_c_m = scene(), PoseState(), se3.exp(np.array([0.3, -0.1, 0.2, 0.05, -0.1, 0.08]))
-    local_map = map_of(seen_with(np.zeros(SHAPES), X, np.eye(4)))
-    covariance = PoseCovariance(local_map, np.eye(4), CovarianceConfig(), has_body=False, has_depth=True)
-    covariance.update(tracked(local_map, seen_with(np.zeros(SHAPES), X, T_c_m), T_c_m))
-    usual = covariance.of_poses(pose, se3.inverse(T_c_m))[0]
+    pose, (local_map, covariance) = PoseState(), begun()
+    covariance.update(tracked_at(local_map, T_C_M))
+    usual = covariance.of_poses(pose, se3.inverse(T_C_M))[0]
     covariance.set_roll(0.02)
-    level = covariance.of_poses(pose, se3.inverse(T_c_m))[0]
+    level = covariance.of_poses(pose, se3.inverse(T_C_M))[0]
     assert np.linalg.eigvalsh(usual - level)[0] > -1e-12
     assert np.linalg.matrix_rank(usual - level, tol=1e-6 * np.trace(usual - level)) == 1  # the slope along y
     assert 0.0 < np.trace(usual - level) < 0.5 * np.trace(usual)
     covariance.set_roll(0.5)  # of a worn rig, whose disparities are estimated
-    np.testing.assert_allclose(covariance.of_poses(pose, se3.inverse(T_c_m))[0], usual)
+    np.testing.assert_allclose(covariance.of_poses(pose, se3.inverse(T_C_M))[0], usual)
 
 
 def test_disparity_errors_that_cancel_cost_less_than_their_parts() -> None:
-    X, pose, T_c_m = scene(), PoseState(), se3.exp(np.array([0.3, -0.1, 0.2, 0.05, -0.1, 0.08]))
-    local_map = map_of(seen_with(np.zeros(SHAPES), X, np.eye(4)))
-    config = CovarianceConfig(calibration_px=0.0)
-    covariance = PoseCovariance(local_map, np.eye(4), config, has_body=False, has_depth=True)
-    covariance.update(tracked(local_map, seen_with(np.zeros(SHAPES), X, T_c_m), T_c_m))
-    noise = covariance.of_poses(pose, se3.inverse(T_c_m))[0]
+    pose, (local_map, covariance) = PoseState(), begun(calibration_px=0.0)
+    covariance.update(tracked_at(local_map, T_C_M))
+    noise = covariance.of_poses(pose, se3.inverse(T_C_M))[0]
 
     def added(offset: F64) -> F64:
         covariance.set_disparity_error(np.outer(offset, offset), 0.0)
-        return covariance.of_poses(pose, se3.inverse(T_c_m))[0] - noise
+        return covariance.of_poses(pose, se3.inverse(T_C_M))[0] - noise
 
     offset = np.array([0.3, 0.0, 0.0, -0.9, 0.0])  # little is left where the points are
     parts = added(offset * [1, 0, 0, 0, 0]) + added(offset * [0, 0, 0, 1, 0])
@@ -100,21 +99,19 @@ def test_disparity_errors_that_cancel_cost_less_than_their_parts() -> None:
     assert np.linalg.matrix_rank(both, tol=1e-6 * np.trace(both)) == 1  # one known direction
     moved = covariance._shift[:, :5] @ (offset * covariance._at_edge)
     left = np.empty((6, 6))
-    left[:3, :3], left[:3, 3:], left[3:, 3:] = np.eye(3), -se3.skew(se3.inverse(T_c_m)[:3, 3]), T_c_m[:3, :3]
+    left[:3, :3], left[:3, 3:], left[3:, 3:] = np.eye(3), -se3.skew(se3.inverse(T_C_M)[:3, 3]), T_C_M[:3, :3]
     left[3:, :3] = 0.0
     np.testing.assert_allclose(both, np.outer(left @ moved, left @ moved), rtol=1e-6, atol=1e-12)
 
 
 def test_near_its_start_the_covariance_follows_every_few_centimetres() -> None:
     def deviations(step_m: float, frames: int) -> list[float]:
-        X = scene()
-        local_map = map_of(seen_with(np.zeros(SHAPES), X, np.eye(4)))
-        covariance = PoseCovariance(local_map, np.eye(4), CovarianceConfig(), has_body=False, has_depth=True)
+        local_map, covariance = begun()
         covariance.begin_submap(np.eye(4))
         out = []
         for k in range(frames):
             T_c_m = se3.exp(np.array([k * step_m, 0.0, 0.0, 0.0, 0.0, 0.0]))
-            covariance.update(tracked(local_map, seen_with(np.zeros(SHAPES), X, T_c_m), T_c_m))
+            covariance.update(tracked_at(local_map, T_c_m))
             cov = covariance.of_poses(PoseState(), se3.inverse(T_c_m))[0] - covariance._noise
             out.append(math.sqrt(cov[0, 0]))
         return out
@@ -126,54 +123,34 @@ def test_near_its_start_the_covariance_follows_every_few_centimetres() -> None:
 
 
 def test_the_error_of_a_keyframe_is_that_of_what_is_measured_against_it() -> None:
-    X = scene()
-    T_c_m = se3.exp(np.array([0.3, -0.1, 0.2, 0.05, -0.1, 0.08]))
-    nothing = np.zeros(SHAPES)
     moved = se3.exp(np.array([0.01, -0.02, 0.015, 0.002, -0.003, 0.004]))
-    local_map = map_of(seen_with(nothing, X, np.eye(4)), moved)
-    covariance = PoseCovariance(local_map, np.eye(4), CovarianceConfig(), has_body=False, has_depth=True)
+    (local_map, covariance), (true_map, alone) = begun(T_m_k=moved), begun()
     covariance._shift_k[0, :, 0] = se3.log(moved)
-    covariance.update(tracked(local_map, seen_with(nothing, X, T_c_m), T_c_m))
+    covariance.update(tracked_at(local_map, T_C_M))
+    alone.update(tracked_at(true_map, T_C_M))
     # observations in the moved map put the camera at moved @ T_m_c: the same perturbation on the left
-    np.testing.assert_allclose(covariance._shift[:, 0] - _alone(X, T_c_m)[:, 0], se3.log(moved), atol=2e-4)
-
-
-def _alone(X: F64, T_c_m: F64) -> F64:
-    local_map = map_of(seen_with(np.zeros(SHAPES), X, np.eye(4)))
-    covariance = PoseCovariance(local_map, np.eye(4), CovarianceConfig(), has_body=False, has_depth=True)
-    covariance.update(tracked(local_map, seen_with(np.zeros(SHAPES), X, T_c_m), T_c_m))
-    return covariance._shift
+    np.testing.assert_allclose(covariance._shift[:, 0] - alone._shift[:, 0], se3.log(moved), atol=2e-4)
 
 
 def test_noise_of_a_measured_pose_is_what_it_says() -> None:
     rng = np.random.default_rng(0)
-    X = scene()
-    T_c_m = se3.exp(np.array([0.3, -0.1, 0.2, 0.05, -0.1, 0.08]))
-    clean = seen_with(np.zeros(SHAPES), X, np.eye(4))
-    local_map = map_of(clean)
-    config = CovarianceConfig(calibration_px=0.0, least_rms=0.0)
-    covariance = PoseCovariance(local_map, np.eye(4), config, has_body=False, has_depth=True)
+    local_map, covariance = begun(calibration_px=0.0, least_rms=0.0)
     covariance.begin_submap(np.eye(4))
     nees = []
     for _ in range(100):
-        track = tracked(local_map, seen_with(np.zeros(SHAPES), X, T_c_m) + 0.15 * rng.normal(size=(120, 3)), T_c_m)
+        track = tracked(local_map, seen_with(NOTHING, X, T_C_M) + 0.15 * rng.normal(size=(120, 3)), T_C_M)
         covariance.update(track)
         T = se3.inverse(track.T_c_m)
-        good = se3.inverse(T_c_m)
+        good = se3.inverse(T_C_M)
         e = np.concatenate([good[:3, 3] - T[:3, 3], se3.so3_log(T[:3, :3].T @ good[:3, :3])])
         nees.append(e @ np.linalg.solve(covariance.of_poses(PoseState(), T)[0], e))
     assert 5.0 < np.mean(nees) < 7.2
 
 
 def test_what_an_imu_pulls_poses_by_adds_up_from_keyframe_to_keyframe() -> None:
-    X = scene()
-    clean = seen_with(np.zeros(SHAPES), X, np.eye(4))
-    local_map = map_of(clean)
-    covariance = PoseCovariance(
-        local_map, np.eye(4), CovarianceConfig(calibration_px=0.0), has_body=False, has_depth=True
-    )
+    local_map, covariance = begun(calibration_px=0.0)
     covariance.begin_submap(np.eye(4))
-    track = tracked(local_map, clean, np.eye(4))
+    track = tracked_at(local_map, np.eye(4))
     pull = np.array([0.0, 0.0, 0.004, 0.0, 0.001, 0.0])
 
     def deviation() -> F64:
@@ -195,9 +172,7 @@ def test_what_an_imu_pulls_poses_by_adds_up_from_keyframe_to_keyframe() -> None:
 
 
 def test_a_wrong_place_in_the_body_shows_once_the_body_turns() -> None:
-    config = CovarianceConfig(calibration_px=0.0, extrinsic_rad=1e-3, extrinsic_m=0.0)
-    local_map = map_of(seen_with(np.zeros(SHAPES), scene(), np.eye(4)))
-    covariance = PoseCovariance(local_map, np.eye(4), config, has_body=True, has_depth=True)
+    _, covariance = begun(has_body=True, calibration_px=0.0, extrinsic_rad=1e-3, extrinsic_m=0.0)
     covariance.begin_submap(np.eye(4))
     assert not covariance.of_poses(PoseState(), np.eye(4))[0].any()
     half = se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, np.pi]))
@@ -206,14 +181,9 @@ def test_a_wrong_place_in_the_body_shows_once_the_body_turns() -> None:
 
 
 def test_dead_reckoning_grows_uncertain_and_the_odometry_keeps_it() -> None:
-    X = scene()
-    clean = seen_with(np.zeros(SHAPES), X, np.eye(4))
-    local_map = map_of(clean)
-    config = replace(CovarianceConfig(), calibration_px=0.0)
-    covariance = PoseCovariance(local_map, np.eye(4), config, has_body=True, has_depth=True)
-    pose = PoseState()
+    pose, (local_map, covariance) = PoseState(), begun(has_body=True, calibration_px=0.0)
     covariance.begin_submap(np.eye(4))
-    covariance.update(tracked(local_map, clean, np.eye(4)))
+    covariance.update(tracked_at(local_map, np.eye(4)))
     before = covariance.of_poses(pose, np.eye(4))[1]
     sizes = []
     for _ in range(20):
@@ -223,7 +193,7 @@ def test_dead_reckoning_grows_uncertain_and_the_odometry_keeps_it() -> None:
     assert np.sqrt(sizes[-1]) == pytest.approx(1.0, abs=0.1)  # half of 2 m/s^2 for a second
     covariance.before_map_change(pose, np.eye(4), SubmapId(0))
     pose.move_map(se3.exp(np.array([0.4, 0.0, 0.0, 0.0, 0.0, 0.3])))
-    covariance.update(tracked(local_map, clean, np.eye(4)))
+    covariance.update(tracked_at(local_map, np.eye(4)))
     assert covariance.of_poses(PoseState(), np.eye(4))[0][0, 0] < 1e-4  # seen in the map again
     after = covariance.of_poses(pose, pose.T_m_c)[1]
     assert np.trace(after[:3, :3]) == pytest.approx(3 * sizes[-1], rel=0.05)  # but nobody knows the way there
@@ -231,11 +201,9 @@ def test_dead_reckoning_grows_uncertain_and_the_odometry_keeps_it() -> None:
 
 
 def test_dead_reckoning_from_an_unknown_speed_is_worse() -> None:
-    config = replace(CovarianceConfig(), unknown_velocity_m_s=5.0, unknown_rate_rad_s=1.0)
     sigma = []
     for moves in (True, False):
-        covariance = PoseCovariance(map_of(seen_with(np.zeros(SHAPES), scene(), np.eye(4))), np.eye(4), config,
-                              has_body=False, has_depth=True)  # fmt: skip
+        _, covariance = begun(unknown_velocity_m_s=5.0, unknown_rate_rad_s=1.0)
         covariance.begin_submap(np.eye(4))
         covariance.dead_reckon(0.3, None, moves=moves)
         sigma.append(np.sqrt(np.diag(covariance.of_poses(PoseState(), np.eye(4))[0])))
@@ -291,9 +259,8 @@ def test_the_kernel_of_poses_composes_as_written() -> None:
 
 @pytest.mark.parametrize("rate_hz", [5.0, 20.0])
 def test_low_quality_after_a_far_relocalisation_lasts_as_long_at_any_frame_rate(rate_hz: float) -> None:
-    local_map = map_of(seen_with(np.zeros(SHAPES), scene(), np.eye(4)))
-    track = tracked(local_map, seen_with(np.zeros(SHAPES), scene(), np.eye(4)), np.eye(4))
-    covariance = PoseCovariance(local_map, np.eye(4), CovarianceConfig(), has_body=False, has_depth=True)
+    local_map, covariance = begun()
+    track = tracked_at(local_map, np.eye(4))
     covariance._far_relocalisation = True
     covariance.confirm_relocalisation()
     frames, sure = 0, 1e-8 * np.eye(6)

@@ -1,7 +1,5 @@
 """What flights found of a rig is kept in a file, and the next flight begins with it."""
 
-from __future__ import annotations
-
 import tomllib
 from dataclasses import replace
 from pathlib import Path
@@ -64,7 +62,6 @@ def test_a_file_holds_what_was_known(rows: np.ndarray, disparity: np.ndarray) ->
     assert known.is_of(CAMERA)
     assert np.allclose(known.rows, rows, atol=6e-4)
     back = known.rectified()
-    assert back is not None
     assert (back.width, back.fx, back.baseline_m) == (CAMERA.width, CAMERA.fx, CAMERA.baseline_m)
 
 
@@ -99,12 +96,10 @@ def test_an_offset_that_was_not_found_is_not_known_to_be_zero() -> None:
     assert kept == small
     for rig, sigma_px in ((found, begun.sigma_px), (vague, held.sigma_px)):
         kept = flown(rig)[0].known_rig()
-        assert kept is not None
         assert kept.disparity_sigma_px == pytest.approx(sigma_px, abs=1e-4)
 
 
 def disparities(agent: Agent) -> DisparityAlignment:
-    assert agent.right_camera is not None
     assert agent.right_camera.disparities is not None
     return agent.right_camera.disparities
 
@@ -158,7 +153,6 @@ def test_an_imu_is_compared_with_one_place_of_the_camera() -> None:
     agent = Agent(moved, ImuCalibration(), AgentConfig(known_rig=known), Identity(AgentId(0), 0), NoBaseChannel())
     assert agent.motion_reports()["time_offset"]["applied_ms"] == 0.0
     found = agent.known_rig()
-    assert found is not None
     assert found.imu == KnownImuConfig()
     assert found.rows_px == known.rows_px
 
@@ -167,7 +161,7 @@ def test_one_eye_keeps_its_imu() -> None:
     mono = CameraRig(LEFT, None, np.eye(4), None)
     camera = Rectifier(mono).camera
     known = KnownRigConfig().updated(camera, None, IMU)
-    assert known is not None and known.rows_px == ()
+    assert known.rows_px == ()
     agent = Agent(mono, ImuCalibration(), AgentConfig(known_rig=known), Identity(AgentId(0), 0), NoBaseChannel())
     assert agent.motion_reports()["time_offset"]["applied_ms"] == -4.0
 
@@ -203,6 +197,6 @@ def test_an_imu_is_kept_with_the_place_of_the_camera_that_it_was_compared_with()
     moved = replace(CAMERA, T_b_c=se3.from_rt(se3.so3_exp(np.array([0.0, 0.01, 0.0])), np.zeros(3)))
     found = replace(IMU, offset_s=(0.002, 0.0003))
     updated = known.updated(moved, None, found)
-    assert updated is not None and updated.imu == found and updated.knows_imu_of(moved)
+    assert updated.imu == found and updated.knows_imu_of(moved)
     assert not updated.knows_imu_of(CAMERA)
     assert updated.rows_px == known.rows_px

@@ -1,19 +1,17 @@
 """Rows of a rolling shutter: moved to the frame's time as the true motion says, and flights that gain by it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from kiteline_agent.agent import Agent
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_agent.step import Identity, StepInput
 from kiteline_agent.tracking.rolling_shutter import RollingShutter
+from kiteline_core.arrays import F64
 from kiteline_core.frame import Frame, ImuBatch, OdometryBatch
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import Rectifier
@@ -21,7 +19,6 @@ from kiteline_core.ids import AgentId
 from kiteline_hw.sim.sensors.rig import make_rig
 from kiteline_hw.sim.source import SimSource, open_sim
 
-F64 = NDArray[np.float64]
 READOUT_S = 0.02
 TWIST = np.array([0.8, -0.5, 0.9, 0.6, -0.7, 0.5])
 
@@ -51,7 +48,6 @@ def test_a_pixel_is_moved_to_where_the_frame_would_show_it() -> None:
 
 def test_rows_are_those_of_the_raw_image_and_the_middle_one_stays() -> None:
     rolling = shutter(TWIST)
-    assert rolling.grid is not None
     v, u = 200, 600
     times = rolling.row_times_s(np.array([[u, v], [u, 10.0], [u, 470.0]], np.float64))
     assert times[0] == pytest.approx(READOUT_S * ((rolling.grid[v // 4, u // 4, 1] + 0.5) / 480 - 0.5))
@@ -76,7 +72,6 @@ def step_error_m(rolled: Rolled, readout_s: float, begin: int) -> float:
     rig = replace(source.rig, left=replace(source.rig.left, readout_s=readout_s))
     agent = Agent(rig, source.imu, AgentConfig(), Identity(AgentId(0), 0), NoBaseChannel())
     found, imu, frames, truth = [], None, 0, source.ground_truth
-    assert truth is not None
     for item in items:
         if isinstance(item, ImuBatch):
             imu = item
@@ -84,7 +79,6 @@ def step_error_m(rolled: Rolled, readout_s: float, begin: int) -> float:
             frames += 1
             if frames > begin:
                 estimate = agent.step(StepInput(item, imu), item.t_ns).estimate
-                assert estimate is not None
                 assert estimate.tracked
                 found.append(estimate.T_o_b)
     true = truth.T_w_b[begin:]

@@ -1,22 +1,19 @@
 """Rows of the right image: offsets are measured in two dimensions, and a worn right camera is read where it looks."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 
 import cv2
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from kiteline_agent.imaging import row_kernels
 from kiteline_agent.imaging.features import build_pyramid
 from kiteline_agent.imaging.row_alignment import RowAlignment, RowConfig, terms
+from kiteline_core.arrays import F64, U8, Bool
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraModel, CameraRig, Lens, Rectifier
 
-U8 = NDArray[np.uint8]
 NO_GRID = np.zeros((0, 0, 2), np.float32)
 LEVELS = 4  # as in flights: kernels are compiled for each number of levels
 WIDTH, HEIGHT, FOCAL, DEPTH_M = 640, 400, 420.0, 3.0
@@ -25,7 +22,7 @@ TURNED = np.array([2.5e-3, -1e-3, 1.5e-3])  # rad: pitch, yaw and roll of the ri
 UV = np.array([[float(x), float(y)] for y in range(40, 370, 18) for x in range(90, 600, 22)])
 
 
-def wall(x_m: NDArray[np.float64], y_m: NDArray[np.float64]) -> U8:
+def wall(x_m: F64, y_m: F64) -> U8:
     """Texture of a wall at points in m, with edges in all directions; without repetition."""
     rng = np.random.default_rng(3)
     waves = rng.normal(0.0, 14.0, (60, 2))
@@ -34,7 +31,7 @@ def wall(x_m: NDArray[np.float64], y_m: NDArray[np.float64]) -> U8:
     return np.clip(128 + 12 * np.asarray(value), 0, 255).astype(np.uint8)
 
 
-def image(camera: CameraModel, T_c_w: NDArray[np.float64]) -> U8:
+def image(camera: CameraModel, T_c_w: F64) -> U8:
     """A camera's image of the wall, which lies in z = DEPTH_M of w."""
     u, v = np.meshgrid(np.arange(WIDTH, dtype=np.float64), np.arange(HEIGHT, dtype=np.float64))
     pixels = np.stack([u.ravel(), v.ravel()], 1)[:, None]
@@ -57,13 +54,13 @@ def eye(lens: Lens, right: bool, turned: tuple[float, ...]) -> U8:
     return image(told_camera(lens), se3.inverse(true) if right else np.eye(4))
 
 
-def flight(lens: Lens, turned: NDArray[np.float64]) -> tuple[Rectifier, U8, U8]:
+def flight(lens: Lens, turned: F64) -> tuple[Rectifier, U8, U8]:
     """The rectifier of a told calibration, and a pair by a rig whose right camera is turned against it."""
     rig = CameraRig(told_camera(lens), told_camera(lens), np.eye(4), T_C_R)
     return Rectifier(rig), eye(lens, False, (0.0, 0.0, 0.0)), eye(lens, True, tuple(turned.tolist()))
 
 
-def measured(rectifier: Rectifier, left: U8, right: U8) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def measured(rectifier: Rectifier, left: U8, right: U8) -> tuple[F64, Bool]:
     """Row offsets of UV."""
     eyes = [build_pyramid(eye, LEVELS) for eye in (rectifier.left(left), right)]
     grid = NO_GRID if rectifier.right_grid is None else rectifier.right_grid
@@ -74,7 +71,7 @@ def measured(rectifier: Rectifier, left: U8, right: U8) -> tuple[NDArray[np.floa
     return offset, found
 
 
-def expected(rectifier: Rectifier, uv: NDArray[np.float64], turned: NDArray[np.float64]) -> NDArray[np.float64]:
+def expected(rectifier: Rectifier, uv: F64, turned: F64) -> F64:
     """Rows in the image of a turned right camera less those of a true one."""
     camera = rectifier.camera
     right = uv - [camera.bf / DEPTH_M, 0.0]
@@ -135,7 +132,7 @@ def test_a_true_rig_is_left_alone(lens: Lens) -> None:
     (np.array([2e-4, 0.0, 0.0]), -1.25, 0.0),  # a tenth of a pixel
     (np.array([0.0, 5e-3, 0.0]), -1.25, 0.5),  # corners are off by more than wear explains: another rectification
 ])  # fmt: skip
-def test_rows_tell_whether_a_rig_is_worn(lens: Lens, turned: NDArray[np.float64], least: float, most: float) -> None:
+def test_rows_tell_whether_a_rig_is_worn(lens: Lens, turned: F64, least: float, most: float) -> None:
     rectifier, left, right = flight(lens, turned)
     rows = RowAlignment(rectifier, RowConfig())
     assert rows.worn_evidence == 0.0

@@ -1,18 +1,13 @@
 """The scale of a monocular map, watched by displacements of images and IMU: its deviation is honest."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from kiteline_agent.inertial.inertial_config import ScaleFilterConfig
 from kiteline_agent.inertial.preintegration import Samples
 from kiteline_agent.inertial.scale_filter import ScaleFilter
 from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry import se3
-
-F64 = NDArray[np.float64]
 
 CALIBRATION = ImuCalibration()
 GRAVITY = np.array([0.0, 0.0, -9.81])

@@ -1,7 +1,5 @@
 """Corrections reach the live pose at once, or no faster than asked for."""
 
-from __future__ import annotations
-
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st

@@ -1,22 +1,18 @@
 """Steps between keyframes: they tile the flight, and are left out where they would not."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from kiteline_agent.inertial.preintegration import Samples
 from kiteline_agent.motion.step_recorder import StepRecorder
 from kiteline_codec.schema import messages
+from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry import se3
 from kiteline_core.ids import AgentId, keyframe_id, submap_id
-
-F64 = NDArray[np.float64]
 
 FRAME_NS = 50_000_000
 SUBMAP = submap_id(AgentId(0), 0, 0)
@@ -59,7 +55,6 @@ def recorder(tracker: Any, frames: int) -> StepRecorder:
 
 def test_steps_tile_the_time_between_two_keyframes(tracker: Any) -> None:
     record = recorder(tracker, 9).take(K1, 8 * FRAME_NS, tracker)
-    assert record is not None
     assert (record.keyframe, record.since) == (K1, K0)
     assert np.allclose(record.dt_s, [0.15, 0.15, 0.1])
     T = np.eye(4)
@@ -80,7 +75,6 @@ def test_the_next_steps_begin_at_the_keyframe(tracker: Any) -> None:
     for n in range(9, 13):
         steps.see(n * FRAME_NS, pose(n), tracker)
     record = steps.take(K2, 12 * FRAME_NS, tracker)
-    assert record is not None
     assert record.since == K1
     assert record.dt_s.sum() == pytest.approx(0.2)
 
@@ -115,8 +109,6 @@ def test_a_map_that_moves_does_not_change_steps(tracker: Any) -> None:
     still.see(8 * FRAME_NS, pose(8), tracker)
     moved.see(8 * FRAME_NS, T_new_old @ pose(8), tracker)
     a, b = (steps.take(K1, 8 * FRAME_NS, tracker) for steps in (still, moved))
-    assert a is not None
-    assert b is not None
     assert np.allclose(a.moved, b.moved, atol=1e-9)
 
 
@@ -127,7 +119,6 @@ def test_a_new_submap_at_a_keyframe_continues_the_chain(tracker: Any) -> None:
     steps.restart(8 * FRAME_NS, elsewhere @ pose(8))
     steps.see(9 * FRAME_NS, elsewhere @ pose(9), tracker)
     record = steps.take(K2, 9 * FRAME_NS, tracker)
-    assert record is not None
     assert np.allclose(record.moved[0], (se3.inverse(pose(8)) @ pose(9))[:3, 3])
 
 

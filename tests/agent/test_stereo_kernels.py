@@ -1,13 +1,11 @@
 """Stereo along the row: against a plain search, and against known sub-pixel disparities."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.imaging import stereo_kernels
 from kiteline_agent.imaging.features import build_pyramid
+from kiteline_core.arrays import U8
 from kiteline_core.geometry.cameras import CameraModel, CameraRig, Lens, Rectifier
 from kiteline_core.geometry.se3 import from_rt, so3_exp
 
@@ -16,9 +14,7 @@ RECTIFIED = np.zeros((0, 0, 2), np.float32)
 LEVELS = 4  # as in flights: kernels are compiled for each number of levels
 
 
-def pair(
-    seed: int, disparity: float, rows: int = 200, columns: int = 320
-) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+def pair(seed: int, disparity: float, rows: int = 200, columns: int = 320) -> tuple[U8, U8]:
     """Left and right image of a wall at one disparity, with a little noise."""
     rng = np.random.default_rng(seed)
     wide = cv2.GaussianBlur(rng.standard_normal((rows, columns + 80)), (0, 0), 1.5)
@@ -48,7 +44,7 @@ def test_search_then_refinement_recover_the_disparity() -> None:
         assert np.percentile(np.abs(found_px[found] - disparity), 90) < 0.15
 
 
-def reference_search(left: NDArray[np.uint8], right: NDArray[np.uint8], x: int, y: int, reach: int) -> int:
+def reference_search(left: U8, right: U8, x: int, y: int, reach: int) -> int:
     """Best integer disparity by zero-mean SAD, written plainly."""
     patch = left[y - RADIUS : y + RADIUS + 1, x - RADIUS : x + RADIUS + 1].astype(np.int64)
     costs = []

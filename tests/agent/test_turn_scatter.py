@@ -1,20 +1,17 @@
 """Rotations by images that scatter against the gyro: people who drag the map must not pass for a worn IMU."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from kiteline_agent.inertial.calibration import self_calibration
 from kiteline_agent.inertial.calibration.pose_chain import Link, PoseChain
 from kiteline_agent.inertial.calibration.turn_scatter import added_variance
 from kiteline_agent.inertial.sample_buffer import SampleBuffer
+from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuBatch
 from kiteline_core.geometry import se3
 from tests.agent.test_imu_self_calibration import CALIBRATION, GYRO, Flight, applied, calibrated, flight
 
-F64 = NDArray[np.float64]
 IMAGE_RAD = 4e-4
 
 

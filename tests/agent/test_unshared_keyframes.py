@@ -1,7 +1,5 @@
 """Keyframes for the tracker alone: a link that carries few keyframes does not thin out the agent's own map."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any

@@ -1,7 +1,5 @@
 """What corrections move the whole map by is left out of the live pose; what changes its shape is not."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from unittest.mock import MagicMock
 
@@ -9,7 +7,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from kiteline_agent.config import AgentConfig, SmoothingConfig
 from kiteline_agent.exchange.corrections import Corrections
@@ -18,12 +15,12 @@ from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.mapping.pose_report import PoseReport
 from kiteline_agent.relocalisation.map_cache import MapCache
 from kiteline_codec.schema import KeyframeHeader, KeyframePose, SubmapPlacement
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, keyframe_id, submap_id
 from tests.agent.plain_landmarks import plain_landmarks
 
-F64 = NDArray[np.float64]
 SECOND_NS = 1_000_000_000
 SMALL = se3.exp(np.array([0.003, -0.002, 0.001, 0.0005, -0.001, 0.0015]))  # within all limits
 
@@ -145,7 +142,6 @@ def test_live_poses_follow_a_loop_closure_but_no_turn_of_the_map(drift_m: float)
     T_o_m = held @ se3.inverse(local_map.T_m_k[4])  # odometry does not move
     for n in range(2, 1200):
         now = corrections.in_world(SUBMAP, local_map.T_m_k[4], T_o_m, SECOND_NS + n * 50_000_000, metric=True)
-    assert said is not None and now is not None
     off_m = float(np.linalg.norm(now[:3, 3] - (drift @ said)[:3, 3]))
     if drift_m == 0.0:
         assert off_m < 1e-3  # of 6 mm that the turn moves it
@@ -171,6 +167,5 @@ def test_tiles_are_read_where_the_base_has_the_vehicle_while_the_live_pose_follo
     camera.pose.T_o_m = held @ se3.inverse(local_map.T_m_k[4])  # odometry does not move
     said = report.report(MagicMock(t_ns=SECOND_NS + 50_000_000), outcome)
     of_tiles = report.in_base_map(said.T_o_b)
-    assert of_tiles is not None and said.T_w_b is not None
     assert np.allclose(of_tiles, local_map.T_m_k[4], atol=1e-9)
     assert np.linalg.norm(said.T_w_b[:3, 3] - of_tiles[:3, 3]) > 0.2

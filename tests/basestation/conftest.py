@@ -1,21 +1,17 @@
 """A synthetic flight: points on the walls of a room, keyframes along a path, a forgetful tracker, noisy pixels."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from kiteline_codec.schema import CameraIntrinsics, KeyframeHeader, NewLandmarks, Observations, Record
+from kiteline_core.arrays import F64, I64, U8
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, keyframe_id, point_id, submap_id
 from kiteline_core.places.place_index import Vocabulary, nodes
-
-F64 = NDArray[np.float64]
 
 
 @dataclass
@@ -44,9 +40,9 @@ class Scene:
     """Points (n,3) with descriptors (n,32), sizes and directions (n,), and the way through them: turns -> T_w_k."""
 
     world: F64
-    descriptors: NDArray[np.uint8]
+    descriptors: U8
     size: F64
-    direction: NDArray[np.int64]
+    direction: I64
     path: Callable[[float], F64]
 
 

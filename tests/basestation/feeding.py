@@ -1,7 +1,5 @@
 """Feeds the records of flights to a mapper; its jobs are run between two steps."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Any

@@ -1,11 +1,11 @@
 """Stores with some values."""
 
-from __future__ import annotations
-
+import sqlite3
+from contextlib import closing
 from pathlib import Path
 
 from kiteline_basestation.store.saved_map import SavedMap, SavedValues
-from kiteline_basestation.store.store import Store, batch_of
+from kiteline_basestation.store.store import FILE, Store, batch_of
 from kiteline_codec.schema import Key
 from kiteline_core.ids import AgentId
 
@@ -19,3 +19,9 @@ def filled(folder: Path, rows: int = 200) -> SavedMap:
     saved = store.load()
     store.close()
     return saved
+
+
+def change(folder: Path, sql: str) -> None:
+    """Alter the file of a store behind the base's back."""
+    with closing(sqlite3.connect(folder / FILE)) as db:
+        db.executescript(sql)

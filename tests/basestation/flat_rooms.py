@@ -1,14 +1,11 @@
 """Rooms of walls seen from above, cameras in them, and the column scans that they see."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
 from kiteline_core.ground.column_scan import ColumnScan
 
-F64 = NDArray[np.float64]
 HEIGHT_M = 1.0  # of the camera above the ground
 
 

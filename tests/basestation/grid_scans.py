@@ -1,14 +1,12 @@
 """Scans of a room that is known, for tests of the grid."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.config import GridConfig
 from kiteline_basestation.grid.grid_view import dense
 from kiteline_basestation.grid.kept_scan import KeptScan, keep
 from kiteline_basestation.grid.scan_grid import ScanGrid
+from kiteline_core.arrays import F64, I8
 from kiteline_core.ground.column_scan import ColumnScan
 from tests.basestation.flat_rooms import ROOM, camera, circle, scan_of
 
@@ -34,7 +32,7 @@ def drawn(scans: list[tuple[KeptScan, tuple[float, float, float]]], config: Grid
     return grid
 
 
-def at(grid: ScanGrid, x: NDArray[np.float64] | float, y: NDArray[np.float64] | float) -> NDArray[np.int8]:
+def at(grid: ScanGrid, x: F64 | float, y: F64 | float) -> I8:
     cells, corner, cell = dense(grid, 0)
     rows = np.floor((np.asarray(y) - corner[1]) / cell).astype(int)
     return np.asarray(cells[rows, np.floor((np.asarray(x) - corner[0]) / cell).astype(int)])

@@ -1,16 +1,13 @@
 """Inertial steps of a body that flies a curve."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
 
-F64 = NDArray[np.float64]
 GRAVITY = np.array([0.0, 0.0, -9.81])
 T_B_C = se3.from_rt(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.array([0.1, 0.02, -0.05]))
 FINE = 1e-2  # s between two samples

@@ -1,7 +1,5 @@
 """The base's batches of corrections: one after another, sized by the link, nothing lost, nothing overtaken."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any

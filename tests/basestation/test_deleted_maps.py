@@ -1,7 +1,5 @@
 """Maps that are deleted or forgotten leave their memory to the next ones, and nothing else."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any

@@ -1,14 +1,11 @@
 """What all disparities are off by is found by bundles of the whole map, and taken off."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.job_kinds import run_job
@@ -23,13 +20,13 @@ from kiteline_codec.schema import (
     Record,
     StereoAlignment,
 )
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.geometry.disparity_offset import none, terms
 from kiteline_core.ids import AgentId
 from tests.basestation.feeding import WITHOUT_GRID
 
-F64 = NDArray[np.float64]
 MakeFlight = Callable[..., Any]
 FOCAL, CX, CY = 420.0, 376.0, 240.0
 BF = FOCAL * 0.11

@@ -1,18 +1,15 @@
-"""Pose graph optimisation: drift is spread over the path, wrong loops have little effect."""
-
-from __future__ import annotations
+"""Pose graphs with and without scales."""
 
 import time
+from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.config import GraphConfig
-from kiteline_basestation.merging.essential_graph import GraphInputs, optimise, residuals
-from kiteline_core.geometry import se3
+from kiteline_basestation.merging.essential_graph import GraphInputs, Scaled, optimise, residuals
+from kiteline_core.arrays import F64
+from kiteline_core.geometry import se3, sim3
 from tests.yardstick import slowness
-
-F64 = NDArray[np.float64]
 
 
 def ring(n: int, per_turn: int, loops: int, wrong: int = 0, seed: int = 0) -> tuple[F64, GraphInputs]:
@@ -96,3 +93,95 @@ def test_a_thousand_keyframes_take_milliseconds() -> None:
         optimise(inputs)
         took.append(time.process_time() - begin)
     assert min(took) < 0.1 * slowness()  # the bar is 0.05 s; this only says that it is no order of magnitude
+
+
+def drifting_ring(
+    n: int, per_turn: int, loops: int, growth: float = 0.0005, seed: int = 0
+) -> tuple[F64, F64, GraphInputs]:
+    """Poses around a circle, seen by one camera whose unit shrinks: lengths grow with each pose."""
+    rng = np.random.default_rng(seed)
+    angle = 2 * np.pi * np.arange(n) / per_turn
+    true = np.array(
+        [
+            se3.from_rt(se3.so3_exp(np.array([0.0, 0.0, a])), np.array([9 * np.cos(a), 9 * np.sin(a), 0.01 * i]))
+            for i, a in enumerate(angle.tolist())
+        ]
+    )
+    unit = np.exp(growth * np.arange(n))
+    start, edges, between, scale = [true[0]], [], [], []
+    for i in range(1, n):
+        noise = se3.exp(np.concatenate([rng.normal(0, 0.002, 3), rng.normal(0, 0.0002, 3)]))
+        between.append(sim3.with_scaled_translation(se3.inverse(true[i - 1]) @ true[i] @ noise, unit[i - 1]))
+        edges.append((i - 1, i))
+        start.append(start[-1] @ between[-1])
+    for i in range(2, n, 2):
+        edges.append((i - 2, i))
+        between.append(se3.inverse(start[i - 2]) @ start[i])
+    scale += [1.0] * len(edges)
+    near = len(edges)
+    for a in rng.integers(0, n - per_turn, loops).tolist():
+        edges.append((a, a + per_turn))
+        between.append(sim3.with_scaled_translation(se3.inverse(true[a]) @ true[a + per_turn], unit[a]))
+        scale.append(unit[a] / unit[a + per_turn])
+    loop = np.arange(len(edges)) >= near
+    scaled = Scaled(np.ones(n, np.bool_), np.array(scale), np.where(loop, 0.01, 0.003))
+    return true, unit, GraphInputs(
+        np.arange(n), np.array(start), np.arange(n) == 0, np.array(edges), np.array(between),
+        np.tile([0.01, 0.003], (len(edges), 1)), loop, GraphConfig(), scaled,
+    )  # fmt: skip
+
+
+def test_loops_correct_scale_drift() -> None:
+    true, unit, inputs = drifting_ring(200, 60, 12)
+    result = optimise(inputs)
+    rigid = optimise(replace(inputs, scaled=None))
+    assert rms(result.T_w_k, true) < 0.3 * rms(inputs.T_w_k, true)
+    assert rms(result.T_w_k, true) < 0.7 * rms(rigid.T_w_k, true)
+    assert np.abs(np.log(result.scale * unit)).max() < 0.03  # it was up to 0.1
+    assert np.array_equal(result.T_w_k[0], inputs.T_w_k[0])
+    assert result.scale[0] == 1.0
+    rotations = result.T_w_k[:, :3, :3]
+    assert np.allclose(rotations @ np.swapaxes(rotations, 1, 2), np.eye(3), atol=1e-9)
+    assert np.array_equal(result.T_w_k, optimise(inputs).T_w_k)
+
+
+def test_metric_submaps_keep_their_scale() -> None:
+    _, _, inputs = drifting_ring(200, 60, 12)
+    assert inputs.scaled is not None
+    free = np.arange(200) >= 100
+    result = optimise(replace(inputs, scaled=replace(inputs.scaled, free=free)))
+    assert np.array_equal(result.scale[~free], np.ones(100))
+    assert result.scale[free].min() < 0.98
+
+
+def test_without_drift_it_is_the_rigid_graph() -> None:
+    _, _, inputs = drifting_ring(120, 60, 6, growth=0.0)
+    assert inputs.scaled is not None
+    held = replace(inputs, scaled=replace(inputs.scaled, free=np.zeros(120, np.bool_)))
+    assert rms(optimise(held).T_w_k, optimise(replace(inputs, scaled=None)).T_w_k) < 1e-3
+
+
+def test_result_is_a_local_minimum() -> None:
+    """Numerically: whatever moves or stretches a keyframe makes the sum of squares larger."""
+    _, _, inputs = drifting_ring(40, 30, 3, growth=0.001)
+    inputs = replace(inputs, config=replace(inputs.config, huber=1e6, stop=1e-12))
+    result = optimise(inputs)
+
+    def cost(T_w_k: F64, scale: F64) -> float:
+        return float(np.sum(residuals(inputs, T_w_k, scale) ** 2))
+
+    least, rng = cost(result.T_w_k, result.scale), np.random.default_rng(1)
+    for _ in range(60):
+        i, poses, scale = int(rng.integers(1, 40)), result.T_w_k.copy(), result.scale.copy()
+        step = rng.normal(0.0, 1.0, 7) * np.array([0.02] * 3 + [0.01] * 3 + [0.01])
+        poses[i] = poses[i] @ se3.exp(step[:6])
+        scale[i] *= np.exp(step[6])
+        assert cost(poses, scale) > least * (1.0 - 1e-3)
+
+
+def test_a_thousand_keyframes_with_scales_take_milliseconds() -> None:
+    _, _, inputs = drifting_ring(1000, 250, 20)
+    optimise(inputs)
+    begin = time.process_time()
+    optimise(inputs)
+    assert time.process_time() - begin < 0.3 * slowness()  # 0.05 s on an idle core

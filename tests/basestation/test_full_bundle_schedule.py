@@ -1,7 +1,5 @@
 """When whole maps are bundled."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

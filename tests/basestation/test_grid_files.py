@@ -1,14 +1,12 @@
 """Files of the grid, and views of it for the status page."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.grid.grid_view import GridViews, dense, differences, grid_files
 from kiteline_basestation.grid.scan_grid import ScanGrid
+from kiteline_core.arrays import U8
 from tests.basestation.flat_rooms import ROOM, box, camera, scan_of
 from tests.basestation.grid_scans import CONFIG, drawn, flight, kept
 
@@ -65,7 +63,7 @@ def test_files_are_what_map_server_reads() -> None:
     assert grid_files(ScanGrid(CONFIG))["grid.pgm"] == b"P5\n1 1\n255\n" + bytes([205])
 
 
-def read_pgm(data: bytes) -> NDArray[np.uint8]:
+def read_pgm(data: bytes) -> U8:
     head, size, most, grey = data.split(b"\n", 3)
     columns, rows = map(int, size.split())
     assert (head, most) == (b"P5", b"255")

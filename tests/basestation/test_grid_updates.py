@@ -1,13 +1,10 @@
 """The grid as the mapper draws it: from scans and landmarks, after corrections, restarts and deletions."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.grid.grid_view import dense
@@ -17,9 +14,10 @@ from kiteline_basestation.job_kinds import run_job
 from kiteline_basestation.jobs import JobDone
 from kiteline_basestation.mapper import Mapper, MapperInput
 from kiteline_codec.schema import CameraIntrinsics, KeyframeScan, Record, messages
+from kiteline_core.arrays import F64, I8, Bool
 from kiteline_core.geometry import se3
 from kiteline_core.ground.column_scan import level_rotation
-from kiteline_core.ids import KEYPOINT_BITS, submap_of_keyframe
+from kiteline_core.ids import KEYPOINT_BITS, KeyframeId, submap_of_keyframe
 from tests.basestation.flat_rooms import box, scan_of
 
 MakeFlight = Callable[..., Any]
@@ -28,20 +26,19 @@ HEIGHT_M = 1.5
 STEP_NS = 500_000_000
 
 
+def seen(keyframe: KeyframeId, T_w_s: F64, *of_scan: Any) -> KeyframeScan:
+    """What a camera truly saw at T_w_s. of_scan: labels, and what tells a scan between keyframes."""
+    up = T_w_s[2, :3]
+    ahead = T_w_s[:3, :3] @ level_rotation(up)[:, 0]
+    scan = scan_of(ROOM, T_w_s[0, 3], T_w_s[1, 3], float(np.arctan2(ahead[1], ahead[0])))
+    record = KeyframeScan(keyframe, replace(scan, up_c=up, camera_height_m=HEIGHT_M + T_w_s[2, 3]), *of_scan)
+    return messages.decode(messages.key(record), messages.encode(record))
+
+
 def scans(flight: Any, first: int = 0, last: int | None = None) -> list[KeyframeScan]:
     """What each keyframe truly saw; even keypoints lie on the ground, odd ones on obstacles."""
-    out = []
-    for keyframe, T_w_k in list(zip(flight.keyframes, flight.true_T_w_k, strict=True))[first:last]:
-        up = T_w_k[2, :3]
-        ahead = T_w_k[:3, :3] @ level_rotation(up)[:, 0]
-        scan = scan_of(ROOM, T_w_k[0, 3], T_w_k[1, 3], float(np.arctan2(ahead[1], ahead[0])))
-        changes = {"up_c": up, "camera_height_m": HEIGHT_M + T_w_k[2, 3]}
-        scan = type(scan)(**{f: changes.get(f, getattr(scan, f)) for f in scan.__dataclass_fields__})
-        record = KeyframeScan(keyframe, scan, (1 + np.arange(150) % 2).astype(np.uint8))
-        decoded = messages.decode(messages.key(record), messages.encode(record))
-        assert isinstance(decoded, KeyframeScan)
-        out.append(decoded)
-    return out
+    labels = (1 + np.arange(150) % 2).astype(np.uint8)
+    return [seen(k, T_w_k, labels) for k, T_w_k in list(zip(flight.keyframes, flight.true_T_w_k))[first:last]]
 
 
 def between(flight: Any) -> list[KeyframeScan]:
@@ -50,15 +47,7 @@ def between(flight: Any) -> list[KeyframeScan]:
     for n, (keyframe, T_w_k) in enumerate(zip(flight.keyframes, flight.true_T_w_k, strict=True)):
         for part in (1, 2 + n % 3):
             T_k_s = se3.exp(np.array([0.02, 0.01, 0.1 * part, 0.02, 0.1 * part, -0.03]))
-            T_w_s = T_w_k @ T_k_s
-            up = T_w_s[2, :3]
-            ahead = T_w_s[:3, :3] @ level_rotation(up)[:, 0]
-            scan = scan_of(ROOM, T_w_s[0, 3], T_w_s[1, 3], float(np.arctan2(ahead[1], ahead[0])))
-            scan = replace(scan, up_c=up, camera_height_m=HEIGHT_M + T_w_s[2, 3])
-            record = KeyframeScan(keyframe, scan, np.zeros(0, np.uint8), part, T_k_s)
-            decoded = messages.decode(messages.key(record), messages.encode(record))
-            assert isinstance(decoded, KeyframeScan)
-            out.append(decoded)
+            out.append(seen(keyframe, T_w_k @ T_k_s, np.zeros(0, np.uint8), part, T_k_s))
     return out
 
 
@@ -100,7 +89,7 @@ def assert_equal(a: ScanGrid, b: ScanGrid) -> None:
     assert all(np.array_equal(a.log_odds(place), b.log_odds(place)) for place in a.places)
 
 
-def known(grid: ScanGrid) -> tuple[NDArray[np.int8], NDArray[np.bool_], NDArray[np.bool_]]:
+def known(grid: ScanGrid) -> tuple[I8, Bool, Bool]:
     """Cells of the main storey, those well inside the room, and those well outside."""
     cells, corner, cell = dense(grid, grid.main_storey())
     rows, columns = np.indices(cells.shape)
@@ -125,7 +114,6 @@ def test_a_loop_that_moves_keyframes_by_half_a_metre_is_drawn_over_several_steps
     feed(mapper, flight, with_scans(flight))
     for n, keyframe in enumerate(flight.keyframes):
         pose = mapper.map.pose(keyframe)
-        assert pose is not None
         pose[:3, 3] += [0.5 * n / 39, -0.3 * n / 39, 0.0]
         mapper.map.set_pose(keyframe, pose)
     expected = from_scratch(mapper, scans(flight))

@@ -1,13 +1,15 @@
-"""The ground under sparse points, and scans made from them."""
-
-from __future__ import annotations
+"""Ground and labels of landmarks where there are no scans."""
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from kiteline_basestation.config import GridConfig, GroundConfig
+from kiteline_basestation.grid import ground_kernels as kernels
 from kiteline_basestation.grid.ground_height import ground_heights
 from kiteline_basestation.grid.sparse_scan import GROUND, OBSTACLE, UNLABELLED, label, sparse_scan
+from kiteline_core.arrays import F64, I64
 from kiteline_core.geometry.cameras import RectifiedCamera
 from tests.basestation.flat_rooms import camera
 
@@ -61,3 +63,32 @@ def test_without_a_floor_there_is_no_scan() -> None:
     ceiling = np.column_stack([rng.uniform(-3, 3, 200), np.full(200, -1.5), rng.uniform(1, 6, 200)])
     assert sparse_scan(GridConfig(), CAMERA, camera(0.0, 0.0, 0.0), ceiling, np.ones(200, bool)) is None
     assert sparse_scan(GridConfig(), CAMERA, camera(0.0, 0.0, 0.0), np.full((3, 3), np.nan), np.ones(3, bool)) is None
+
+
+def ground_reference(count: F64, seed: int, seed_bin: int, reach: int, share: float, least: float) -> I64:
+    rows, columns, bins = count.shape
+    ground = {(seed // columns, seed % columns): seed_bin}
+    queue = list(ground)
+    while queue:
+        r, c = queue.pop(0)
+        for place in ((r + 1, c), (r - 1, c), (r, c + 1), (r, c - 1)):
+            if place in ground or not (0 <= place[0] < rows and 0 <= place[1] < columns):
+                continue
+            window = range(max(0, ground[r, c] - reach), min(bins - 1, ground[r, c] + reach) + 1)
+            h = count[place]
+            need = max(share * max(h[b] for b in window), least)
+            peaks = [b for b in window if h[b] >= need and (b == window[-1] or h[b] >= h[b + 1])]
+            ground[place] = peaks[0] if peaks else ground[r, c]
+            queue.append(place)
+    return np.array([[ground[r, c] for c in range(columns)] for r in range(rows)])
+
+
+@settings(max_examples=40)
+@given(st.integers(0, 2**32 - 1))
+def test_ground_spreads_as_in_the_reference(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    count = rng.integers(0, 9, (rng.integers(1, 5), rng.integers(1, 5), 20)).astype(np.float32)
+    start, start_bin, reach = int(rng.integers(count.shape[0] * count.shape[1])), int(rng.integers(20)), 3
+    ground = np.zeros(count.shape[:2], np.int32)
+    kernels.spread_ground(count, start, start_bin, reach, 0.25, 4.0, ground, np.zeros(ground.size, np.int32))
+    assert np.array_equal(ground, ground_reference(count.astype(float), start, start_bin, reach, 0.25, 4.0))

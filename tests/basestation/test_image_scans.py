@@ -1,13 +1,10 @@
 """Scans that the base makes of images: those that the agent would have made, in order, kept and taken back."""
 
-from __future__ import annotations
-
 from itertools import count
 
 import cv2
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from kiteline_basestation.grid.image_scans import ImageScans, MadeScan
 from kiteline_basestation.grid.scan_job import ScanInputs, ScanResult
@@ -15,6 +12,7 @@ from kiteline_basestation.job_kinds import run_job
 from kiteline_basestation.jobs import Job, JobDone, set_aside
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_codec.schema import KeyframeScan, ScanImages, messages
+from kiteline_core.arrays import U8
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ground.column_scan import ColumnScan, level_rotation
@@ -32,7 +30,7 @@ TEXTURE = cv2.GaussianBlur(np.random.default_rng(3).integers(0, 256, (2048, 2048
 TEXTURE = np.asarray(cv2.normalize(TEXTURE, None, 0, 255, cv2.NORM_MINMAX), np.uint8)
 
 
-def room_pair(x_m: float = 0.0) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+def room_pair(x_m: float = 0.0) -> tuple[U8, U8]:
     """A textured floor and a wall across, from x_m to the left, as both eyes see them."""
     R_c_l = level_rotation(UP)
     u, v = np.meshgrid((np.arange(SMALL.width) - SMALL.cx) / SMALL.fx, (np.arange(SMALL.height) - SMALL.cy) / SMALL.fy)

@@ -1,7 +1,5 @@
 """Imports are taken in as a whole or not at all, and what was left out is told."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Records are taken from the agent whose they are, and from no other."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The recipe of CONTRIBUTING.md: a new kind of job is one `JobKind` and one row in a table."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import pytest

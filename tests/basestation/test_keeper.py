@@ -1,7 +1,5 @@
 """The keeper writes batches in order, repeats failed writes and does not block the loop."""
 
-from __future__ import annotations
-
 import sqlite3
 import threading
 import time

@@ -1,18 +1,14 @@
 """Matching kernels against plain numpy."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.refinement import landmark_matching_kernels as kernels
+from kiteline_core.arrays import I64, U64, Bool
 from kiteline_core.imaging.matching_kernels import hamming
 from tests.core.helpers_from_python import from_python
 
-U64 = NDArray[np.uint64]
 
-
-def bits(a: U64, b: U64) -> NDArray[np.int64]:
+def bits(a: U64, b: U64) -> I64:
     """Hamming distances (n,m) by counting unpacked bits."""
     x = np.unpackbits(a.view(np.uint8).reshape(len(a), 32), axis=1)
     y = np.unpackbits(b.view(np.uint8).reshape(len(b), 32), axis=1)
@@ -28,7 +24,7 @@ def noisy(rng: np.random.Generator, a: U64, share: float) -> U64:
     return np.ascontiguousarray(a.view(np.uint8).reshape(-1, 32) ^ flips).view(np.uint64)
 
 
-def chosen(distance: NDArray[np.int64], allowed: NDArray[np.bool_], limit: int, ratio: float) -> list[int]:
+def chosen(distance: I64, allowed: Bool, limit: int, ratio: float) -> list[int]:
     """The keypoint of each row that is near enough and distinct, each keypoint given to its nearest row only."""
     cost = np.where(allowed, distance, 1 << 20)
     out = [-1] * len(cost)

@@ -1,12 +1,9 @@
 """Gravity at keyframes: loop closures keep roll and pitch, and matches that tilt a map are no closures."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from kiteline_basestation.config import BaseConfig, GraphConfig, LoopConfig
 from kiteline_basestation.inertial.level import Level, level_of, tilt_between
@@ -16,11 +13,10 @@ from kiteline_basestation.merging.essential_graph import GraphInputs, Scaled, op
 from kiteline_basestation.merging.loop_consistency import keeps_level
 from kiteline_basestation.merging.loop_edges import LoopEdge
 from kiteline_codec.schema import CameraIntrinsics, KeyframeHeader, LivePose, Record, SubmapScale, SubmapTie
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, AgentId, keyframe_id, submap_id
-
-F64 = NDArray[np.float64]
 
 UP = np.array([0.0, 0.0, 1.0])
 AGENT = AgentId(1)
@@ -49,17 +45,14 @@ def test_gravity_of_a_map_is_the_mean_and_bent_keyframes_are_less_certain() -> N
     sparse_map = a_map(np.zeros(3))
     keyframes = [keyframe_id(OLD, k) for k in range(4)]
     level = level_of(sparse_map, keyframes)
-    assert level is not None
     assert np.allclose(level.up_w, UP, atol=1e-9)
     assert np.allclose(level.sigma, 0.005)
     up, _ = sparse_map.up[keyframes[3]]
     T = sparse_map.world_pose(keyframes[3])
-    assert T is not None
     bent = T[:3, :3].T @ se3.so3_exp(np.array([0.1, 0.0, 0.0])) @ T[:3, :3] @ up
     sparse_map.up[keyframes[3]] = bent, 0.005
     del sparse_map.up[keyframes[1]]
     level = level_of(sparse_map, keyframes)
-    assert level is not None
     assert level.rows.tolist() == [0, 2, 3]
     assert level.sigma[2] > 0.06 > level.sigma[0] > 0.005
     assert level_of(sparse_map, []) is None
@@ -70,13 +63,10 @@ def test_a_match_that_tilts_a_map_is_refused(degrees: float, kept: bool) -> None
     turn = np.radians(degrees) * np.array([0.6, 0.8, 0.0])
     sparse_map = a_map(turn)
     found = tilt_between(sparse_map, NEW, OLD, np.eye(4))
-    assert found is not None
     assert found[0] == pytest.approx(np.radians(degrees), abs=1e-9)
     assert found[1] == pytest.approx(np.hypot(0.005, 0.005))
     new, old = keyframe_id(NEW, 0), keyframe_id(OLD, 0)
     T_w_old, T_w_new = sparse_map.world_pose(old), sparse_map.world_pose(new)
-    assert T_w_old is not None
-    assert T_w_new is not None
     for yaw in (0.0, 1.0, 3.0):  # which gravity does not tell
         X = se3.from_rt(se3.so3_exp(yaw * UP), np.array([3.0, -1.0, 0.5]))
         edge = LoopEdge(new, old, se3.inverse(T_w_old) @ X @ T_w_new, 50, 3.0)
@@ -156,18 +146,12 @@ def test_a_submap_after_a_loss_lies_where_its_tie_says(late: bool) -> None:
     if late:
         assert placed(mapper) is None  # without images for longer than odometry is followed
         step(mapper, 2.0, tie)
-    found = placed(mapper)
-    assert found is not None
-    assert np.allclose(found, T_K_F, atol=1e-9)
+    assert np.allclose(placed(mapper), T_K_F, atol=1e-9)
     better = T_K_F @ se3.exp(np.array([0.1, 0.0, -0.2, 0.0, 0.0, 0.0]))
     step(mapper, 3.0, SubmapTie(NEW, LAST, better, 0.05, 0.004))
-    found = placed(mapper)
-    assert found is not None
-    assert np.allclose(found, better, atol=1e-9)
+    assert np.allclose(placed(mapper), better, atol=1e-9)
     step(mapper, 4.0, SubmapTie(NEW, LAST, T_K_F, 0.5, 0.004))  # too uncertain
-    found = placed(mapper)
-    assert found is not None
-    assert np.allclose(found, better, atol=1e-9)
+    assert np.allclose(placed(mapper), better, atol=1e-9)
 
 
 @pytest.mark.parametrize("up_to_scale", [False, True])
@@ -196,9 +180,7 @@ def test_submaps_after_one_that_follows_its_tie_move_along() -> None:
     before = mapper.placements[later]
     better = T_K_F @ se3.exp(np.array([0.1, 0.0, -0.2, 0.0, 0.0, 0.3]))
     step(mapper, 3.0, SubmapTie(NEW, LAST, better, 0.05, 0.004))
-    found = placed(mapper)
-    assert found is not None
-    assert np.allclose(found, better, atol=1e-9)
+    assert np.allclose(placed(mapper), better, atol=1e-9)
     assert not np.allclose(before, mapper.placements[later], atol=0.05)
     assert np.allclose(se3.inverse(mapper.placements[NEW]) @ mapper.placements[later], between, atol=1e-9)
     mapper.map.root_submaps[later] = OLD  # recognised: it lies where the merge says

@@ -1,7 +1,5 @@
 """Which matches agree on one correction, against plain similarities; which outvote the expected drift."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any

@@ -1,28 +1,27 @@
 """Loop closures reduce drift, and repetitive corridors close none."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from kiteline_basestation.config import BaseConfig, LandmarkMatchingConfig
 from kiteline_basestation.exchange.sharing import SharingPolicy
 from kiteline_basestation.job_kinds import run_job
 from kiteline_basestation.jobs import Job, JobDone
+from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.mapper import Mapper, MapperInput
 from kiteline_basestation.merging.loop_detector import LoopClosure, LoopDetector
+from kiteline_basestation.merging.loop_verification import KeyframeObservations, same_unit
 from kiteline_codec.schema import CameraIntrinsics, KeyframePose, Record
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
-from kiteline_core.ids import AgentId
+from kiteline_core.ids import NO_KEYFRAME, AgentId, keyframe_id, submap_id
 from kiteline_core.places import place_kernels
 from tests.basestation.feeding import WITHOUT_GRID
 
-F64 = NDArray[np.float64]
 MakeFlight = Callable[..., Any]
 STEP_NS = 250_000_000
 
@@ -124,7 +123,6 @@ def test_repetitive_corridor_closes_no_loop(
     flight = make_flight(keyframes=40, turns=1.0, scene=corridor, seed=4)
     mapper = Mapper(WITHOUT_GRID, words)
     feed(mapper, [flight])
-    assert mapper.merger is not None
     assert mapper.merger.detector.verified > 0  # they do look alike
     assert mapper.summary()["loops"] == 0
     assert np.max(errors_m(mapper, flight)) < 0.3
@@ -164,3 +162,23 @@ def test_a_new_keyframe_is_compared_with_all_places_once(
     feed(mapper, [flight])
     assert mapper.merger is not None
     assert 4 <= compared <= len(flight.keyframes)
+
+
+@pytest.mark.parametrize(
+    ("unit", "known", "one"), [(1.0, 40, True), (1.08, 40, True), (1.4, 40, False), (0.6, 40, False), (0.6, 5, True)]
+)
+def test_same_unit_compares_depths_of_both_maps(unit: float, known: int, one: bool) -> None:
+    random = np.random.default_rng(0)
+    keyframe = keyframe_id(submap_id(0, 0, 0), 0)
+    T_w_k = se3.exp(random.normal(0.0, 1.0, 6))
+    sparse_map = SparseMap()
+    sparse_map.add_keyframe(keyframe, 0, NO_KEYFRAME, T_w_k, 0)
+    sparse_map.keyframes.T_w_k[sparse_map.rows[keyframe]] = T_w_k
+    local = random.uniform([-1.0, -1.0, 2.0], [1.0, 1.0, 6.0], (50, 3))
+    n, small = np.arange(50, dtype=np.int32), np.zeros(50, np.uint8)
+    mine = KeyframeObservations(
+        n, n, np.zeros((50, 2)), np.full(50, -1.0), small, small, np.zeros((50, 32), np.uint8),
+        se3.transform(T_w_k, local), np.arange(50) < known,
+    )  # fmt: skip
+    depth = unit * local[:, 2] * random.uniform(0.97, 1.03, 50)
+    assert same_unit(sparse_map, keyframe, mine, n, depth) == one

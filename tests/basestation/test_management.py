@@ -1,7 +1,5 @@
 """Commands of users on maps: list, get, name, merge, split, delete."""
 
-from __future__ import annotations
-
 import copy
 import json
 from collections.abc import Callable, Sequence

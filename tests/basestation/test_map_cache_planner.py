@@ -1,7 +1,5 @@
 """Map cache planner: keyframes near the agent that it lacks, from agents that share with it, at their current poses."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -92,7 +90,6 @@ def test_landmarks_are_sent_as_the_agents_camera_would_see_them(make_flight: Mak
         xyz, known = base.map.positions(points)
         assert known.all()
         T = base.map.world_pose(part.keyframe)
-        assert T is not None
         local = se3.transform(se3.inverse(T), xyz)
         assert np.allclose(part.inv_depth, 1.0 / local[:, 2], rtol=1e-5)
         uv = local[:, :2] / local[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)

@@ -1,7 +1,5 @@
 """PLY, TUM and g2o, read back by other means."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import gtsam

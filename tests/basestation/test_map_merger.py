@@ -1,14 +1,11 @@
 """Maps are merged where they overlap, and not where they only look alike."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.job_kinds import run_job
@@ -18,11 +15,11 @@ from kiteline_basestation.mapper import Mapper, MapperInput
 from kiteline_basestation.station import Station
 from kiteline_codec.channel import plain_pair
 from kiteline_codec.schema import CameraIntrinsics, Key, SubmapPlacement
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
 from kiteline_core.ids import SEQUENCE_BITS, submap_of_keyframe
 from tests.basestation.feeding import STEP_NS, WITHOUT_GRID, feed
 
-F64 = NDArray[np.float64]
 MakeFlight = Callable[..., Any]
 ELSEWHERE = se3.exp(np.array([3.0, -1.0, 0.2, 0.02, -0.03, 1.1]))
 
@@ -34,7 +31,6 @@ def joint_error_m(mapper: Mapper, flights: Sequence[Any]) -> F64:
         T_w_m = mapper.placements[submap_of_keyframe(flight.keyframes[0])]
         for k, true in zip(flight.keyframes, flight.true_T_w_k):
             pose = mapper.map.pose(k)
-            assert pose is not None
             out.append(float(np.linalg.norm((T_w_m @ pose)[:3, 3] - true[:3, 3])))
     return np.array(out)
 
@@ -70,7 +66,6 @@ def test_similar_rooms_are_not_merged(
     b = make_flight(keyframes=28, turns=1.0, scene=other, variant=1, agent=1)
     mapper = Mapper(WITHOUT_GRID, words)
     feed(mapper, [a, b])
-    assert mapper.merger is not None
     assert mapper.merger.detector.verified > 0  # single walls do look alike
     assert mapper.summary()["merges"] == 0
     assert mapper.summary()["maps"] == 2

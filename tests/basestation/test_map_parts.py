@@ -1,7 +1,5 @@
 """Full bundles of maps of any size: none, one, or parts that overlap."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
@@ -59,7 +57,6 @@ def test_a_map_too_large_for_one_bundle_is_bundled_in_parts(make_flight: MakeFli
         full = [job for job in jobs if job.kind == "full"]
         if most:
             assert max(len(job.inputs.problem.T_c_m) for job in full) <= 16 + 16  # free, and held around them
-            assert mapper.merger is not None
             bundled = mapper.merger._corrections._schedule.bundled
             assert {part for _, part in bundled} >= set(range(len(part_spans(40, 16))))
         poses = [mapper.map.pose(k) for k in flight.keyframes]
@@ -75,7 +72,6 @@ def test_what_follows_a_part_is_held_also_behind_culled_keyframes(make_flight: M
     alone = replace(config.bundle_window, max_fixed=0)
     free = flight.keyframes[2:10]
     window = bundle_window(mapper.map, free, alone, config.measurement, set(), with_children=True)
-    assert window is not None
     held = mapper.map.keyframes.id[window.rows[~window.problem.free]].tolist()
     assert held == [flight.keyframes[1], flight.keyframes[12]]
 
@@ -83,13 +79,11 @@ def test_what_follows_a_part_is_held_also_behind_culled_keyframes(make_flight: M
 def test_a_part_tells_all_that_it_moves_also_what_came_since_it_began(make_flight: MakeFlight) -> None:
     flight, config = make_flight(keyframes=30), BaseConfig()
     mapper = Mapper(replace(config, graph=replace(config.graph, max_full=16)), _no_words())
-    assert mapper.merger is not None
     camera = CameraIntrinsics(flight.agent, flight.camera)
     for n, records in enumerate(flight.records[:20]):
         mapper.step(MapperInput(((flight.agent, (camera, *records)),)), n * STEP_NS)
     submap = submap_of_keyframe(flight.keyframes[0])
     window = full_bundle_window(mapper.map, submap, (), mapper.config, (submap, 1))
-    assert window is not None
     for n, records in enumerate(flight.records[20:], 20):
         mapper.step(MapperInput(((flight.agent, tuple(records)),)), n * STEP_NS)
     T_c_m = window.problem.T_c_m.copy()

@@ -1,7 +1,5 @@
 """The scale of a map by inertial steps: the truth, an IMU that is silent about it, maps whose scale drifts."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
 
@@ -9,7 +7,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from kiteline_basestation.config import InertialScaleConfig
 from kiteline_basestation.inertial import band_kernels
@@ -17,12 +14,12 @@ from kiteline_basestation.inertial.chain import Segment, path_along
 from kiteline_basestation.inertial.map_scale import MapScale, in_metres, map_scale, tells_scale
 from kiteline_basestation.inertial.scale_drift import bent, drift_along, shared_landmarks
 from kiteline_codec.schema import InertialSteps
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
 from kiteline_core.ids import KeyframeId
 from kiteline_core.optimisation.bundle import BundleProblem, BundleResult
 from tests.basestation.inertial_maps import T_B_C, body, steps
 
-F64 = NDArray[np.float64]
 CONFIG = InertialScaleConfig()
 
 
@@ -101,7 +98,6 @@ def test_the_scale_is_found_within_its_deviation(scale: float) -> None:
     for seed in range(4):
         segments, T_w_c = a_map(scale, seed=seed)
         found = scale_of(segments, T_w_c)
-        assert found is not None
         assert found.sigma < 0.02
         off.append(np.log(np.mean(found.metres) * scale) / found.sigma)
     assert np.abs(off).max() < 2.5
@@ -111,12 +107,10 @@ def test_the_scale_is_found_within_its_deviation(scale: float) -> None:
 def test_a_flight_without_accelerations_keeps_the_agents_scale() -> None:
     segments, T_w_c = a_map(0.95, lively=0.0)
     found = scale_of(segments, T_w_c)
-    assert found is not None
     assert found.sigma > 0.02
     assert np.abs(found.metres - 1.0).max() < 0.02
     told = tuple(replace(s, metre=0.95) for s in segments)  # the unit of the agent
     found = scale_of(told, T_w_c)
-    assert found is not None
     assert np.abs(found.metres - 0.95).max() < 0.02
 
 
@@ -138,7 +132,6 @@ def test_the_path_ends_where_the_keyframes_are() -> None:
 def test_a_gap_in_the_chain_costs_little() -> None:
     segments, T_w_c = a_map(0.95)
     found = scale_of((*segments[:10], *segments[13:]), T_w_c)
-    assert found is not None
     assert abs(np.mean(found.metres) * 0.95 - 1.0) < 0.02
 
 
@@ -186,7 +179,7 @@ def test_a_torn_map_tells_no_scale() -> None:
     T_w_c[-3:, :3, 3] += 0.6 * (T_w_c[-3:, :3, 3] - T_w_c[-4, :3, 3])
     assert map_scale(segments, T_w_c, shared, CONFIG) is None
     loose = map_scale(segments, T_w_c, shared, replace(CONFIG, most_drift=1e9))
-    assert loose is not None and np.ptp(loose.metres) > 0.05
+    assert np.ptp(loose.metres) > 0.05
 
 
 def test_where_a_path_comes_back_to_landmarks_both_passes_have_one_scale() -> None:
@@ -253,7 +246,6 @@ def test_shared_landmarks_are_counted() -> None:
 def test_a_change_that_does_not_matter_waits() -> None:
     segments, T_w_c = a_map(0.999)
     found = scale_of(segments, T_w_c)
-    assert found is not None
     problem = a_problem(T_w_c, np.zeros((0, 3)))
     result, largest = solved(problem), float(np.abs(np.log(found.metres)).max())
     patient = replace(CONFIG, hold=1.1 * largest / found.sigma)

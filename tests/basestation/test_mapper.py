@@ -1,7 +1,5 @@
 """The mapper on synthetic flights: refinement, landmark matching, culling, determinism."""
 
-from __future__ import annotations
-
 import pickle
 from collections.abc import Callable
 from dataclasses import replace
@@ -9,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from kiteline_basestation.config import BaseConfig, LandmarkMatchingConfig, TriangulationConfig
 from kiteline_basestation.grid.placed_map import placed_map
@@ -30,11 +27,11 @@ from kiteline_codec.schema import (
     SubmapPlacement,
     messages,
 )
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
 from kiteline_core.ids import KeyframeId, submap_of_keyframe
 from tests.basestation.feeding import STEP_NS, WITHOUT_GRID, feed_groups
 
-F64 = NDArray[np.float64]
 MakeFlight = Callable[..., Any]
 
 
@@ -172,14 +169,6 @@ def test_intake_does_not_depend_on_order_of_records(make_flight: MakeFlight) -> 
     assert maps[0][0] == maps[1][0]
 
 
-def test_two_runs_publish_the_same_bytes(make_flight: MakeFlight) -> None:
-    flight = make_flight(keyframes=25, turns=1.2)
-    runs = []
-    for _ in range(2):
-        runs.append(pickle.dumps(feed_groups(Mapper(), flight, flight.records)))
-    assert runs[0] == runs[1]
-
-
 def test_incomplete_keyframe_is_used_after_the_patience(make_flight: MakeFlight) -> None:
     flight = make_flight(keyframes=8, turns=0.2)
     late = flight.records[5].pop()
@@ -253,7 +242,6 @@ def test_submap_without_first_keyframe_begins_at_its_oldest(make_flight: MakeFli
         mapper.step(MapperInput(()), 20_000_000_000)
     assert mapper.counts.keyframes == 8
     a, b = mapper.map.pose(flight.keyframes[4]), mapper.map.pose(flight.keyframes[9])
-    assert a is not None and b is not None
     true = se3.inverse(flight.true_T_m_k[4]) @ flight.true_T_m_k[9]
     assert np.allclose(se3.inverse(a) @ b, true, atol=0.05)
 
@@ -327,7 +315,6 @@ def test_later_submap_is_placed_by_odometry(make_flight: MakeFlight) -> None:
     published = feed_groups(mapper, later, later.records)
     (placement,) = [r for r in published if isinstance(r, SubmapPlacement)]
     left, begin = mapper.map.pose(live.keyframe), mapper.map.pose(later.keyframes[0])
-    assert left is not None and begin is not None
     assert np.allclose(placement.S_w_m @ begin, left @ live.T_k_c, atol=1e-9)
     assert not placement.recognised
 

@@ -1,7 +1,5 @@
 """Monocular maps: loops take the drift of their unit of length back, and merges find how long it is."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from dataclasses import replace
@@ -9,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.exchange.map_cache_planner import MapCachePlanner
@@ -36,12 +33,12 @@ from kiteline_codec.schema import (
     SubmapPlacement,
     SubmapScale,
 )
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import agent_of_keyframe, agent_of_submap, submap_of_keyframe
 from kiteline_core.optimisation.bundle import BundleResult
 from tests.basestation.feeding import STEP_NS, WITHOUT_GRID, feed
 
-F64 = NDArray[np.float64]
 MakeFlight = Callable[..., Any]
 ELSEWHERE = se3.exp(np.array([3.0, -1.0, 0.2, 0.02, -0.03, 1.1]))
 
@@ -88,7 +85,6 @@ def believed(flight: Any) -> F64:
 def error_m(found: F64, true: F64) -> tuple[float, float]:
     """RMS after the best similarity, in true metres, and the scale of that."""
     S = align_points(true, found, with_scale=True)
-    assert S is not None
     return float(np.sqrt(np.mean(np.sum((se3.transform(S, found) - true) ** 2, axis=1)))), sim3.scale_of(S)
 
 
@@ -269,7 +265,6 @@ def test_depths_that_do_not_say_one_length_say_none() -> None:
     rng = np.random.default_rng(0)
     config, own = BaseConfig().loops, rng.uniform(1.0, 8.0, 60)
     told = depth_scale(own, 2.5 * own * np.exp(rng.normal(0.0, 0.05, 60)), config)
-    assert told is not None
     assert abs(told / 2.5 - 1.0) < 0.03
     assert depth_scale(own[:10], 2.5 * own[:10], config) is None
     assert depth_scale(own, own * np.exp(rng.normal(0.0, 0.4, 60)), config) is None
@@ -291,7 +286,6 @@ def test_what_a_base_remembers_of_units_is_known_to_the_next(met: Met, words: An
     points = mapper.map.landmark_ids(mapper.map.live_landmarks())
     here, there = mapper.map.find_landmarks(points), again.map.find_landmarks(points)
     assert np.allclose(mapper.map.positions(here)[0], again.map.positions(there)[0], atol=1e-6)
-    assert again.merger is not None and mapper.merger is not None
     assert [v.scale for v in again.merger.edges] == [v.scale for v in mapper.merger.edges]
     assert sorted(again.merger.merges[0].moved) == sorted(mapper.merger.merges[0].moved)
 
@@ -315,7 +309,6 @@ def test_a_map_begun_in_metres_stays_as_it_is_and_the_one_before_it_is_stretched
         assert np.isclose(sim3.scale_of(placed_at[before]), 2.0)
         assert sim3.scale_of(placed_at[after]) == 1.0
         begin, end = mapper.map.pose(later.keyframes[0]), mapper.map.pose(flight.keyframes[-1])
-        assert begin is not None and end is not None
         assert np.allclose((placed_at[after] @ begin)[:3, 3], 2.0 * end[:3, 3], atol=1e-6)  # where it was left
 
 

@@ -1,7 +1,6 @@
 """Links between keyframes: they hold the poses of those that see few points, and are loose where many are seen."""
 
-from __future__ import annotations
-
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +10,7 @@ from kiteline_basestation.config import BaseConfig, OdometryFactorConfig
 from kiteline_basestation.inertial.units import units_of
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.mapper_state import map_state, restore_map
-from kiteline_basestation.refinement.bundle_window import bundle_window
+from kiteline_basestation.refinement.bundle_window import BundleWindow, bundle_window
 from kiteline_basestation.refinement.disparity_calibration import with_border
 from kiteline_basestation.refinement.odometry_factors import (
     median_depths,
@@ -27,6 +26,8 @@ from kiteline_core.optimisation.bundle import bundle
 CAMERA = RectifiedCamera(752, 480, 430.0, 430.0, 376.0, 240.0, 0.11, True, np.eye(4))
 SUBMAP = submap_id(0, 0, 0)
 KEYFRAMES, BIRTHS = 6, 14
+IDS = [keyframe_id(SUBMAP, k) for k in range(KEYFRAMES)]
+CONFIG = BaseConfig()
 
 
 def flight(noise_px: float, births: int = BIRTHS, unseen: int = -1) -> tuple[SparseMap, list[np.ndarray]]:
@@ -66,20 +67,21 @@ def flight(noise_px: float, births: int = BIRTHS, unseen: int = -1) -> tuple[Spa
     return sparse_map, truth
 
 
+def window(sparse_map: SparseMap, free: Sequence[KeyframeId] = IDS) -> BundleWindow:
+    return bundle_window(sparse_map, list(free), CONFIG.bundle_window, CONFIG.measurement)
+
+
 def error_m(poses: np.ndarray, truth: list[np.ndarray]) -> float:
     return float(max(np.linalg.norm(np.linalg.inv(a)[:3, 3] - b[:3, 3]) for a, b in zip(poses, truth, strict=True)))
 
 
 def test_links_hold_what_few_points_cannot() -> None:
     sparse_map, truth = flight(noise_px=1.5)
-    config = BaseConfig()
-    keyframes = [keyframe_id(SUBMAP, k) for k in range(KEYFRAMES)]
-    part = bundle_window(sparse_map, keyframes, config.bundle_window, config.measurement)
-    assert part is not None
-    alone = bundle(part.problem, config.bundle)
-    linked = with_odometry_factors(sparse_map, part, config.odometry_factors)
+    part = window(sparse_map)
+    alone = bundle(part.problem, CONFIG.bundle)
+    linked = with_odometry_factors(sparse_map, part, CONFIG.odometry_factors)
     assert len(linked.points) > len(part.problem.points)
-    result = without_odometry_factors(part, bundle(linked, config.bundle))
+    result = without_odometry_factors(part, bundle(linked, CONFIG.bundle))
     assert len(result.points) == len(part.points)
     assert len(result.inlier) == len(part.slots)
     assert error_m(result.T_c_m, truth) < 0.5 * error_m(alone.T_c_m, truth)
@@ -87,24 +89,21 @@ def test_links_hold_what_few_points_cannot() -> None:
 
 def test_keyframes_that_see_nothing_of_those_before_them_are_held_by_their_parent() -> None:
     sparse_map, _ = flight(noise_px=0.1, births=40, unseen=3)
-    config, free = BaseConfig(), [keyframe_id(SUBMAP, k) for k in range(3, KEYFRAMES)]
-    part = bundle_window(sparse_map, free, config.bundle_window, config.measurement)
-    assert part is not None
+    part = window(sparse_map, IDS[3:])
     held = dict(zip((sparse_map.keyframes.id[part.rows] - keyframe_id(SUBMAP, 0)).tolist(), part.problem.free))
     assert held == {2: False, 3: True, 4: True, 5: True}
-    linked = with_odometry_factors(sparse_map, part, config.odometry_factors)
+    linked = with_odometry_factors(sparse_map, part, CONFIG.odometry_factors)
     moved = linked.T_c_m.copy()
     moved[1:, 0, 3] += 0.02  # all of them together
-    result = bundle(replace(linked, T_c_m=moved), config.bundle)
+    result = bundle(replace(linked, T_c_m=moved), CONFIG.bundle)
     assert np.linalg.norm(result.T_c_m[1:, :3, 3] - linked.T_c_m[1:, :3, 3], axis=1).max() < 0.004
 
 
 def test_a_culled_parent_holds_nothing() -> None:
     sparse_map, _ = flight(noise_px=0.1, births=40)
-    culled, *free = [keyframe_id(SUBMAP, k) for k in range(2, KEYFRAMES)]
+    culled, *free = IDS[2:]
     sparse_map.cull_keyframe(culled)
-    part = bundle_window(sparse_map, free, BaseConfig().bundle_window, BaseConfig().measurement)
-    assert part is not None
+    part = window(sparse_map, free)
     assert sparse_map.rows[culled] not in part.rows.tolist()
 
 
@@ -116,17 +115,13 @@ def test_keyframes_with_many_points_are_told_how_they_turned_and_no_lengths() ->
     sparse_map, truth = flight(noise_px=0.5)
     for row in sparse_map.rows.values():  # the agent's steps are 3 % too long, its turns are right
         sparse_map.keyframes.T_p_k[row, :3, 3] *= 1.03
-    config = BaseConfig()
-    part = bundle_window(
-        sparse_map, [keyframe_id(SUBMAP, k) for k in range(KEYFRAMES)], config.bundle_window, config.measurement
-    )
-    assert part is not None
+    part = window(sparse_map)
     far = replace(part, problem=replace(part.problem, T_c_m=np.stack([se3.inverse(T) for T in truth])))
-    alone = bundle(far.problem, config.bundle)
+    alone = bundle(far.problem, CONFIG.bundle)
     loose, firm = (
         without_odometry_factors(
             part,
-            bundle(with_odometry_factors(sparse_map, far, OdometryFactorConfig(enough_observations=e)), config.bundle),
+            bundle(with_odometry_factors(sparse_map, far, OdometryFactorConfig(enough_observations=e)), CONFIG.bundle),
         )
         for e in (5, 80)
     )
@@ -146,11 +141,7 @@ def test_turns_that_are_all_off_the_same_way_count_less() -> None:
         for sign, row in zip(signs, sparse_map.rows.values(), strict=True):
             off = se3.from_rt(se3.so3_exp(np.array([0.0, sign * 5e-4, 0.0])), np.zeros(3))
             sparse_map.keyframes.T_p_k[row] = sparse_map.keyframes.T_p_k[row] @ off
-        config = BaseConfig()
-        part = bundle_window(
-            sparse_map, [keyframe_id(SUBMAP, k) for k in range(KEYFRAMES)], config.bundle_window, config.measurement
-        )
-        assert part is not None
+        part = window(sparse_map)
         part = replace(part, problem=replace(part.problem, T_c_m=np.stack([se3.inverse(T) for T in truth])))
         sigma[name] = with_odometry_factors(sparse_map, part, OdometryFactorConfig(enough_observations=5)).sigma[-1, 0]
     assert sigma["alike"] > 1.3 * sigma["by chance"]
@@ -158,14 +149,11 @@ def test_turns_that_are_all_off_the_same_way_count_less() -> None:
 
 def test_links_of_a_worn_rig_count_less() -> None:
     sparse_map, _ = flight(noise_px=0.3)
-    config = BaseConfig()
-    keyframes = [keyframe_id(SUBMAP, k) for k in range(KEYFRAMES)]
-    part = bundle_window(sparse_map, keyframes, config.bundle_window, config.measurement)
-    assert part is not None
+    part = window(sparse_map)
     sparse_map.keyframes.t_ns[: len(sparse_map)] = 2_000_000_000 * np.arange(len(sparse_map))  # as over a radio
-    good = with_odometry_factors(sparse_map, part, config.odometry_factors).sigma[len(part.slots) :]
+    good = with_odometry_factors(sparse_map, part, CONFIG.odometry_factors).sigma[len(part.slots) :]
     sparse_map.disparity_sigma_px[AgentId(0)] = 0.2
-    worn = with_odometry_factors(sparse_map, part, config.odometry_factors).sigma[len(part.slots) :]
+    worn = with_odometry_factors(sparse_map, part, CONFIG.odometry_factors).sigma[len(part.slots) :]
     assert good.max() < 0.3
     assert worn.min() > 5.0 * good.max()
 
@@ -173,24 +161,18 @@ def test_links_of_a_worn_rig_count_less() -> None:
 def test_links_of_few_points_are_measured_with_the_offset_of_the_border() -> None:
     """A synthetic point has a disparity where the child sees it, which the offset changes, and none in the parent."""
     sparse_map, _ = flight(noise_px=0.3)
-    config = BaseConfig()
-    part = bundle_window(
-        sparse_map, [keyframe_id(SUBMAP, k) for k in range(KEYFRAMES)], config.bundle_window, config.measurement
-    )
-    assert part is not None
-    problem, agents = with_border(sparse_map, part.slots, part.problem, config.disparity)
+    part = window(sparse_map)
+    problem, agents = with_border(sparse_map, part.slots, part.problem, CONFIG.disparity)
     assert agents == (AgentId(0),)
-    linked = with_odometry_factors(sparse_map, replace(part, problem=problem), config.odometry_factors)
-    assert linked.border is not None
+    linked = with_odometry_factors(sparse_map, replace(part, problem=problem), CONFIG.odometry_factors)
     assert len(linked.border.group) == len(linked.border.terms) == len(linked.camera) > len(part.slots)
     disparity = linked.measured[len(part.slots) :, 2].reshape(-1, 2)
     assert ((disparity >= 0.0).sum(1) == 1).all()
     assert np.array_equal(linked.border.group[len(part.slots) :] == 0, disparity.ravel() >= 0.0)
     many = OdometryFactorConfig(enough_observations=5)  # rotations alone, of points far away: no disparity counts there
     linked = with_odometry_factors(sparse_map, replace(part, problem=problem), many)
-    assert linked.border is not None
     assert (linked.border.group[len(part.slots) :] == -1).all()
-    assert bundle(linked, config.bundle).offset.shape == (1, 5)
+    assert bundle(linked, CONFIG.bundle).offset.shape == (1, 5)
 
 
 OFFSET = np.array([0.5, 0.0, 0.0, 0.0, 0.0])
@@ -198,30 +180,26 @@ OFFSET = np.array([0.5, 0.0, 0.0, 0.0, 0.0])
 
 def test_steps_follow_the_disparity_offset_as_it_becomes_known() -> None:
     """Disparities are half a pixel too large; the agent did not know when it measured its steps by them."""
-    config = BaseConfig()
-    keyframes = [keyframe_id(SUBMAP, k) for k in range(KEYFRAMES)]
     sparse_map, truth = flight(noise_px=0.0, births=70)
     sparse_map.keypoints.inv_depth[: sparse_map.slots] += OFFSET[0] / CAMERA.bf
-    part = bundle_window(sparse_map, keyframes, config.bundle_window, config.measurement)
-    assert part is not None
-    told = bundle(part.problem, replace(config.bundle, robust_trials=20)).T_c_m
+    part = window(sparse_map)
+    told = bundle(part.problem, replace(CONFIG.bundle, robust_trials=20)).T_c_m
     for k in range(1, KEYFRAMES):
-        sparse_map.keyframes.T_p_k[sparse_map.rows[keyframes[k]]] = told[k - 1] @ se3.inverse(told[k])
+        sparse_map.keyframes.T_p_k[sparse_map.rows[IDS[k]]] = told[k - 1] @ se3.inverse(told[k])
     blind = replace(
         part, problem=replace(part.problem, T_c_m=told, sigma=1e3 * part.problem.sigma)
     )  # links alone count
     sparse_map.disparity_offset_px[AgentId(0)] = OFFSET
-    few = replace(config.odometry_factors, enough_observations=1000)
-    for known, least, most in (({}, 0.0, 0.5), ({keyframes[0]: OFFSET}, 0.98, 1.02)):  # it stands if the agent knew
+    few = replace(CONFIG.odometry_factors, enough_observations=1000)
+    for known, least, most in (({}, 0.0, 0.5), ({IDS[0]: OFFSET}, 0.98, 1.02)):  # it stands if the agent knew
         sparse_map.measured_with_px = dict(known)
         linked = with_odometry_factors(sparse_map, blind, few)
-        result = bundle(linked, replace(config.bundle, robust_trials=20))
+        result = bundle(linked, replace(CONFIG.bundle, robust_trials=20))
         assert least <= error_m(result.T_c_m, truth) / error_m(told, truth) <= most
 
 
 def test_a_map_notes_which_offset_each_keyframe_was_measured_with() -> None:
-    sparse_map, better = SparseMap(), OFFSET + 0.1
-    keyframes = [keyframe_id(SUBMAP, k) for k in range(6)]
+    sparse_map, better, keyframes = SparseMap(), OFFSET + 0.1, IDS
     for k, keyframe in enumerate(keyframes):
         if k in (2, 4):
             sparse_map.disparity_offset_px[AgentId(0)] = OFFSET if k == 2 else better
@@ -244,20 +222,16 @@ def test_steps_in_a_scene_without_disparities_are_taken_as_told() -> None:
     """A changed offset leaves none of the synthetic points' disparities: all would be behind infinity."""
     sparse_map, _ = flight(noise_px=0.0)
     sparse_map.keypoints.inv_depth[: sparse_map.slots] *= 0.005
-    keyframes = [keyframe_id(SUBMAP, k) for k in range(KEYFRAMES)]
-    config = BaseConfig()
-    part = bundle_window(sparse_map, keyframes, config.bundle_window, config.measurement)
-    assert part is not None
+    part = window(sparse_map)
     sparse_map.disparity_offset_px[AgentId(0)] = 4.0 * OFFSET
     far = replace(part, problem=replace(part.problem, measured=part.problem.measured * (1.0, 1.0, 0.005)))
-    linked = with_odometry_factors(sparse_map, far, config.odometry_factors)
+    linked = with_odometry_factors(sparse_map, far, CONFIG.odometry_factors)
     added = linked.measured[len(part.slots) :]
     assert len(added) and (added[:, 2] > 0.0).all()
 
 
 def test_offsets_of_steps_do_not_depend_on_the_order_in_which_keyframes_arrive() -> None:
-    sparse_map = SparseMap()
-    keyframes = [keyframe_id(SUBMAP, k) for k in range(6)]
+    sparse_map, keyframes = SparseMap(), IDS
 
     def arrive(*numbers: int) -> None:
         for k in numbers:
@@ -294,24 +268,19 @@ def test_a_saved_state_with_what_is_no_disparity_offset_is_refused(wrong: np.nda
 def test_a_keyframe_without_observations_stays_tied_to_its_parent() -> None:
     """The parent is in the window though it shares no landmark, fixed, and its odometry factor with it."""
     sparse_map, _ = flight(noise_px=0.5)
-    config = BaseConfig()
-    few = replace(config.bundle_window, max_fixed=0)  # nobody is in the window for what it observes
-    free = [keyframe_id(SUBMAP, k) for k in (3, 4, 5)]
-    part = bundle_window(sparse_map, free, few, config.measurement)
-    assert part is not None
+    few = replace(CONFIG.bundle_window, max_fixed=0)  # nobody is in the window for what it observes
+    part = bundle_window(sparse_map, IDS[3:], few, CONFIG.measurement)
     ids = sparse_map.keyframes.id[part.rows].tolist()
-    assert ids == [keyframe_id(SUBMAP, k) for k in (2, 3, 4, 5)]
+    assert ids == IDS[2:]
     assert part.problem.free.tolist() == [False, True, True, True]
-    linked = with_odometry_factors(sparse_map, part, config.odometry_factors)
+    linked = with_odometry_factors(sparse_map, part, CONFIG.odometry_factors)
     added = linked.camera[len(part.problem.camera) :]
     assert {0, 1} <= set(added.tolist())
 
 
 def test_median_depths_are_those_of_each_camera_s_disparities() -> None:
     sparse_map, _ = flight(0.3, 40, unseen=3)
-    config, keyframes = BaseConfig(), [keyframe_id(SUBMAP, k) for k in range(KEYFRAMES)]
-    part = bundle_window(sparse_map, keyframes, config.bundle_window, config.measurement)
-    assert part is not None
+    part = window(sparse_map)
     problem = part.problem
     measured = problem.measured.copy()
     measured[problem.camera == 2, 2] = -1.0
@@ -342,18 +311,16 @@ def test_where_accelerations_have_corrected_lengths_steps_are_as_long_as_the_map
 
 def test_inertial_steps_tie_a_keyframe_without_a_parent() -> None:
     sparse_map, _ = flight(noise_px=0.5)
-    config, keyframes = BaseConfig(), [keyframe_id(SUBMAP, k) for k in range(KEYFRAMES)]
-    window = bundle_window(sparse_map, keyframes, config.bundle_window, config.measurement)
-    assert window is not None
-    expected = with_odometry_factors(sparse_map, window, config.odometry_factors)
-    row = sparse_map.rows[keyframes[3]]
+    part = window(sparse_map)
+    expected = with_odometry_factors(sparse_map, part, CONFIG.odometry_factors)
+    row = sparse_map.rows[IDS[3]]
     T_p_k = sparse_map.keyframes.T_p_k[row].copy()
     sparse_map.keyframes.parent[row], sparse_map.keyframes.T_p_k[row] = NO_KEYFRAME, np.eye(4)
-    apart = with_odometry_factors(sparse_map, window, config.odometry_factors)
+    apart = with_odometry_factors(sparse_map, part, CONFIG.odometry_factors)
     assert len(apart.points) < len(expected.points)
     rest = np.zeros((1, 3))
-    sparse_map.inertial_steps[keyframes[3]] = InertialSteps(
-        keyframes[3], keyframes[2], 2e-3, np.ones(1), rest, T_p_k[None, :3, 3], rest, rest
+    sparse_map.inertial_steps[IDS[3]] = InertialSteps(
+        IDS[3], IDS[2], 2e-3, np.ones(1), rest, T_p_k[None, :3, 3], rest, rest
     )
-    tied = with_odometry_factors(sparse_map, window, config.odometry_factors)
+    tied = with_odometry_factors(sparse_map, part, CONFIG.odometry_factors)
     assert np.allclose(tied.measured, expected.measured) and np.allclose(tied.points, expected.points)

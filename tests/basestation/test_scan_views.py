@@ -1,7 +1,5 @@
 """What single views free, and what several say together."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -17,13 +15,18 @@ from tests.basestation.flat_rooms import HEIGHT_M, ROOM, box, camera, scan_of
 from tests.basestation.grid_scans import BF, CONFIG, at, kept
 
 
-def test_one_view_at_the_side_of_an_image_frees_nothing() -> None:
-    """What stands there is seen in part, and matched worst: a view from elsewhere has to agree."""
+def bare(free_from_m: float, free_m: float) -> ColumnScan:
+    """Free ground without an obstacle, over 80 degrees."""
     n = 70
-    near = ColumnScan(
-        np.array([0.0, -1.0, 0.0]), -0.69, 0.02, np.full(n, 0.5), np.full(n, 1.8), np.full(n, np.inf),
+    return ColumnScan(
+        np.array([0.0, -1.0, 0.0]), -0.69, 0.02, np.full(n, free_from_m), np.full(n, free_m), np.full(n, np.inf),
         np.zeros(n, np.uint8), np.zeros(n), HEIGHT_M,
     )  # fmt: skip
+
+
+def test_one_view_at_the_side_of_an_image_frees_nothing() -> None:
+    """What stands there is seen in part, and matched worst: a view from elsewhere has to agree."""
+    near = bare(0.5, 1.8)
     config = replace(CONFIG, side_columns=5, hole_neighbours=9)
     grid = ScanGrid(config)
     grid.put(0, kept(near, config), camera(0.0, 0.0, 0.0))
@@ -38,10 +41,7 @@ def test_each_cell_of_a_scan_is_freed_once() -> None:
     config = replace(CONFIG, storey_overlap_m=0.0, opening=False, bands_m=(0.0, 0.5, 1.2, 2.0))
     rng = np.random.default_rng(3)
     for heading in [*np.arange(8) * np.pi / 4, *rng.uniform(-4, 4, 12)]:
-        wide = ColumnScan(
-            np.array([0.0, -1.0, 0.0]), -0.7 + 0.01, 0.02, np.full(70, 0.5), np.full(70, 6.0), np.full(70, np.inf),
-            np.zeros(70, np.uint8), np.zeros(70), HEIGHT_M,
-        )  # fmt: skip
+        wide = bare(0.5, 6.0)
         x, y = rng.uniform(-1, 1, 2).round(2)
         grid = ScanGrid(config)
         grid.put(0, kept(wide, config), camera(x, y, heading))
@@ -84,19 +84,16 @@ def test_cells_over_which_the_nearest_rays_to_the_ground_pass_low_are_free_by_tw
 
     One view that sees the far edge of a pit at the lower border of its image does not free the pit.
     """
-    bare = ColumnScan(
-        np.array([0.0, -1.0, 0.0]), -0.7 + 0.01, 0.02, np.full(70, 2.0), np.full(70, 4.0), np.full(70, np.inf),
-        np.zeros(70, np.uint8), np.zeros(70), HEIGHT_M,
-    )  # fmt: skip
+    seen = kept(bare(2.0, 4.0))
     grid = ScanGrid(CONFIG)
-    grid.put(0, kept(bare), camera(0.0, 0.0, 0.0))
+    grid.put(0, seen, camera(0.0, 0.0, 0.0))
     near, first = Place(0, 0, 0), 2.0 * (1.0 - CONFIG.bands_m[0] / HEIGHT_M)
     odds = grid.log_odds(near)[:, 1]
     columns = (np.arange(64) + 0.5) * 0.05
     assert (odds[:, (columns > first + 0.05) & (columns < 1.95)] == -CONFIG.log_free_far).all()
     assert not odds[:, columns < first - 0.05].any()
     assert grid.cells(near)[0][1, 38] == -1
-    grid.put(1, kept(bare), camera(0.01, 0.0, 0.3))
+    grid.put(1, seen, camera(0.01, 0.0, 0.3))
     assert grid.cells(near)[0][1, 38] == 0
 
 
@@ -104,7 +101,6 @@ def test_a_far_view_frees_alone_what_lies_well_before_its_obstacle_and_two_what_
     """A far box and the wall behind it are one surface: between them nothing is free by one look from afar."""
     bf = 48.0
     found = keep(CONFIG, scan_of(np.array(box(-5.53, -5.53, 5.53, 5.53)), 0.0, 0.0, 0.0), bf)
-    assert found is not None
     grid = ScanGrid(CONFIG)
     grid.put(0, found, camera(0.0, 0.0, 0.0))
     row = np.concatenate([grid.log_odds(Place(0, 0, k))[0, 1] for k in range(2)])
@@ -124,12 +120,7 @@ def test_a_far_view_frees_alone_what_lies_well_before_its_obstacle_and_two_what_
 
 def test_a_far_view_of_ground_that_ends_before_no_obstacle_frees_alone_nearly_up_to_its_end() -> None:
     bf, end = 48.0, 5.0
-    bare = ColumnScan(
-        np.array([0.0, -1.0, 0.0]), -0.7 + 0.01, 0.02, np.full(70, 1.0), np.full(70, end), np.full(70, np.inf),
-        np.zeros(70, np.uint8), np.zeros(70), HEIGHT_M,
-    )  # fmt: skip
-    found = keep(CONFIG, bare, bf)
-    assert found is not None
+    found = keep(CONFIG, bare(1.0, end), bf)
     grid = ScanGrid(CONFIG)
     grid.put(0, found, camera(0.0, 0.0, 0.0))
     row = np.concatenate([grid.log_odds(Place(0, 0, k))[0, 1] for k in range(2)])
@@ -188,12 +179,11 @@ def test_overlong_and_far_rays_are_cut_and_unknown_ground_is_not_drawn() -> None
     long[40] = 19.5
     bare = replace(scan, free_m=long, obstacle_m=np.full(84, np.inf), bands=np.zeros(84, np.uint8))
     found = keep(CONFIG, bare, 1e4)
-    assert found is not None
     ranges = found.ranges()
     q1, q3 = np.quantile(long[long > 0], (0.25, 0.75))
     assert ranges[3].max() == pytest.approx(q3 + 1.5 * (q3 - q1), abs=0.01)
     near = keep(CONFIG, replace(scan, free_m=np.full(84, 19.0), obstacle_m=np.full(84, 19.0)), 20.0)
-    assert near is not None and near.ranges()[3].max() < np.sqrt(CONFIG.max_sigma_m * 20.0 / CONFIG.sigma_px) + 0.01
+    assert near.ranges()[3].max() < np.sqrt(CONFIG.max_sigma_m * 20.0 / CONFIG.sigma_px) + 0.01
     assert np.isinf(near.ranges()[0]).all()
     assert keep(CONFIG, replace(scan, camera_height_m=np.nan), BF) is None
 
@@ -209,7 +199,6 @@ def test_nothing_is_free_close_before_an_obstacle_that_is_too_far_to_be_drawn() 
             bands=np.full(84, 7, np.uint8),
         )  # fmt: skip
         found = keep(CONFIG, scan, 20.0)
-        assert found is not None
         obstacle, _, _, free, clear = found.ranges()
         assert np.isinf(obstacle).all()
         until_m = min(limit_m, at_m - CONFIG.gap_sigmas * sigma_per_m2 * at_m**2)

@@ -1,7 +1,5 @@
 """Maps of any size: regions, memory, corrections of many keyframes, loops that many votes close."""
 
-from __future__ import annotations
-
 import itertools
 import time
 import tracemalloc
@@ -111,7 +109,6 @@ def test_two_bundles_never_adjust_one_landmark(mapped: tuple[Any, Mapper]) -> No
     def shares_landmarks_alone(keyframe: KeyframeId) -> bool:
         free = local_keyframes(mapper.map, keyframe, config.bundle_window)
         window = bundle_window(mapper.map, free, config.bundle_window, config.measurement)
-        assert window is not None
         met = set(window.rows[window.problem.free].tolist()) & set(pending.rows.tolist())
         met |= set(window.rows.tolist()) & set(pending.rows[pending.problem.free].tolist())
         return not met and bool(np.isin(window.points, pending.points).any())
@@ -303,7 +300,6 @@ def test_what_moves_nothing_is_coded_over_several_steps_too(mapped: tuple[Any, M
 
 def test_a_large_map_is_merged_in_a_step(words: Any) -> None:
     mapper = Mapper(BaseConfig(), words)
-    assert mapper.merger is not None
     for submap in (submap_id(0, 1, 0), submap_id(1, 1, 0)):
         for k in range(20_000 if submap > submap_id(0, 1, 0) else 1):
             mapper.map.add_keyframe(keyframe_id(submap, k), k, NO_KEYFRAME, np.eye(4), 0)

@@ -1,7 +1,5 @@
 """Lists of observations in flat arrays, against sets."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from kiteline_basestation.map import sparse_map_kernels as kernels

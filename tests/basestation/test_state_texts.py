@@ -1,7 +1,5 @@
 """The mapper's state as texts: it comes back as it was, and only changed parts are written."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

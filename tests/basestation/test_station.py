@@ -1,7 +1,5 @@
 """The station over real channels: both sides end with the same values."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """What a base says of itself: each thing that is wrong is named while it is, and imported agents are not in contact."""
 
-from __future__ import annotations
-
 import errno
 import os
 from collections.abc import Callable
@@ -60,7 +58,6 @@ def test_a_log_that_cannot_be_made_and_one_that_loses_messages_are_named(
     assert without.state()["troubles"] == ["log: there is none of this start"]
     assert make_base(folder=str(tmp_path), log_name="").state()["troubles"] == []  # nobody asked for one
     base = make_base(folder=str(tmp_path / "log"))
-    assert base._log is not None
     base._log.why = os.strerror(errno.ENOSPC)
     assert base.state()["troubles"] == ["log: messages are lost: No space left on device"]
     base.close()

@@ -1,12 +1,9 @@
 """The store returns what was written, in whole batches, also after the writer was killed."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import shutil
 import signal
-import sqlite3
 import subprocess
 import sys
 import time
@@ -21,7 +18,7 @@ from kiteline_basestation.store.saved_map import SavedMap, SavedValues, pack, un
 from kiteline_basestation.store.store import FILE, Batch, Store, backup, batch_of, read
 from kiteline_codec.schema import GravityAlignment, Key, KeyframeHeader, RefinedLandmarks, WireError
 from kiteline_core.ids import SEQUENCE_BITS, AgentId, submap_id
-from tests.basestation.filled_stores import filled
+from tests.basestation.filled_stores import change, filled
 
 keys = st.builds(Key, st.integers(0, 255), st.integers(0, 2**62), st.integers(0, 65535))
 values = st.dictionaries(keys, st.binary(max_size=30), max_size=4)
@@ -107,18 +104,14 @@ def test_file_that_is_no_store_is_refused(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match=r"map\.sqlite"):
         Store(tmp_path)
     (tmp_path / FILE).unlink()
-    with sqlite3.connect(tmp_path / FILE) as db:
-        db.execute("CREATE TABLE mine (a)")
-    db.close()
+    change(tmp_path, "CREATE TABLE mine (a)")
     with pytest.raises(StoreError, match="no store of a base"):
         read(tmp_path)
 
 
 def test_other_version_is_refused(tmp_path: Path) -> None:
     Store(tmp_path).close()
-    with sqlite3.connect(tmp_path / FILE) as db:
-        db.execute("PRAGMA user_version = 99")
-    db.close()
+    change(tmp_path, "PRAGMA user_version = 99")
     with pytest.raises(StoreError, match="version 99, expected version 5"):
         Store(tmp_path)
 

@@ -1,7 +1,5 @@
 """What a person at a base's terminal is told."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from typing import Any
@@ -82,7 +80,6 @@ def test_a_loop_is_reported_with_its_length_and_error(make_flight: MakeFlight, r
     lines, _, _ = told([flight], words, range(0), -1)
     loops = [line for line in lines if re.search(r"loop \d+ closed", line)]
     found = re.search(r"loop 1 closed: error (\d+\.\d\d) m after (\d+) m", loops[0])
-    assert found is not None
     path_m = np.linalg.norm(np.diff(np.array(flight.true_T_w_k)[:, :3, 3], axis=0), axis=1).sum()
     assert 0.02 < float(found[1]) < 5.0 and 0.5 * path_m < float(found[2]) < path_m
 

@@ -1,14 +1,11 @@
 """Submaps that an agent flew without a break are tied, with the metre that it corrected."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.inertial.ties import InertialTie, InertialTies, moved
@@ -23,8 +20,6 @@ from kiteline_codec.schema import CameraIntrinsics, InertialSteps, SubmapScale
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, keyframe_id, submap_id, submap_of_keyframe
-
-F64 = NDArray[np.float64]
 
 T_B_C = se3.from_rt(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.array([0.1, 0.02, -0.05]))
 AGENT = AgentId(0)
@@ -72,7 +67,6 @@ def test_the_new_submap_begins_where_the_steps_end_in_the_agents_new_metre(told:
     S = sim3.normalise(S_new_old @ tie.S_older_newer)
     assert sim3.scale_of(S) == pytest.approx(1.0)  # a metre of the new submap is one of w
     T_w_a = sparse_map.world_pose(LAST)
-    assert T_w_a is not None
     relative = se3.inverse(T_B_C) @ moved(a_record()) @ T_B_C
     expected = T_w_a @ sim3.with_scaled_translation(relative, told)
     assert np.allclose(sim3.place(S, T_M_FIRST), expected, atol=1e-9)
@@ -96,13 +90,12 @@ def test_a_map_in_the_base_s_metres_tells_how_long_the_agents_unit_was_there() -
     for k in range(n):
         keyframe = keyframe_id(OLD, k)
         T = sparse_map.pose(keyframe)
-        assert T is not None
         sparse_map.set_pose(keyframe, sim3.with_scaled_translation(T, 0.98), carry=False)
     sparse_map.scaled_submaps.add(OLD)
     ties = InertialTies(sparse_map)
     ties.add(replace(a_record(), since=keyframe_id(OLD, n - 1)))
     tie = ties.take()
-    assert tie is not None and tie.metre == 1.0
+    assert tie.metre == 1.0
     assert sim3.scale_of(tie.S_older_newer) == pytest.approx(0.98 / UNIT)
 
 
@@ -165,5 +158,4 @@ def test_a_mapper_joins_what_was_flown_without_a_break(make_flight: Callable[...
     )
     true = np.array([T[:3, 3] for T in (*before.true_T_w_k, *after.true_T_w_k)])
     S = align_points(true, found, with_scale=False)
-    assert S is not None
     assert np.linalg.norm(se3.transform(S, found) - true, axis=1).max() < 0.02

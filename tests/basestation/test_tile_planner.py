@@ -1,13 +1,12 @@
 """Tiles for agents: near and ahead first, within the bytes that keyframes earn, removed when far."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from kiteline_basestation.config import BaseConfig, TileConfig
+from kiteline_basestation.exchange.agent_velocity import AgentVelocity
 from kiteline_basestation.exchange.tile_planner import TilePlanner
 from kiteline_basestation.grid.grid_updates import GridUpdates
 from kiteline_basestation.grid.tile_store import Place
@@ -138,7 +137,6 @@ def test_while_a_loop_is_drawn_no_tile_is_sent_and_then_those_that_changed() -> 
     flight.wait(5.0)
     for keyframe in flight.map.submaps[SUBMAP]:
         pose = flight.map.pose(keyframe)
-        assert pose is not None
         pose[1, 3] += 0.5
         flight.map.set_pose(keyframe, pose)
     before = dict(flight.tiles)
@@ -188,3 +186,30 @@ def test_a_drone_beyond_the_last_storey_gets_no_tiles(z: float) -> None:
     flight.fly(0.0, z=z)
     flight.wait(2.0)
     assert not flight.tiles
+
+
+FIRST, SECOND = submap_id(AgentId(0), 1, 0), submap_id(AgentId(0), 1, 1)
+HERE, THERE = np.array([1.0, 2.0, 3.0]), np.array([2.0, 2.0, 1.0])
+
+
+def test_the_velocity_is_that_since_the_last_plan() -> None:
+    velocity = AgentVelocity(0.5)
+    assert not velocity.update(10**9, FIRST, HERE).any()
+    np.testing.assert_allclose(velocity.update(1_500_000_000, FIRST, THERE), [2.0, 0.0, -4.0])
+    np.testing.assert_allclose(velocity.update(2_500_000_000, FIRST, HERE), [-1.0, 0.0, 2.0])
+
+
+def test_nothing_is_derived_from_another_submap_or_an_old_or_later_plan() -> None:
+    velocity = AgentVelocity(0.5)
+    velocity.update(10**9, FIRST, HERE)
+    assert not velocity.update(1_500_000_000, SECOND, THERE).any()
+    assert not velocity.update(4_000_000_000, SECOND, HERE).any()  # five periods later
+    assert not velocity.update(3_500_000_000, SECOND, THERE).any()  # the agent's clock went back
+    assert velocity.update(4_000_000_000, SECOND, HERE).any()
+
+
+def test_later_changes_of_the_position_do_not_matter() -> None:
+    velocity, position = AgentVelocity(1.0), HERE.copy()
+    velocity.update(10**9, FIRST, position)
+    position += 5.0
+    np.testing.assert_allclose(velocity.update(2 * 10**9, FIRST, THERE), THERE - HERE)

@@ -1,7 +1,5 @@
 """What the status page is told: pure functions."""
 
-from __future__ import annotations
-
 import json
 import struct
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The status page's snapshot of a station that has flown."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The process that does the long work of a base."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import signal

@@ -1,7 +1,5 @@
 """Chains of inertial steps over keyframes of a map, and a world in metres by all of them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
@@ -10,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from kiteline_basestation.inertial.chain import segments_of
 from kiteline_basestation.job_kinds import run_job
@@ -21,14 +18,13 @@ from kiteline_basestation.refinement.apply_bundle import keep_scales
 from kiteline_basestation.refinement.bundle_window import BundleWindow
 from kiteline_basestation.store.integrity import contradictions
 from kiteline_codec.schema import CameraIntrinsics, InertialSteps, Record, SubmapPlacement, SubmapScale
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, keyframe_id, submap_id, submap_of_keyframe
 from kiteline_core.optimisation.bundle import BundleResult
 from tests.basestation.feeding import WITHOUT_GRID
 from tests.basestation.inertial_maps import FINE, GRAVITY, T_B_C, steps
-
-F64 = NDArray[np.float64]
 
 
 def a_sparse_map(culled: set[int]) -> tuple[SparseMap, BundleWindow, list[KeyframeId]]:

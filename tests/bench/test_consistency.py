@@ -1,7 +1,5 @@
 """Errors of poses against the truth, faults in mid-flight, and random flights."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

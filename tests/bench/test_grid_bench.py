@@ -1,7 +1,5 @@
 """What the grid's benchmark judges with: reference methods on scenes whose answer is known, and objects in a grid."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

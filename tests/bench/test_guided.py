@@ -1,7 +1,5 @@
 """A simulated worn rig, mounted degrees off, is turned by hand: what `kiteline calibrate imu` finds and writes."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from dataclasses import replace

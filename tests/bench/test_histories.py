@@ -1,7 +1,5 @@
 """No id, nonce or session comes twice, whatever happens to disks, cards and clocks; planted bugs are found."""
 
-from __future__ import annotations
-
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

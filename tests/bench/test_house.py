@@ -1,7 +1,5 @@
 """The shape of the sources is measured: sizes, import circles, also those of types alone."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from kiteline_bench.benchmark import BENCHMARKS, parts

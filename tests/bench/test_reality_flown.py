@@ -1,7 +1,5 @@
 """The figures of the reality benches, on a flight whose errors are known."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -43,7 +41,6 @@ def scaled(flight: Flown, factor: float) -> Flown:
     """The flight with lengths in another unit."""
 
     def in_unit(T: np.ndarray | None) -> np.ndarray:
-        assert T is not None
         return se3.from_rt(T[:3, :3], factor * T[:3, 3])
 
     estimates = [replace(e, T_m_b=in_unit(e.T_m_b), T_o_b=in_unit(e.T_o_b), T_w_b=None)
@@ -67,7 +64,6 @@ def test_a_jump_beside_the_odometry_is_measured(flight: Flown) -> None:
         shift = np.eye(4)
         shift[0, 3] = 0.05
         pose = live_pose(moved[k])
-        assert pose is not None
         moved[k] = replace(moved[k], T_w_b=shift @ pose)
     jumping = replace(flight, run=replace(flight.run, estimates=moved))
     assert jumping.largest_jump_m() == pytest.approx(0.05, abs=0.012)
@@ -113,7 +109,6 @@ def test_a_flight_is_measured_by_the_imu_of_another_rig() -> None:
     seen = ImuBatch(np.arange(4), samples @ (np.array(truth["gyro_matrix"]) @ turn["one"]).T, samples)
     flight = Recording(rigs[0].told, None, (Item(Frame(0, np.zeros((4, 4), np.uint8)), seen),))
     there = as_measured_by(flight, truth, other).items[0].imu
-    assert there is not None
     np.testing.assert_allclose(there.gyro, samples @ (np.array(other["gyro_matrix"]) @ turn["other"]).T, atol=1e-12)
     late_s = other["frame_stamps_late_s"] - truth["frame_stamps_late_s"]
     np.testing.assert_allclose(there.t_ns, np.arange(4) - round(1e9 * late_s))

@@ -1,7 +1,5 @@
 """The results file: sections are replaced, bars are met or not, the summary stands on top."""
 
-from __future__ import annotations
-
 import importlib
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Own CPU times of stages: they add up to the whole, every stage is found and public, the table lists all."""
 
-from __future__ import annotations
-
 import time
 from pathlib import Path
 

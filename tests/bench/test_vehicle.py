@@ -1,7 +1,5 @@
 """The bench on the vehicle: its physics, what it says without an autopilot, and how it counts."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path
@@ -9,11 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kiteline_bench.benchmark import parts
 from kiteline_bench.harness.bars import Bench
 from kiteline_bench.vehicle import controllers, faults
 from kiteline_bench.vehicle.sitl import flights
-from kiteline_bench.vehicle.sitl.arducopter import PARAMETERS, VARIABLE
+from kiteline_bench.vehicle.sitl.arducopter import VARIABLE
 from kiteline_bench.vehicle.sitl.copter import Copter
 from kiteline_bench.vehicle.sitl.loop import Truth
 from kiteline_hw.sim.flight_controller import VisionSample
@@ -48,8 +45,7 @@ def test_it_climbs_and_what_it_measures_is_its_motion() -> None:
 
 
 @pytest.mark.parametrize(
-    ("motors", "axis"),
-    [((0.5, 0.6, 0.6, 0.5), 0), ((0.6, 0.5, 0.6, 0.5), 1), ((0.6, 0.6, 0.5, 0.5), 2)],
+    ("motors", "axis"), [((0.5, 0.6, 0.6, 0.5), 0), ((0.6, 0.5, 0.6, 0.5), 1), ((0.6, 0.6, 0.5, 0.5), 2)]
 )  # rolls right by the left motors, lifts its nose by the front ones, turns clockwise against those that turn back
 def test_motors_turn_it_as_in_arducopters_quadrotor_x(motors: tuple[float, ...], axis: int) -> None:
     copter = flown(Copter(), pwm(0.6, 0.6, 0.6, 0.6), 0.2)
@@ -73,13 +69,6 @@ def test_truth_is_interpolated_across_south() -> None:
     assert np.allclose(position, 0.5) and math.cos(heading[0] - math.pi) == pytest.approx(1.0)
 
 
-def test_all_parts_are_there_and_one_can_be_chosen() -> None:
-    assert [name for name, _, _ in parts("vehicle")] == [
-        f"vehicle/{part}" for part in ("sitl", "controllers", "faults", "camera", "calibration", "units")
-    ]
-    assert len(parts("vehicle/units")) == 1
-
-
 def test_without_an_autopilot_the_loop_is_not_flown_and_says_so(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -88,12 +77,6 @@ def test_without_an_autopilot_the_loop_is_not_flown_and_says_so(
     assert flights.run(bench) == [] and VARIABLE in bench.more[0]
     monkeypatch.setenv(VARIABLE, str(tmp_path / "none"))
     assert not flights.run(bench)[0].met
-
-
-def test_the_ekf_has_nothing_but_poses() -> None:
-    """No GPS and no compass: position, velocity, height and heading are those of the poses."""
-    assert all(PARAMETERS[f"EK3_SRC1_{what}"] == 6 for what in ("POSXY", "VELXY", "POSZ", "VELZ", "YAW"))
-    assert PARAMETERS["GPS1_TYPE"] == 0 and "ARMING_CHECK" not in PARAMETERS
 
 
 def test_wrong_axes_are_named_and_right_ones_are_not() -> None:

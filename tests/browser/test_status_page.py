@@ -1,7 +1,5 @@
 """The status page over loopback: files, status, websocket, who may look, and that it costs nothing unseen."""
 
-from __future__ import annotations
-
 import http.client
 import json
 import socket

@@ -1,7 +1,5 @@
 """The status page in a real browser, where there is one: it draws, writes its numbers, and complains of nothing."""
 
-from __future__ import annotations
-
 import base64
 import json
 import re
@@ -77,7 +75,6 @@ def browser(tmp_path: Path) -> Iterator[Browser]:
     ]  # fmt: skip
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     try:
-        assert process.stderr is not None
         port = next(m[1] for line in process.stderr if (m := re.search(r"listening on ws://[^:]+:(\d+)/", line)))
         page = next(
             t for t in _targets(int(port)) if t["type"] == "page"

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import pytest
 
 from kiteline_cli import main as cli

@@ -1,7 +1,5 @@
 """A second reader of the codec's bytes, written from codec/SPEC.md alone in plain Python."""
 
-from __future__ import annotations
-
 import struct
 from math import sqrt
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Records from one end to the other: coded and plain."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

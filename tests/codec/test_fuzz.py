@@ -1,7 +1,5 @@
 """A short run of the fuzzer over the kept corpus; `kiteline bench fuzz` makes a long one."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The second reader, written from codec/SPEC.md alone, reads what the codec writes."""
 
-from __future__ import annotations
-
 import json
 import zlib
 from dataclasses import replace

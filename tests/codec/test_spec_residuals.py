@@ -1,7 +1,5 @@
 """A second reader of residual codes, written from codec/SPEC.md in plain Python, reads what the codec writes."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable
 from math import floor

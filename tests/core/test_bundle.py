@@ -1,16 +1,13 @@
 """Bundle adjustment against numeric differences, plain numpy and an independent solver."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
 from kiteline_core.optimisation import bundle_kernels as kernels
 from kiteline_core.optimisation.bundle import BundleConfig, BundleProblem, bundle, pack, unpack
 
-F64 = NDArray[np.float64]
 LENS = np.array([400.0, 410.0, 320.0, 240.0, 44.0])
 
 
@@ -78,20 +75,6 @@ def huber_cost(s: F64, bound: F64) -> F64:
     return np.where(outside, 2.0 * np.sqrt(bound) * root - bound, s)
 
 
-def huber_weight(s: F64, bound: F64) -> F64:
-    """Derivative of `huber_cost` by s."""
-    outside = s > bound
-    return np.where(outside, np.sqrt(bound) / np.sqrt(np.where(outside, s, 1.0)), 1.0)
-
-
-def test_huber_is_smooth_and_its_weight_is_its_derivative() -> None:
-    s = np.linspace(0.01, 40.0, 300)
-    bound = np.full_like(s, 7.8)
-    e = 1e-6
-    numeric = (huber_cost(s + e, bound) - huber_cost(s - e, bound)) / (2 * e)
-    assert np.allclose(numeric, huber_weight(s, bound), atol=1e-6)
-
-
 def test_kernel_residuals_agree_with_numpy() -> None:
     problem, _, _ = scene(4, 30, 0.5, 1)
     out = np.empty(len(problem.camera))
@@ -102,33 +85,21 @@ def test_kernel_residuals_agree_with_numpy() -> None:
     assert np.allclose(out, np.square(residuals(problem, problem.T_c_m, problem.points)).sum(1), rtol=1e-10)
 
 
+def normal_blocks(points: int, observations: int, free: int) -> tuple[F64, ...]:
+    """Room for what `linearise` gives: blocks of cameras, of points and between them."""
+    shapes = ((free, 6, 6), (free, 6), (points, 6), (points, 3), (observations, 6, 3))
+    return tuple(np.zeros(shape) for shape in shapes)
+
+
 def test_normal_equations_agree_with_numeric_differences() -> None:
     problem, _, _ = scene(3, 12, 0.5, 2)
     n, m, f = len(problem.points), len(problem.camera), 2
     free = np.array([-1, 0, 1], np.int32)
-    hcc, bc, hpp, bp, hcp = (
-        np.empty((f, 6, 6)),
-        np.empty((f, 6)),
-        np.empty((n, 6)),
-        np.empty((n, 3)),
-        np.zeros((m, 6, 3)),
-    )
+    hcc, bc, hpp, bp, hcp = blocks = normal_blocks(n, m, f)
     model = (problem.starts, problem.camera, problem.measured, 1.0 / np.square(problem.sigma))
     huge = np.array([1e12, 1e12])
-    cost = kernels.linearise(
-        pack(problem.T_c_m),
-        problem.lens,
-        problem.points,
-        *model,
-        np.ones(m, np.uint8),
-        huge,
-        free,
-        hcc,
-        bc,
-        hpp,
-        bp,
-        hcp,
-    )
+    every = np.ones(m, np.uint8)
+    cost = kernels.linearise(pack(problem.T_c_m), problem.lens, problem.points, *model, every, huge, free, *blocks)
 
     def move(x: F64) -> F64:
         poses = problem.T_c_m.copy()
@@ -161,17 +132,11 @@ def test_reduced_system_and_its_solution_agree_with_dense_algebra() -> None:
     problem, _, _ = scene(6, 40, 0.5, 3)
     n, m, f = len(problem.points), len(problem.camera), 5
     free = np.arange(-1, 5, dtype=np.int32)
-    hcc, bc, hpp, bp, hcp = (
-        np.empty((f, 6, 6)),
-        np.empty((f, 6)),
-        np.empty((n, 6)),
-        np.empty((n, 3)),
-        np.zeros((m, 6, 3)),
-    )
+    hcc, bc, hpp, bp, hcp = blocks = normal_blocks(n, m, f)
     model = (problem.starts, problem.camera, problem.measured, 1.0 / np.square(problem.sigma))
     active, bound = np.ones(m, np.uint8), np.array([5.99, 7.81])
     cameras = pack(problem.T_c_m)
-    kernels.linearise(cameras, problem.lens, problem.points, *model, active, bound, free, hcc, bc, hpp, bp, hcp)
+    kernels.linearise(cameras, problem.lens, problem.points, *model, active, bound, free, *blocks)
     h, g = np.zeros((6 * f + 3 * n, 6 * f + 3 * n)), np.zeros(6 * f + 3 * n)
     for c in range(f):
         block = np.triu(hcc[c]) + np.triu(hcc[c], 1).T

@@ -1,17 +1,14 @@
 """Offsets of disparities as unknowns of a bundle, against an independent solver and dense algebra."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
 from kiteline_core.optimisation.bundle import Border, BundleConfig, BundleProblem, BundleResult, bundle
 
-F64 = NDArray[np.float64]
 LENS = np.array([400.0, 410.0, 320.0, 240.0, 44.0])
 TRUE = np.array([[0.3, -0.4], [-0.2, 0.0]])  # px: constant, and by the x of the image; of two agents
 EASY = BundleConfig(robust_trials=60, final_trials=0, stop=0.0, chi2_mono=1e9, chi2_stereo=1e9)
@@ -50,7 +47,6 @@ def passage(sigma: float = 10.0, seed: int = 4) -> BundleProblem:
 
 
 def residuals(problem: BundleProblem, poses: F64, points: F64, c: F64) -> F64:
-    assert problem.border is not None
     which = np.repeat(np.arange(len(points)), np.diff(problem.starts))
     q = np.einsum("nij,nj->ni", poses[problem.camera][:, :3, :3], points[which]) + poses[problem.camera][:, :3, 3]
     off = np.where(problem.border.group >= 0, np.sum(problem.border.terms * c[problem.border.group], axis=1), 0.0)
@@ -138,7 +134,6 @@ def test_a_prior_widens_where_the_data_contradict_it() -> None:
 
 def test_a_prior_stays_where_the_data_agree_with_it() -> None:
     problem = passage(0.02)
-    assert problem.border is not None
     off = np.sum(problem.border.terms * TRUE[problem.border.group], axis=1)
     good = problem.measured.copy()
     good[:, 2] -= np.where(problem.border.group >= 0, off, 0.0)

@@ -28,10 +28,7 @@ def through_lens(c: CameraModel, points: np.ndarray) -> np.ndarray:
     if c.lens is Lens.RADTAN:
         k1, k2, p1, p2, k3, k4, k5, k6 = (*c.distortion, *[0.0] * 8)[:8]
         scale = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
-        x, y = (
-            x * scale + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-            y * scale + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-        )
+        x, y = (x * scale + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * scale + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y)
     elif c.lens is Lens.EQUIDISTANT:
         r = np.sqrt(r2)
         a = np.arctan(r)

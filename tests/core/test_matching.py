@@ -1,7 +1,5 @@
 """Descriptor matching against plain references."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from kiteline_core.imaging import matching

@@ -1,16 +1,13 @@
 """Velocities brought to the body frame: by hand, and against motion itself."""
 
-from __future__ import annotations
-
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
 from kiteline_core import odometry
+from kiteline_core.arrays import F64
 from kiteline_core.frame import UNMEASURED, OdometryBatch
 from kiteline_core.geometry import se3
-
-F64 = np.ndarray
 
 # A body whose axes are a camera's (right, down, forward) above and ahead of a rover's axle (forward, left, up).
 R_B_D = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
@@ -75,7 +72,6 @@ def test_batches_are_joined_and_chosen_from() -> None:
     assert odometry.joined([]) is None
     assert odometry.joined([a]) is a
     both = odometry.joined([a, b])
-    assert both is not None
     assert both.velocity[:, 0].tolist() == [1.0, 2.0]
     assert both.rate_cov.shape == (2, 3, 3)
     assert odometry.chosen(both, slice(1, 2)).velocity[0, 0] == 2.0

@@ -1,7 +1,5 @@
 """The place index against plain references: words, scores, places that come and go, and what a query costs."""
 
-from __future__ import annotations
-
 import time
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Absolute pose: P3P against constructed truth, RANSAC among outliers."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import assume, given
@@ -51,7 +49,6 @@ def test_pose_among_outliers(share: float) -> None:
         uv[bad] = rng.uniform(0, 480, (len(bad), 2))
         observed = np.column_stack([uv, np.full(90, -1.0)])
         fit = pnp.solve_pnp(points, np.zeros((90, 3)), observed, np.zeros(90, np.uint8), CAMERA, trial)
-        assert fit is not None
         error = se3.log(fit.T_c_m @ se3.inverse(T))
         assert np.linalg.norm(error[:3]) < 0.05 and np.linalg.norm(error[3:]) < 0.01
         assert np.count_nonzero(fit.inlier[bad]) <= 1 and fit.inliers >= 90 - len(bad) - 3
@@ -73,7 +70,7 @@ def test_the_same_seed_gives_the_same_bits_and_draws_end_early() -> None:
     observed = np.column_stack([uv, np.full(50, -1.0)])
     args = points, np.zeros((50, 3)), observed, np.zeros(50, np.uint8), CAMERA
     one, two = pnp.solve_pnp(*args, 7), pnp.solve_pnp(*args, 7)
-    assert one is not None and two is not None and one.T_c_m.tobytes() == two.T_c_m.tobytes()
+    assert one.T_c_m.tobytes() == two.T_c_m.tobytes()
     state, again = np.array([7], np.uint64), np.array([7], np.uint64)
     T, inlier = np.eye(4), np.zeros(50, np.bool_)
     pnp_kernels.p3p_ransac(points, uv, np.full(50, 3.0), CAMERA, 1000, 0.99, state, T, inlier)

@@ -1,17 +1,14 @@
 """Motion-only optimisation: it finds the pose, ignores outliers, and weighs points by how well they are known."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64, Bool
 from kiteline_core.geometry import se3
 from kiteline_core.pose import pose_kernels
 
-F64 = NDArray[np.float64]
 CAMERA = np.array([450.0, 450.0, 370.0, 240.0, 50.0])
 
 
@@ -30,9 +27,7 @@ def project(T: F64, points: F64) -> F64:
     return np.column_stack([fx * p[:, 0] / p[:, 2] + cx, fy * p[:, 1] / p[:, 2] + cy, bf / p[:, 2]])
 
 
-def optimise(
-    T: F64, points: F64, observed: F64, ray: F64 | None = None, chi2: float = 9.21
-) -> tuple[F64, NDArray[np.bool_], int]:
+def optimise(T: F64, points: F64, observed: F64, ray: F64 | None = None, chi2: float = 9.21) -> tuple[F64, Bool, int]:
     n = len(points)
     out, inlier = T.copy(), np.ones(n, np.bool_)
     count, _ = pose_kernels.optimise_pose(

@@ -1,7 +1,5 @@
 """The documentation: links lead somewhere, files that it names exist, and no page is forgotten."""
 
-from __future__ import annotations
-
 import pkgutil
 import re
 from pathlib import Path
@@ -102,10 +100,7 @@ def test_the_architecture_names_every_subpackage(room: str) -> None:
 
 @pytest.mark.parametrize(
     ("module", "heading"),
-    [
-        ("agent/kiteline_agent/agent.py", "**Agent.**"),
-        ("basestation/kiteline_basestation/mapper.py", "**Base.**"),
-    ],
+    [("agent/kiteline_agent/agent.py", "**Agent.**"), ("basestation/kiteline_basestation/mapper.py", "**Base.**")],
 )
 def test_the_architecture_has_the_numbered_steps_of_the_code(module: str, heading: str) -> None:
     steps = re.findall(r"^ *# (\d\. .*)$", (ROOT / module).read_text(encoding="utf-8"), re.MULTILINE)

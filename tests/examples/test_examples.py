@@ -1,7 +1,5 @@
 """The scripts in examples/ run as they are, on a small simulated recording."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys
@@ -50,4 +48,4 @@ def test_a_flown_log_becomes_arrays(recording: Path, tmp_path: Path) -> None:
     assert lines[0].startswith("left images    (30, 240, 320) uint8")
     assert lines[1] == "gyro, accel    (0, 3), (0, 3)"
     found = re.match(r"odometry       \(30, 4, 4\), path (\d\.\d+) m", lines[2])
-    assert found is not None and float(found[1]) == pytest.approx(29 * STEP_M, abs=0.01)
+    assert float(found[1]) == pytest.approx(29 * STEP_M, abs=0.01)

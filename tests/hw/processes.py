@@ -1,7 +1,5 @@
 """What tests of links share: free addresses, other processes and waiting."""
 
-from __future__ import annotations
-
 import os
 import socket
 import subprocess

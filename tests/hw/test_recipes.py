@@ -1,7 +1,5 @@
 """The recipes of CONTRIBUTING.md: a new source, link and MAVLink message is one file and one line in a table."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import dataclass
 from pathlib import Path
@@ -120,7 +118,7 @@ class Rangefinder(messages.MavlinkMessage):
     distance_cm: int
 
     @classmethod
-    def parse(cls, m: object) -> Rangefinder:
+    def parse(cls, m: object) -> "Rangefinder":
         return cls(m.time_boot_ms, m.current_distance)  # type: ignore[attr-defined]
 
     def values(self) -> tuple[int, ...]:

@@ -115,7 +115,6 @@ def test_a_wide_pair_is_found_with_corners_beside_the_cameras() -> None:
     views = exact_views(FISHEYE, right, 30, 3, 0.1)
     assert any(view.eyes[0] is None for view in views) or len(views) == 30
     result = calibrate(BOARD.points_m, views, [(512, 512)] * 2, Lens.EQUIDISTANT, 4)
-    assert result.T_c_r is not None
     np.testing.assert_allclose(result.T_c_r[:3, 3], T_C_R[:3, 3], atol=5e-4)
     assert np.linalg.norm(se3.so3_log(result.T_c_r[:3, :3].T @ T_C_R[:3, :3])) < 1e-3
     assert pixels_apart(right, result.cameras[1]) < 0.1
@@ -128,7 +127,6 @@ def test_wrong_corners_do_not_turn_the_result() -> None:
         assert view.eyes[0] is not None
         view.eyes[0].px[rng.integers(len(view.eyes[0].px))] += rng.normal(0, 20, 2)  # a corner of something else
     eye = views[3].eyes[0]
-    assert eye is not None
     eye.px[:] += rng.normal(0, 15, eye.px.shape)  # a view that is no board
     result = calibrate(BOARD.points_m, views, [(640, 480)], Lens.RADTAN, 4)
     assert result.left_out == 1 and pixels_apart(RADTAN, result.cameras[0]) < 0.3
@@ -163,7 +161,6 @@ def test_the_verdict_names_what_is_missing_and_how_to_mend_it() -> None:
     kept = []
     for view in views:
         eye = view.eyes[0]
-        assert eye is not None
         right = eye.px[:, 0] > 160
         if right.sum() >= 8:
             kept.append(View(view.t_ns, (Corners(eye.ids[right], eye.px[right]),)))
@@ -211,15 +208,15 @@ def test_a_printed_board_is_found_whole_and_in_part_and_turned(tmp_path: Path) -
     assert image is not None
     image = cv2.resize(image, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
     whole = BOARD.find(np.asarray(image))
-    assert whole is not None and len(whole.ids) == len(BOARD.points_m) == 48
+    assert len(whole.ids) == len(BOARD.points_m) == 48
     part = BOARD.find(np.ascontiguousarray(image[:, : image.shape[1] // 2]))
-    assert part is not None and 12 <= len(part.ids) < 30
+    assert 12 <= len(part.ids) < 30
     np.testing.assert_allclose(part.px, whole.px[part.ids], atol=0.3)
     assert BOARD.find(np.full((480, 640), 120, np.uint8)) is None
     chess = parse_board("chessboard:9x6:0.03")
     plain = chess.draw(40)
     seen = chess.find(plain)
-    assert seen is not None and len(seen.ids) == 40
+    assert len(seen.ids) == 40
     turned = Corners(seen.ids, seen.px[::-1].copy())
     np.testing.assert_array_equal(same_order(seen, turned).px, seen.px)
 
@@ -262,12 +259,11 @@ def test_rendered_pictures_of_a_pair_by_the_command(tmp_path: Path, capsys: pyte
     said = json.loads(capsys.readouterr().out)
     assert status == 0 and said["verdict"] in ("good", "poor") and max(said["rms_px"]) < 0.3
     told = read_calibration(str(out))
-    assert told.T_c_r is not None
     np.testing.assert_allclose(told.T_c_r[:3, 3], T_C_R[:3, 3], atol=6e-4)
     assert np.linalg.norm(se3.so3_log(told.T_c_r[:3, :3].T @ T_C_R[:3, :3])) < 2e-3
     assert pixels_apart(RADTAN, told.cameras[0]) < 0.4 and pixels_apart(right, told.cameras[1]) < 0.4
     image = cv2.imread(str(drawn))
-    assert image is not None and image.shape[1] == 1280
+    assert image.shape[1] == 1280
     # the file flies the very images that it was made of
     frames = [f for f in open_source(source, calibration=str(out)) if isinstance(f, Frame)]
     assert len(frames) == 10 and frames[0].right is not None

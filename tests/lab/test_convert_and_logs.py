@@ -54,7 +54,6 @@ def test_convert_keeps_every_frame_and_sample(
             np.testing.assert_array_equal(a.accel, b.accel)
     assert (before.imu, before.rig.left, before.rig.right) == (after.imu, after.rig.left, after.rig.right)
     np.testing.assert_array_equal(before.rig.T_b_c, after.rig.T_b_c)
-    assert before.ground_truth is not None and after.ground_truth is not None
     np.testing.assert_array_equal(before.ground_truth.t_ns, after.ground_truth.t_ns)
     np.testing.assert_allclose(before.ground_truth.T_w_b, after.ground_truth.T_w_b, atol=1e-12)
 

@@ -1,7 +1,5 @@
 """`kiteline doctor --camera`: modelled devices with each fault, and the verdict on it."""
 
-from __future__ import annotations
-
 import json
 import time
 from collections.abc import Callable
@@ -177,9 +175,7 @@ def test_exposure(watched: dict[str, Found], name: str, severity: Severity, word
     assert exposure.severity is severity and words in exposure.text and exposure.remedy
 
 
-def test_a_blurred_lens_is_found_on_its_side_and_a_blank_wall_is_not_called_blurred(
-    watched: dict[str, Found],
-) -> None:
+def test_a_blurred_lens_is_found_on_its_side_and_a_blank_wall_is_not_called_blurred(watched: dict[str, Found]) -> None:
     blurred = watched["blurred"]["camera sharpness"]
     assert blurred.severity is Severity.FAIL and "right one" in blurred.text and "focus" in blurred.remedy
     bare = watched["bare"]["camera sharpness"]

@@ -1,12 +1,10 @@
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64
 from kiteline_core.frame import Trajectory
 from kiteline_core.geometry import se3
 from kiteline_lab.evaluation.trajectories import TrajectoryError, read
@@ -151,7 +149,7 @@ def test_a_plot_of_a_file_of_any_name(name: str, tmp_path: Path) -> None:
 def test_errors_at_the_ends_of_a_line_are_against_the_truth_beyond_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    drawn: list[NDArray[np.float64]] = []
+    drawn: list[F64] = []
     monkeypatch.setattr(plot, "_draw_errors", lambda axes, errors: drawn.extend(off for _, off, _ in errors))
     t_ns = np.arange(11, dtype=np.int64) * 20_000_000
     poses = np.tile(np.eye(4), (11, 1, 1))

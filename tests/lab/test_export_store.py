@@ -1,7 +1,5 @@
 """Exports of a map that was made by the real mapper."""
 
-from __future__ import annotations
-
 import os
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Flights in this process: every mode flies the same recording, keeps the contract, and does so twice alike."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 from pathlib import Path

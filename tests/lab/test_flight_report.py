@@ -1,7 +1,5 @@
 """Composing the refined trajectory, the report's numbers, and the check of a flight's folder."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from dataclasses import dataclass
@@ -9,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import KeyframeId, SubmapId
 from kiteline_lab.flights import flight_report
@@ -19,8 +17,6 @@ from kiteline_lab.flights.flight_report import statistic, table, without_timing,
 from kiteline_lab.flights.fly import fly
 from kiteline_lab.flights.plan import Options
 from kiteline_lab.flights.refined_path import refined_path
-
-F64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,5 @@
 """What a command line becomes: options, flight time 0 of several sources, a cleared folder."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The guided motion of camera and IMU: which motion is wanted, and the verdict."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A live flight with a modelled pair of cameras that are unplugged on the way, beside a flight controller and a log."""
 
-from __future__ import annotations
-
 import threading
 import time
 from pathlib import Path

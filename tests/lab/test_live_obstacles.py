@@ -1,7 +1,5 @@
 """A live flight by a slow camera tells a flight controller of obstacles at the full rate, and its log replays."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import replace
 from pathlib import Path

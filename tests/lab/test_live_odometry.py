@@ -1,7 +1,5 @@
 """A live flight with odometry of a flight controller that has a clock of its own, and the same flight from its log."""
 
-from __future__ import annotations
-
 import threading
 import time
 from pathlib import Path

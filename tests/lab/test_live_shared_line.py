@@ -1,7 +1,5 @@
 """A live flight whose poses and packets for a base share one connection to a flight controller."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,17 +1,14 @@
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64, I64
 from kiteline_core.frame import Trajectory
 from kiteline_core.geometry import se3
 from kiteline_lab.evaluation import metrics
 from kiteline_lab.evaluation.metrics import TrajectoryAlignment, associate, evaluate, match, truth_at, umeyama
 
-F64 = NDArray[np.float64]
 PERIOD_NS = 50_000_000
 
 tangents = st.lists(st.floats(-2.0, 2.0), min_size=6, max_size=6).map(np.array)
@@ -32,7 +29,7 @@ def moved(trajectory: Trajectory, T: F64, scale: float = 1.0) -> Trajectory:
     return Trajectory(trajectory.t_ns, T @ poses)
 
 
-def part(trajectory: Trajectory, keep: NDArray[np.int64]) -> Trajectory:
+def part(trajectory: Trajectory, keep: I64) -> Trajectory:
     return Trajectory(trajectory.t_ns[keep], trajectory.T_w_b[keep])
 
 
@@ -42,8 +39,6 @@ def test_ate_and_rpe_do_not_depend_on_where_the_estimate_s_world_lies(xi: F64) -
     noisy = Trajectory(truth.t_ns, truth.T_w_b @ se3.exp(np.array([0.02, 0.0, 0.01, 0.0, 0.03, 0.0])))
     there, here = evaluate(moved(noisy, se3.exp(xi)), truth), evaluate(noisy, truth)
     assert there.ate_m.rmse == pytest.approx(here.ate_m.rmse, abs=1e-9)
-    assert there.rpe_frame is not None
-    assert here.rpe_frame is not None
     assert there.rpe_frame.rotation_deg.rmse == pytest.approx(here.rpe_frame.rotation_deg.rmse, abs=1e-7)
     assert there.rpe_frame.translation_m.rmse == pytest.approx(here.rpe_frame.translation_m.rmse, abs=1e-9)
 
@@ -86,10 +81,8 @@ def test_known_answers() -> None:
     e = evaluate(Trajectory(t_ns, est), Trajectory(t_ns, truth), TrajectoryAlignment.ORIGIN)
     assert e.ate_m.max == pytest.approx(0.06)  # the first pose lies on the truth, each second one 6 cm beside
     assert e.ate_m.mean == pytest.approx(0.06 * 20 / 41)
-    assert e.rpe_frame is not None
     assert e.rpe_frame.translation_m.rmse == pytest.approx(0.06)
     assert e.rpe_frame.rotation_deg.max == pytest.approx(0.0)
-    assert e.rpe_second is not None
     assert e.rpe_second.translation_m.max == pytest.approx(0.0, abs=1e-12)  # ten frames on, the same side again
     assert e.rpe_second.translation_m.n == 31
     assert e.path_m == pytest.approx(4.0)
@@ -105,7 +98,6 @@ def test_a_steady_turn_is_the_rotation_error() -> None:
     for a, b in zip(truth.T_w_b[:-1], truth.T_w_b[1:]):
         poses.append(poses[-1] @ se3.inverse(a) @ b @ turn)
     e = evaluate(Trajectory(truth.t_ns, np.stack(poses)), truth)
-    assert e.rpe_frame is not None
     assert e.rpe_frame.rotation_deg.mean == pytest.approx(0.25, rel=1e-6)
     assert e.rpe_frame.rotation_deg.max == pytest.approx(0.25, rel=1e-6)
     assert e.rpe_frame.translation_m.max == pytest.approx(0.0, abs=1e-9)
@@ -117,7 +109,6 @@ def test_scale_is_found_only_when_asked_for() -> None:
     with_scale = evaluate(half, truth, TrajectoryAlignment.SIM3)
     assert with_scale.scale == pytest.approx(2.0)
     assert with_scale.ate_m.rmse == pytest.approx(0.0, abs=1e-9)
-    assert with_scale.rpe_frame is not None
     assert with_scale.rpe_frame.translation_m.max == pytest.approx(0.0, abs=1e-9)
     assert evaluate(half, truth).ate_m.rmse > 0.3
 
@@ -130,18 +121,9 @@ def test_drift_along_a_long_way_is_kitti_s_percent() -> None:
     est[:, 2, 3] *= 1.02
     t_ns = 100_000_000 * np.arange(n, dtype=np.int64)
     k = evaluate(Trajectory(t_ns, est), Trajectory(t_ns, truth)).kitti
-    assert k is not None
     assert k.t_rel_percent == pytest.approx(2.0, rel=0.01)
     assert k.r_rel_deg_per_100m == pytest.approx(0.0, abs=1e-9)
     assert k.segments == sum(len(range(0, 3000 - 2 * int(length), 10)) for length in metrics.KITTI_LENGTHS_M)
-
-
-def test_association_takes_the_nearest_once_and_nothing_far() -> None:
-    truth = np.array([0, 5, 10, 15, 20, 100], np.int64) * 1_000_000
-    est = np.array([1, 4, 6, 19, 60, 98], np.int64) * 1_000_000
-    i, j = associate(est, truth)
-    assert i.tolist() == [0, 1, 3, 5]  # 6 ms wants 5 ms too, but 4 ms came first; 60 ms is near nothing
-    assert j.tolist() == [0, 1, 4, 5]
 
 
 @given(
@@ -174,7 +156,6 @@ def test_a_gappy_estimate_against_truth_of_another_rate() -> None:
     assert e.ate_m.max == pytest.approx(0.0, abs=1e-9)
     assert e.coverage == pytest.approx((39 + 49) * 0.05 / (1199 * 0.005), rel=1e-9)
     assert e.frames_covered == pytest.approx(90 / 120, rel=1e-9)
-    assert e.rpe_frame is not None
     assert e.rpe_frame.translation_m.n == 89
 
 
@@ -196,7 +177,7 @@ def test_a_standing_estimate_has_no_scale() -> None:
 def test_dense_truth_is_met_between_its_stamps() -> None:
     """A fast steady motion, truth at 50 Hz, frames at 20 Hz: every second frame lies midway between two true poses."""
 
-    def at(t_ns: NDArray[np.int64]) -> Trajectory:
+    def at(t_ns: I64) -> Trajectory:
         poses = np.stack([se3.exp(np.array([0.0, 0.0, 0.0, 0.1, 0.2, 1.5]) * t) for t in t_ns / 1e9])
         poses[:, :3, 3] = np.outer(t_ns / 1e9, [2.0, 1.0, -0.5])
         return Trajectory(t_ns, poses)
@@ -205,7 +186,6 @@ def test_dense_truth_is_met_between_its_stamps() -> None:
     e = evaluate(est, truth, TrajectoryAlignment.ORIGIN)
     assert e.matched == 41
     assert e.ate_m.max == pytest.approx(0.0, abs=1e-9)
-    assert e.rpe_frame is not None
     assert e.rpe_frame.rotation_deg.max == pytest.approx(0.0, abs=1e-5)
 
 

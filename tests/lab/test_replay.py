@@ -1,7 +1,5 @@
 """Logs fly again bit for bit, and a log that was tampered with is found out."""
 
-from __future__ import annotations
-
 import shutil
 import struct
 from pathlib import Path

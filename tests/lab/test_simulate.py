@@ -1,7 +1,5 @@
 """`kiteline sim`: what it records opens again as the same flight, and its truth lies beside it."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -35,7 +33,7 @@ def test_the_recording_is_the_flight(tmp_path: Path) -> None:
             assert np.array_equal(a.left, b.left)
             assert a.right is not None and b.right is not None and np.array_equal(a.right, b.right)
     true, stated = recorded.ground_truth, rendered.ground_truth
-    assert true is not None and stated is not None and np.allclose(true.T_w_b, stated.T_w_b, atol=1e-9)
+    assert np.allclose(true.T_w_b, stated.T_w_b, atol=1e-9)
     assert "image: flight.pgm" in (tmp_path / "flight.yaml").read_text() and (tmp_path / "flight.pgm").is_file()
 
 
@@ -73,7 +71,6 @@ def test_every_agent_gets_its_log(tmp_path: Path) -> None:
     out = tmp_path / "two.mcap"
     assert main([SCENE, "--out", str(out), "--also", "course"]) == 0
     first, second = open_source(f"mcap:{out}"), open_source(f"mcap:{tmp_path / 'two-1.mcap'}")
-    assert first.ground_truth is not None and second.ground_truth is not None
     assert not np.allclose(first.ground_truth.T_w_b[0], second.ground_truth.T_w_b[0])
 
 

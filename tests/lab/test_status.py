@@ -1,7 +1,5 @@
 """`kiteline status`: a base's answer as lines of text, and its exit status."""
 
-from __future__ import annotations
-
 import json
 from copy import deepcopy
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Training of the vocabulary: kernels against plain references, clusters found, and the tree that ships."""
 
-from __future__ import annotations
-
 from importlib.resources import files
 
 import numpy as np

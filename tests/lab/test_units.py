@@ -1,7 +1,5 @@
 """`kiteline install-units`: what it writes, what it refuses, and that nothing of the user's is removed."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """No kernel is compiled in flight: `warm` has run each one on the types that flights use, and the lists name them."""
 
-from __future__ import annotations
-
 import importlib
 import json
 import subprocess

@@ -1,7 +1,5 @@
 """Kept logs replay as their expected outputs say; what differs is named: half, stage, frame, and by how much."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path

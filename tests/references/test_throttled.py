@@ -1,7 +1,5 @@
 """The kept flight again on a small share of a modelled core: within its budget, and still where it should be."""
 
-from __future__ import annotations
-
 import contextlib
 from pathlib import Path
 
@@ -27,7 +25,6 @@ def test_a_throttled_flight_keeps_budget_and_accuracy(
     made = plan(Options((str(RECORDING),), tmp_path, mode, cpu_percent=percent), quiet=True)
     with contextlib.closing(made):
         agent = fly_in_process(made, mode).agents[0]
-    assert agent is not None
     assert agent["tracked"] + agent["dropped"] + agent["lost"] == agent["frames"] == 32
     assert agent["lost"] == 0
     assert least_tracked <= agent["tracked"] / agent["frames"] < 0.9, "the budget should bind, and not choke"

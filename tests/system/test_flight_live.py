@@ -1,7 +1,5 @@
 """Agent and base as users start them: real clocks, systemd, signals, kills and restarts."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

@@ -1,7 +1,5 @@
 """Flights of separate processes over a real link: agreement, repetition, killed processes, no orphans."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -1,7 +1,5 @@
 """The byte budget holds on the wire (sealed, framed or cut into MAVLink messages) in any window of one second."""
 
-from __future__ import annotations
-
 import random
 from collections import deque
 

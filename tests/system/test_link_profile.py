@@ -1,7 +1,5 @@
 """An agent without a named profile selects the one that suits its link, and its poses are not queued."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Errors of `make` on a machine that lacks a tool."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The drone's install: the wheel holds the repository's code, which flies with no package but those that it names."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,7 +1,5 @@
 """Small files that outlive a process are whole, and the newest, after a loss of power: content first, then its name."""
 
-from __future__ import annotations
-
 import os
 import stat
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """The link's endpoints over a serial line with noise: both sides end with the same values."""
 
-from __future__ import annotations
-
 import random
 import time
 

@@ -1,7 +1,5 @@
 """Agent and base as systemd runs them: ready in time, stopped within a second, numbers and logs kept."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

@@ -1,7 +1,5 @@
 """The units pass systemd's own checkers; a missing checker skips only its test."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

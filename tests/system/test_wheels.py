@@ -1,7 +1,5 @@
 """A Raspberry Pi needs no compiler and little room: what the drone needs comes as wheels for aarch64, and is small."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

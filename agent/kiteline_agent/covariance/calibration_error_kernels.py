@@ -1,15 +1,9 @@
 """Kernels that propagate calibration errors, shared by a whole flight, to a pose measured against a map."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64, I64, Bool
 from kiteline_core.jit import helper, njit
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 
 CALIBRATION = 10  # error terms of a calibration, see bias_error: those of the disparity, then those of both cameras
 DISPARITY_SHAPES = 5
@@ -37,7 +31,7 @@ def bias_error(u: float, v: float, disparity: float, camera: F64, half_px: float
 
 @njit
 def sensitivity(
-    T_c_m: F64, camera: F64, half_px: float, rows: I64, inlier: Bools, xyz: F64, ray: F64, observed: F64, sigma_px: F64,
+    T_c_m: F64, camera: F64, half_px: float, rows: I64, inlier: Bool, xyz: F64, ray: F64, observed: F64, sigma_px: F64,
     per_keyframe: int, T_m_k: F64, anchor_px: F64, rho: F64, of_keyframes: F64, h: F64, g: F64, of_errors: F64,
     side: F64,
 ) -> None:  # fmt: skip

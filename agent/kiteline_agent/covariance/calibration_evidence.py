@@ -1,13 +1,9 @@
 """How far the calibration of the cameras is off, by the residuals of tracked landmarks over a flight."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.covariance.calibration_error_kernels import CALIBRATION, DISPARITY_SHAPES
-
-F64 = NDArray[np.float64]
+from kiteline_core.arrays import F64
 
 _WORN = 5.0  # errors of a worn calibration over those of a good one: a quarter of a pixel at the image's edge
 _SEEN = 0.3  # share of an error that residuals show: depths of landmarks, measured with it, hide the rest

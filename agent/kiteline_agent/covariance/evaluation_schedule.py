@@ -1,15 +1,9 @@
 """When the covariance of the pose is evaluated again."""
 
-from __future__ import annotations
-
 import math
 
-import numpy as np
-from numpy.typing import NDArray
-
 from kiteline_agent.tracking.track import Track
-
-F64 = NDArray[np.float64]
+from kiteline_core.arrays import F64
 
 _EVERY = 4  # frames between two evaluations
 _FEWER = 0.7  # share of the inliers of the last evaluation below which the next one is due at once

@@ -1,13 +1,9 @@
 """Drift of the odometry frame since the flight began, as the map measures it."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
-
-F64 = NDArray[np.float64]
 
 
 def covariance_by_map(cov_m: F64, T_o_m: F64, T_m_b: F64) -> F64:

@@ -10,12 +10,9 @@
 - *Dead reckoning* has the covariance of the IMU or odometer, or that of unknown accelerations.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.config import CovarianceConfig
 from kiteline_agent.covariance.calibration_error_kernels import (
@@ -33,10 +30,9 @@ from kiteline_agent.covariance.pose_quality import probability_good
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.tracking.pose_state import PoseState
 from kiteline_agent.tracking.track import Track
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
 from kiteline_core.ids import SEQUENCE_BITS, KeyframeId, SubmapId
-
-F64 = NDArray[np.float64]
 
 _CACHE_PX = 1.0  # px, error of a corner at octave 0 that matched a landmark of the map cache
 _CACHE_DEPTH_M = 4.0  # typical depth of such corners

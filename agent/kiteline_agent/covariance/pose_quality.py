@@ -1,13 +1,8 @@
 """Probability that a pose is as accurate as configured."""
 
-from __future__ import annotations
-
 import math
 
-import numpy as np
-from numpy.typing import NDArray
-
-F64 = NDArray[np.float64]
+from kiteline_core.arrays import F64
 
 
 def probability_good(cov: F64, good_m: float, good_rad: float) -> float:

@@ -5,11 +5,8 @@ for motion. So each corner is aligned with the image in which it was found, warp
 filter knows it, by its distance.
 """
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.config import AlignConfig
 from kiteline_agent.ekf_config import EkfConfig
@@ -17,12 +14,8 @@ from kiteline_agent.imaging import alignment_kernels, features
 from kiteline_agent.imaging.alignment_kernels import TEMPLATE, TEMPLATE_LEVELS
 from kiteline_agent.imaging.features import DetectorConfig, Pyramid
 from kiteline_agent.tracking.frame_images import NO_GRID
+from kiteline_core.arrays import F64, I64, U8, Bool
 from kiteline_core.geometry.cameras import RectifiedCamera
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-Bools = NDArray[np.bool_]
-U8 = NDArray[np.uint8]
 
 _BORDER_PX = 8.0  # a window of the flow and its gradients lie inside
 _WINDOW_PX = 21  # px of the flow's window
@@ -93,7 +86,7 @@ class CornerFlow:
         """Forget corners."""
         self._keep(~np.isin(self.ids, ids))
 
-    def _keep(self, keep: Bools) -> None:
+    def _keep(self, keep: Bool) -> None:
         if keep.all():
             return
         self.ids, self.uv, self.octave = self.ids[keep], self.uv[keep], self.octave[keep]

@@ -1,11 +1,8 @@
 """The onboard half with the smallest tracker: one camera and odometry. Sans-IO; it is stepped like Agent."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.covariance.pose_quality import probability_good
@@ -23,12 +20,11 @@ from kiteline_agent.scans.local_grid import Surroundings
 from kiteline_agent.step import Estimate, Identity, PredictedPose, StepInput, StepOutput
 from kiteline_codec.channel import RecordChannel
 from kiteline_codec.schema import GridTile
+from kiteline_core.arrays import F64
 from kiteline_core.frame import Frame
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraRig, Rectifier
 from kiteline_core.ids import SubmapId
-
-F64 = NDArray[np.float64]
 
 _SILENT_NS = 1_000_000_000  # of an odometer, before the user is told
 

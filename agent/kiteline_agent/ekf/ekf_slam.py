@@ -1,11 +1,8 @@
 """The filter over a flight: odometry moves it, tracked pixels correct it, landmarks enter late and leave."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.ekf import landmark_update
 from kiteline_agent.ekf.filter_state import FilterState, Motion
@@ -21,14 +18,11 @@ from kiteline_agent.ekf.ray_initialisation import (
 from kiteline_agent.ekf.ray_tracks import RayTracks
 from kiteline_agent.ekf.ray_update import update_by_rays
 from kiteline_agent.ekf_config import EkfConfig
+from kiteline_core.arrays import F64, I64, U8, Bool
 from kiteline_core.geometry.cameras import RectifiedCamera
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-Bools = NDArray[np.bool_]
-
 _VIEW_M = 0.15  # m between two camera poses in the state: nearer ones add no parallax indoors
-_LEAST_RAYS = 4  # sightings from which a landmark is positioned
+_LEAST_RAYS = 4  # observations from which a landmark is positioned
 _RAY_PX = 10.0  # px from the point that two views give beyond which a third one's ray is a wrong match
 _PARALLAX_RAD = 0.05  # rad: three degrees between a landmark's first and last ray, at least
 _DEPTH_SHARE = (
@@ -80,7 +74,7 @@ class EkfSlam:
         self.state.propagate(motion)
         self._way += float(np.linalg.norm(motion.T_c0_c1[:3, 3]))
 
-    def update(self, ids: I64, uv: F64, octave: NDArray[np.uint8] | None = None) -> FrameUpdate:
+    def update(self, ids: I64, uv: F64, octave: U8 | None = None) -> FrameUpdate:
         """Correct the state by the pixels (n,2) of tracks (n,), ids increasing; new landmarks enter.
 
         octave: (n,) level of the pyramid at which each was found: its error is that of a pixel there; None: the finest.
@@ -113,10 +107,10 @@ class EkfSlam:
 
     # steps
 
-    def _update_landmarks(self, slots: I64, xy: F64, coarse: F64) -> tuple[Bools, Bools]:
-        """Update by the sightings of landmarks; masks (n,) of the compatible and of the rejected ones.
+    def _update_landmarks(self, slots: I64, xy: F64, coarse: F64) -> tuple[Bool, Bool]:
+        """Update by the observations of landmarks; masks (n,) of the compatible and of the rejected ones.
 
-        coarse: (n,) factors of their deviations. Divided by them, all sightings have the same.
+        coarse: (n,) factors of their deviations. Divided by them, all observations have the same.
         """
         good, bad = np.zeros(len(slots), np.bool_), np.zeros(len(slots), np.bool_)
         at = np.flatnonzero(slots >= 0)
@@ -195,8 +189,8 @@ class EkfSlam:
         out = []
         for k in order[enough[order]][:_ENTRIES].tolist():
             views = np.flatnonzero(seen[k, :-1])
-            sightings = points[k, np.append(views, config.views)]
-            out.append((int(known[k]), Track(views, sightings, self._sigma * float(coarse[known[k]]))))
+            observations = points[k, np.append(views, config.views)]
+            out.append((int(known[k]), Track(views, observations, self._sigma * float(coarse[known[k]]))))
         return out
 
     def _may_enter(self, track: Track) -> bool:

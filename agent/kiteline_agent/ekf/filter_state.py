@@ -6,20 +6,14 @@ of the whole map, which nothing measures; errors that add up make a filter claim
 Source: A. Barrau, S. Bonnabel, "An EKF-SLAM algorithm with consistency properties", 2015.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.ekf import covariance_kernels as kernels
 from kiteline_agent.ekf_config import EkfConfig
+from kiteline_core.arrays import F64, I64, Bool
 from kiteline_core.geometry import se3
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 
 SCALE = 6  # row of the odometry's scale, after position (3) and rotation (3) of the camera
 _VIEWS = 7  # first row of the past views, six each
@@ -46,9 +40,9 @@ class FilterState:
         self.T_o_c = T_o_c.copy()
         self.scale = 1.0  # true way over that by odometry
         self.view_T_o_c = np.tile(np.eye(4), (config.views, 1, 1))
-        self.view_used: Bools = np.zeros(config.views, np.bool_)
+        self.view_used: Bool = np.zeros(config.views, np.bool_)
         self.points = np.zeros((config.landmarks, 3))  # (n,3) landmarks in o
-        self.used: Bools = np.zeros(config.landmarks, np.bool_)
+        self.used: Bool = np.zeros(config.landmarks, np.bool_)
         self._walk = np.zeros(config.landmarks)  # rad: what their pixels drift by, see `add_landmark`
         self._first = _VIEWS + 6 * config.views
         self.P = np.zeros((self._first + 3 * config.landmarks,) * 2)

@@ -1,7 +1,5 @@
 """Runs the filter's kernels before the first frame."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from kiteline_agent.ekf.ekf_slam import EkfSlam

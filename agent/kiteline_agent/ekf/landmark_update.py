@@ -1,19 +1,13 @@
 """Which of the matched landmarks are compatible with the state, and the update by them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.ekf import covariance_kernels as kernels
 from kiteline_agent.ekf.filter_state import FilterState
 from kiteline_agent.ekf_config import EkfConfig
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-Bools = NDArray[np.bool_]
+from kiteline_core.arrays import F64, I64, Bool
 
 _FIRST_MATCHES = 6  # matches with which a compatible set is begun before the largest set is taken
 _AGREE = 0.6  # share of the matches in a set at which no other set is tried
@@ -28,8 +22,8 @@ class Innovation:
     M: F64
 
 
-def innovation(state: FilterState, slots: I64, xy: F64) -> tuple[Innovation, Bools]:
-    """Residuals of sightings (n,2) of landmarks (n,), and which of them lie before the camera (n,)."""
+def innovation(state: FilterState, slots: I64, xy: F64) -> tuple[Innovation, Bool]:
+    """Residuals of observations (n,2) of landmarks (n,), and which of them lie before the camera (n,)."""
     R = state.T_o_c[:3, :3]
     local = (state.points[slots] - state.T_o_c[:3, 3]) @ R
     ahead = local[:, 2] > 1e-2
@@ -42,11 +36,11 @@ def innovation(state: FilterState, slots: I64, xy: F64) -> tuple[Innovation, Boo
 
 
 def divided(found: Innovation, factor: F64) -> Innovation:
-    """The same sightings in units (m,) of their own."""
+    """The same observations in units (m,) of their own."""
     return Innovation(found.slots, found.residual / factor[:, None], found.M / factor[:, None, None])
 
 
-def compatible(state: FilterState, found: Innovation, sigma: float, config: EkfConfig) -> Bools:
+def compatible(state: FilterState, found: Innovation, sigma: float, config: EkfConfig) -> Bool:
     """Mask (m,) of matches that are jointly compatible with the state.
 
     Each is taken if it fits given those taken before: a wrong one that the prior allows no longer fits then. As it may
@@ -64,7 +58,7 @@ def compatible(state: FilterState, found: Innovation, sigma: float, config: EkfC
     order = np.argsort(alone, kind="stable")
     order = order[alone[order] <= config.gate]
     L, white, taken = np.zeros((2 * m, 2 * m)), np.zeros(2 * m), np.zeros(m, np.int64)
-    best: Bools = np.zeros(m, np.bool_)
+    best: Bool = np.zeros(m, np.bool_)
     for seed in range(min(_FIRST_MATCHES, len(order))):
         begun = np.concatenate([order[seed : seed + 1], order[:seed], order[seed + 1 :]])
         count = kernels.compatible_set(S, residual, begun, config.gate, L, white, taken)
@@ -77,7 +71,7 @@ def compatible(state: FilterState, found: Innovation, sigma: float, config: EkfC
 
 
 def update(state: FilterState, found: Innovation, sigma: float) -> None:
-    """Update the state by sightings."""
+    """Update the state by observations."""
     m = len(found.slots)
     if m == 0:
         return

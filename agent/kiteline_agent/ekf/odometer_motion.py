@@ -1,17 +1,13 @@
 """The camera's motion between two frames, and its error, by an odometer's samples."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.ekf.filter_state import Motion
 from kiteline_agent.ekf_config import EkfConfig
 from kiteline_agent.motion.odometer_samples import MeanVelocity, OdometerSamples
+from kiteline_core.arrays import F64
 from kiteline_core.frame import OdometryBatch
 from kiteline_core.geometry import se3
-
-F64 = NDArray[np.float64]
 
 _MEASURED = 100.0  # (m/s)^2 or (rad/s)^2: any measured direction is far more precise
 _TURN_SHARE = 0.02  # rad per sqrt(rad) turned: error of the heading

@@ -5,21 +5,15 @@ that of the linearised pixels given the poses in the state; what the rays say be
 the poses from which they were seen.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.ekf.filter_state import FilterState
 from kiteline_agent.ekf.ray_kernels import position_by_rays
+from kiteline_core.arrays import F64, I64, Bool
 from kiteline_core.geometry import se3
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 
 
 class NewLandmark(NamedTuple):
@@ -30,7 +24,7 @@ class NewLandmark(NamedTuple):
     cov: F64
 
 
-def nearest_points(centres: F64, rays: F64, seen: Bools) -> tuple[F64, Bools]:
+def nearest_points(centres: F64, rays: F64, seen: Bool) -> tuple[F64, Bool]:
     """Point (n,3) nearest to the rays of each of n landmarks, and whether it is well defined (n,).
 
     centres: (v,3) camera centres. rays: (n,v,3) unit directions. seen: (n,v).
@@ -43,14 +37,14 @@ def nearest_points(centres: F64, rays: F64, seen: Bools) -> tuple[F64, Bools]:
     return np.asarray(np.linalg.solve(a, b[..., None])[..., 0]), good
 
 
-def supporting_views(centres: F64, rays: F64, seen: Bools, tolerance: float) -> Bools:
+def supporting_views(centres: F64, rays: F64, seen: Bool, tolerance: float) -> Bool:
     """Which views (n,v) agree with the last one on a point; rays far from it are wrong matches.
 
     Each other view in turn gives a point with the last one; the one with most rays near it counts.
     centres: (v,3). rays: (n,v,3) unit directions. seen: (n,v). tolerance: rad.
     """
     n, v = seen.shape
-    best: Bools = np.zeros((n, v), np.bool_)
+    best: Bool = np.zeros((n, v), np.bool_)
     most = np.zeros(n, np.int64)
     for other in range(v - 1):
         pair = [other, v - 1]
@@ -65,7 +59,7 @@ def supporting_views(centres: F64, rays: F64, seen: Bools, tolerance: float) -> 
     return best
 
 
-def largest_parallax(rays: F64, seen: Bools) -> F64:
+def largest_parallax(rays: F64, seen: Bool) -> F64:
     """Largest angle (n,) in rad between the last view's ray and another one. rays: (n,v,3). seen: (n,v)."""
     cosine = np.einsum("nvj,nj->nv", rays, rays[:, -1])
     return np.asarray(np.arccos(np.clip(np.where(seen, cosine, 1.0).min(axis=1), -1.0, 1.0)))
@@ -83,8 +77,8 @@ def project(xy: F64, T_o_c: F64, point: F64) -> tuple[F64, F64, F64]:
 
 @dataclass(frozen=True, slots=True)
 class Track:
-    """Sightings of one track. views: (v,) past views. xy: (v,2) x/z, y/z in them, or (v+1,2) with the camera of now at
-    the end. sigma: deviation of these.
+    """Observations of one track. views: (v,) past views. xy: (v,2) x/z, y/z in them, or (v+1,2) with the camera of now
+    at the end. sigma: deviation of these.
     """
 
     views: I64
@@ -94,7 +88,7 @@ class Track:
 
 @dataclass(frozen=True, slots=True)
 class Rays:
-    """A track's rays, linearised and split by the point where they meet, in deviations of a sighting.
+    """A track's rays, linearised and split by the point where they meet, in deviations of an observation.
 
     0 = by_point error of the point + by_state error of the state + white noise, and told = H error of the state + white
     noise, where the point is eliminated. point: (3,). columns: (k,) of the state. by_point: (3,3). by_state: (3,k). H:

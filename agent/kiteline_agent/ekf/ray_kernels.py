@@ -1,13 +1,9 @@
 """Kernel that positions a landmark by its rays."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64
 from kiteline_core.jit import helper, njit
-
-F64 = NDArray[np.float64]
 
 _STEPS = 3  # Gauss-Newton steps after the linear solution: it is near
 _STILL = 1e-4  # of the distance: a shorter step is the last

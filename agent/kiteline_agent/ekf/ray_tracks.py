@@ -1,24 +1,19 @@
 """Pixels that past views saw of tracks which are not yet landmarks."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-Bools = NDArray[np.bool_]
+from kiteline_core.arrays import F64, I64, Bool
 
 
 class RayTracks:
-    """Sightings of each track by each past view."""
+    """Observations of each track by each past view."""
 
     def __init__(self, views: int) -> None:
         self._views = views
         self.ids: I64 = np.zeros(0, np.int64)  # (n,) increasing
         self.xy = np.zeros((0, views, 2))  # x/z, y/z in the view
         self.coarse = np.zeros(0)  # (n,) size of a track's pixels in those of the finest level
-        self.seen: Bools = np.zeros((0, views), np.bool_)
+        self.seen: Bool = np.zeros((0, views), np.bool_)
 
     def add(self, view: int, ids: I64, xy: F64, coarse: F64) -> None:
         """Add what the newest view saw. ids: (m,) increasing. xy: (m,2). coarse: (m,)."""
@@ -55,7 +50,7 @@ class RayTracks:
         known = np.flatnonzero(self.ids[at] == ids)
         return known, at[known]
 
-    def _keep(self, keep: Bools) -> None:
+    def _keep(self, keep: Bool) -> None:
         if not keep.all():
             self.ids, self.xy, self.seen = self.ids[keep], self.xy[keep], self.seen[keep]
             self.coarse = self.coarse[keep]

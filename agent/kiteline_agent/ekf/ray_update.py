@@ -6,17 +6,13 @@ Where odometry is poor the views are off by a tenth of the way between them, and
 in that: all tracks are linearised again at the corrected views (iterated Kalman filter).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.ekf.filter_state import FilterState
 from kiteline_agent.ekf.ray_initialisation import Rays, Track, linearised
-
-F64 = NDArray[np.float64]
+from kiteline_core.arrays import F64, I64
 
 _ITERATIONS = 3
 _SETTLED = 0.1  # deviations of the state by which another iteration would have to change it
@@ -45,7 +41,7 @@ def update_by_rays(state: FilterState, tracks: Sequence[Track]) -> None:
     state.update(np.ascontiguousarray(H @ P), L, white)
 
 
-def _stacked(every: Sequence[Rays], columns: NDArray[np.int64], change: F64) -> tuple[F64, F64]:
+def _stacked(every: Sequence[Rays], columns: I64, change: F64) -> tuple[F64, F64]:
     """H (m,k) over the columns (k,), and told (m,), each track by its weight."""
     H = np.zeros((sum(len(r.told) for r in every), len(columns)))
     told = np.zeros(len(H))

@@ -3,13 +3,10 @@
 The filter keeps what it estimates: o stays continuous. A corrected keyframe moves m under the camera.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.exchange.corrections import Corrections
@@ -40,14 +37,11 @@ from kiteline_codec.schema import (
     SubmapScale,
     SubmapTie,
 )
+from kiteline_core.arrays import F64, I64, U8, Bool
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import KEYPOINT_BITS, NO_KEYFRAME, KeyframeId, SubmapId
 from kiteline_core.order_statistics import median
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-U8 = NDArray[np.uint8]
 
 _USUAL_DEPTH_M = 4.0  # of a scene none of whose landmarks has a depth yet
 _LEAST_FRESH = 8  # corners without a landmark at the base for which a keyframe is worth its bytes
@@ -164,7 +158,7 @@ class SharedKeyframes:
             events += ["submap: full", "submap: opened"]
         return events
 
-    def _need(self, frame: FilteredFrame, anchored: NDArray[np.bool_]) -> KeyframeNeed | None:
+    def _need(self, frame: FilteredFrame, anchored: Bool) -> KeyframeNeed | None:
         """Why a frame should become a keyframe; None if it need not."""
         if self.keyframe == NO_KEYFRAME:
             return KeyframeNeed("first", True)
@@ -187,7 +181,7 @@ class SharedKeyframes:
         known = frame.depth_m[frame.depth_m > 0.0]
         return max(float(median(known)), 0.1) if len(known) else _USUAL_DEPTH_M
 
-    def _make(self, frame: FilteredFrame, T_m_c: F64, anchored: NDArray[np.bool_]) -> None:
+    def _make(self, frame: FilteredFrame, T_m_c: F64, anchored: Bool) -> None:
         """Share a keyframe, and make it the reference."""
         reference, profile = self._reference, self._channel.profile
         T_m_p = reference.T_m_k
@@ -231,7 +225,7 @@ class SharedKeyframes:
         self._channel.put(SubmapTie(submap, since, T_k_c, TRACKED_M, TRACKED_RAD))
         self._corrections.note_continued(submap)
 
-    def _new_rows(self, frame: FilteredFrame, anchored: NDArray[np.bool_], most: int) -> I64:
+    def _new_rows(self, frame: FilteredFrame, anchored: Bool, most: int) -> I64:
         """Rows of the corners that become landmarks, the best `most` first, each group by image rows."""
         margin = (BORDER + 1.0) * (1 << frame.octave.astype(np.int64))[:, None]
         size = np.array([self._camera.width, self._camera.height], np.float64)

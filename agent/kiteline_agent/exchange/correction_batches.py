@@ -1,7 +1,5 @@
 """Holds corrections of the base until all of their batch have arrived."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from kiteline_codec.schema import CorrectionBatch, Key, Record, messages

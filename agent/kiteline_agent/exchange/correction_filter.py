@@ -5,15 +5,11 @@ share of its distance from the origin. A Kalman filter of the vehicle's position
 deviation of the base's scale and that of the position reported so far.
 """
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.config import SmoothingConfig
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
-
-F64 = NDArray[np.float64]
 
 
 class CorrectionFilter:

@@ -1,12 +1,9 @@
 """Records of the base: corrections of the local map, cached keyframes, submap placements, grid tiles."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.config import SmoothingConfig
 from kiteline_agent.exchange.correction_batches import CorrectionBatches
@@ -32,10 +29,9 @@ from kiteline_codec.schema import (
     RemovedObservations,
     SubmapPlacement,
 )
+from kiteline_core.arrays import F64, I64
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import NO_KEYFRAME, SEQUENCE_BITS, SubmapId
-
-F64 = NDArray[np.float64]
 
 _SAME_TILT = 0.9999  # cosine of the angle, 0.8 degrees, between verticals that agree: gravity is known to half a degree
 _SAME_UNIT = 0.2  # difference of the scale from 1 up to which w is in metres too, as IMU and base estimate them
@@ -134,7 +130,7 @@ class Corrections:
             self._whole.add(poses, self._map.T_m_k[slots], S_w_m)
         return True
 
-    def _slots_of_active(self) -> NDArray[np.int64]:
+    def _slots_of_active(self) -> I64:
         """Slots of the keyframes of the active submap, the one seen last at the end."""
         m = self._map
         slots = np.flatnonzero((m.keyframe != NO_KEYFRAME) & (m.keyframe >> SEQUENCE_BITS == m.active))

@@ -1,7 +1,5 @@
 """The channel of an agent without a base: nothing is sent or received."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from kiteline_codec.pacing.profiles import EXACT

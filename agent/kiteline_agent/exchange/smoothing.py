@@ -1,14 +1,10 @@
 """Smooths corrections of the live pose: the odometry frame moves in the world at a limited speed."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.config import SmoothingConfig
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3, sim3
-
-F64 = NDArray[np.float64]
 
 
 class Smoothing:

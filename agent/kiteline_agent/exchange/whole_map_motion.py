@@ -5,15 +5,11 @@ others by milliradians. The shape of the flown path, and all that is left to fly
 turn; poses from before and after it do not fit each other. Changes of shape are not touched.
 """
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.config import SmoothingConfig
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3, sim3
-
-F64 = NDArray[np.float64]
 
 _LEAST_KEYFRAMES = 3  # two have hardly a shape
 _SLACK = 2.0  # as a factor of the limit: so far the shift grows while the vehicle flies on, before it is limited again

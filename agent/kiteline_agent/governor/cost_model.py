@@ -1,7 +1,5 @@
 """Cost model of the virtual CPU: the time of a step from the operations counted in it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields
 
 

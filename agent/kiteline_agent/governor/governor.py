@@ -7,8 +7,6 @@ skipped evenly to fit the budget. The sum over the last second exceeds the budge
 second.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from dataclasses import dataclass, replace
 from enum import Enum

@@ -1,7 +1,5 @@
 """Virtual CPU: the time at which a limited core is free again."""
 
-from __future__ import annotations
-
 
 class VirtualCpu:
     """A core of which `percent` are available, in order of work; 0: it is never busy."""

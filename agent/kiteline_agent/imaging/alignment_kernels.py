@@ -8,8 +8,6 @@ All sums over patches are integer sums (values in 1/16 grey level, positions in 
 so that the compiler can vectorise them.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from kiteline_agent.imaging.rectification_kernels import _raw_at

@@ -5,8 +5,6 @@ Every pixel is scored without a branch, so that the loops become vectors; unsign
 negative ones.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from kiteline_core.jit import helper, njit

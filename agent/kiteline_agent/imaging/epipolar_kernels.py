@@ -1,7 +1,5 @@
 """Kernel of the epipolar search for landmarks without depth: template correlation along a line segment."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from kiteline_agent.imaging.alignment_kernels import GREY, PATCH, PATCH_RADIUS, STRIDE, TEMPLATE_LEVELS, warp_template

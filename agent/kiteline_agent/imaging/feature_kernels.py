@@ -1,7 +1,5 @@
 """Kernels of corner scores, orientations and binary descriptors."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from kiteline_core.jit import njit

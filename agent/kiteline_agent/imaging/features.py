@@ -1,17 +1,14 @@
 """Image pyramids, corner detection spread over the image, and binary descriptors."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.imaging import feature_kernels as kernels
 from kiteline_agent.imaging.corner_kernels import fast_corners
+from kiteline_core.arrays import F64, U8
 
-U8 = NDArray[np.uint8]
 Pyramid = tuple[U8, ...]
 
 # 256 tests from a Gaussian of 1/5 of the 31 px patch (M. Calonder et al., "BRIEF", 2010, layout G II). They must never
@@ -24,7 +21,7 @@ _FAINT_NOISE = 1.5  # their least score in squared noise: corners of pure noise 
 _MARGIN_PX = 20  # px at octave 0: border without image after rectification
 
 
-def _pattern() -> NDArray[np.float64]:
+def _pattern() -> F64:
     # Park-Miller's generator, since numpy does not guarantee the same stream for ever.
     state, draws = PATTERN_SEED, np.empty(256 * 4 * 12)
     for i in range(draws.size):
@@ -54,9 +51,9 @@ class DetectorConfig:
 class Corners:
     """uv: (n,2) float64 level-0 px. octave: (n,) uint8. score: (n,) float64. Strongest first."""
 
-    uv: NDArray[np.float64]
+    uv: F64
     octave: U8
-    score: NDArray[np.float64]
+    score: F64
 
 
 def for_kernels(image: U8) -> U8:
@@ -75,7 +72,7 @@ def build_pyramid(image: U8, levels: int) -> Pyramid:
     return tuple(out)
 
 
-def detect(pyramid: Pyramid, taken: NDArray[np.float64], config: DetectorConfig) -> Corners:
+def detect(pyramid: Pyramid, taken: F64, config: DetectorConfig) -> Corners:
     """Detect the best corners of the cells without any of `taken` (n,2) level-0 px."""
     h, w = pyramid[0].shape
     rows, columns = -(-h // config.cell_px), -(-w // config.cell_px)
@@ -118,7 +115,7 @@ def noise_of(image: U8) -> float:
     return float(np.median(np.abs(second[:, :-2] - 2 * second[:, 1:-1] + second[:, 2:]))) * 1.4826 / 6.0
 
 
-def describe(pyramid: Pyramid, uv: NDArray[np.float64], octave: U8) -> tuple[U8, U8]:
+def describe(pyramid: Pyramid, uv: F64, octave: U8) -> tuple[U8, U8]:
     """Angles (n,) in 1/256 turns and descriptors (n,32) of corners uv (n,2) level-0 px, at least BORDER inside."""
     n = len(uv)
     angle_code, descriptor = np.zeros(n, np.uint8), np.zeros((n, 32), np.uint8)

@@ -1,7 +1,5 @@
 """Kernels that rectify small parts of a raw image, from a grid of raw pixels (`Rectifier.left_grid`, `right_grid`)."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from kiteline_core.geometry.cameras import GRID_STEP

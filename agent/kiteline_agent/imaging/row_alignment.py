@@ -6,18 +6,14 @@ passes for a curved disparity offset. Offsets of rows need no depth and no motio
 a pixel.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.imaging import row_kernels
+from kiteline_core.arrays import F64, U8
 from kiteline_core.geometry.cameras import Rectifier
-
-F64 = NDArray[np.float64]
 
 TERMS = 5
 _ROUNDS = 4  # of robust weighting
@@ -75,8 +71,8 @@ class RowAlignment:
         self.applied_px: F64 = np.zeros(TERMS)  # the offset, as factors of `terms` at pixels of the right image
 
     def add(
-        self, left: tuple[NDArray[np.uint8], ...], right: tuple[NDArray[np.uint8], ...], uv: F64,
-        octave: NDArray[np.uint8], disparity: F64,
+        self, left: tuple[U8, ...], right: tuple[U8, ...], uv: F64,
+        octave: U8, disparity: F64,
     ) -> int:  # fmt: skip
         """Measure rows at points (n,) of a keyframe. Returns at how many they are known; 0 if at too few to be used.
 

@@ -1,7 +1,5 @@
 """Kernels that measure how far a right image lies above or below the rows of the left one."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from kiteline_agent.imaging.rectification_kernels import _raw_at

@@ -1,7 +1,5 @@
 """Kernels of row-wise stereo matching: coarse search, then sub-pixel alignment in one dimension."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from kiteline_agent.imaging.alignment_kernels import GREY, LANES, STRIDE, dot

@@ -1,12 +1,10 @@
 """Options for the IMU of a flight controller: its noise, and the pose of the camera."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry import se3
 
@@ -36,6 +34,6 @@ class ControllerImuConfig:
                 "T_f_c is no rigid motion: expected 16 numbers, a rotation and metres in rows, the last 0 0 0 1"
             )
 
-    def camera(self) -> NDArray[np.float64] | None:
+    def camera(self) -> F64 | None:
         """T_f_c (4,4); None if not configured."""
         return se3.orthonormalise(np.array(self.T_f_c).reshape(4, 4)) if self.T_f_c else None

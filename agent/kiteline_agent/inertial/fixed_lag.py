@@ -5,8 +5,6 @@ remaining state, linearised once (S. Leutenegger et al., "Keyframe-based visual-
 optimization", 2015; the chain is that of T. Qin et al., "VINS-Mono", 2018, without points among the unknowns).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,12 +14,12 @@ from kiteline_agent.inertial import fixed_lag_kernels as kernels
 from kiteline_agent.inertial import inertial_kernels
 from kiteline_agent.inertial.inertial_config import FixedLagConfig, StartDeviations
 from kiteline_agent.inertial.preintegration import Preintegrated, Samples, preintegrate
+from kiteline_core.arrays import F64, Bool
 from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 
-F64 = NDArray[np.float64]
-Bools = NDArray[np.bool_]
+_BY_DEFINITION = 1e-4  # m and rad: deviation of a pose that defines its map
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +34,7 @@ class VisualPoints:
     ray: F64
     observed: F64
     sigma_px: F64
-    inlier: Bools
+    inlier: Bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -225,7 +223,7 @@ class FixedLagSmoother:
         self._imu_bias[: self._n, 3:] += change
         self._prior_s[9:] += change
 
-    def begin_map(self, T_m_b: F64, position_sigma_m: float = 1e-4, turn_sigma_rad: float = 1e-4) -> None:
+    def begin_map(self, T_m_b: F64) -> None:
         """Begin a new map, in which the newest body pose is T_m_b (4,4) by definition.
 
         Velocity, biases and gravity are kept; the uncertainty of the old attitude is added to theirs.
@@ -239,7 +237,7 @@ class FixedLagSmoother:
         carry[:3, :3] = se3.skew(old.velocity) @ r
         carry[9:, :3] = np.linalg.pinv(self._gravity * jac) @ se3.skew(gravity) @ r
         cov = np.zeros((17, 17))
-        cov[:3, :3], cov[3:6, 3:6] = turn_sigma_rad**2 * np.eye(3), position_sigma_m**2 * np.eye(3)
+        cov[:6, :6] = _BY_DEFINITION**2 * np.eye(6)
         cov[6:, 6:] = carry @ old.cov @ carry.T
         T_new_old = T_m_b @ se3.inverse(old.T_m_b)
         self.start(old.T_m_b, old.velocity, old.bias, gravity, StartDeviations())

@@ -4,18 +4,12 @@ States and residuals are those of inertial_kernels. The matrix is block tridiago
 so elimination goes along the chain.
 """
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.inertial.imu_kernels import copy33, mul33, mul33_tn, so3_exp, so3_log
 from kiteline_agent.inertial.inertial_kernels import imu_terms, velocity_terms, visual_terms
+from kiteline_core.arrays import F64, I64, Bool
 from kiteline_core.jit import helper, njit
-
-F64 = NDArray[np.float64]
-Bools = NDArray[np.bool_]
-I64 = NDArray[np.int64]
 
 _D = 15  # degrees of freedom of a state
 _B = 17  # of a state and gravity
@@ -132,7 +126,7 @@ def smooth(
     n: int, iterations: int, fresh: int, rot: F64, state: F64, tilt: F64, gravity: float,
     imu_dt: F64, imu_turn: F64, imu_vp: F64, imu_jac: F64, imu_bias: F64, imu_info: F64, imu_walk: F64,
     prior_h: F64, prior_b: F64, prior_r: F64, prior_s: F64, prior_tilt: F64,
-    r_cb: F64, t_cb: F64, camera: F64, counts: I64, xyz: F64, ray: F64, observed: F64, sigma_px: F64, use: Bools,
+    r_cb: F64, t_cb: F64, camera: F64, counts: I64, xyz: F64, ray: F64, observed: F64, sigma_px: F64, use: Bool,
     chi2: float, scale: F64, vis_h: F64, vis_b: F64, vis_r: F64, vis_p: F64, vel: F64, vel_info: F64, cov: F64,
 ) -> float:  # fmt: skip
     """Gauss-Newton over the n states of the window, in place.

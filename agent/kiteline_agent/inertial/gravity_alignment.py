@@ -5,22 +5,18 @@ acceleration, so that gravity is known to half a degree in motion too. The first
 sent to the base, and a flight controller gets its first pose once the rotation is known.
 """
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.inertial import inertial_kernels
 from kiteline_agent.inertial.fixed_lag import InertialState
 from kiteline_agent.inertial.inertial_tracker import InertialTracker
 from kiteline_codec.coding import quantise
 from kiteline_codec.schema import GravityAlignment
+from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuBatch
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import SubmapId
-
-F64 = NDArray[np.float64]
 
 _ATTITUDE_TILT = np.array([0, 1, 2, 15, 16])  # in the covariance of a state
 AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # R_m_c of a level camera that looks along x

@@ -1,22 +1,18 @@
 """Initialisation of the inertial state from a window of poses by images: at rest, or in motion."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.inertial import initial_alignment
 from kiteline_agent.inertial.fixed_lag import FixedLagSmoother
 from kiteline_agent.inertial.inertial_config import InertialConfig, StartDeviations
 from kiteline_agent.inertial.preintegration import Preintegrated, Samples, preintegrate
 from kiteline_agent.inertial.sample_buffer import SampleBuffer
+from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuCalibration
-
-F64 = NDArray[np.float64]
 
 _MIN_FRAMES = 5
 _REST_SAMPLES = 20

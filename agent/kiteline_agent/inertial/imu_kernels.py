@@ -4,14 +4,10 @@ Source: C. Forster, L. Carlone, F. Dellaert, D. Scaramuzza, "On-manifold preinte
 odometry", 2017; rotations are perturbed on the right, R = R_hat Exp(phi). Midpoint rule instead of Euler's.
 """
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64, I64
 from kiteline_core.jit import helper, njit
-
-F64 = NDArray[np.float64]
 
 
 @helper
@@ -208,9 +204,7 @@ def preintegrate(
 
 
 @njit
-def second_differences(
-    t_ns: NDArray[np.int64], values: F64, usual_ns: float, even: float, gap: float, sums: F64
-) -> tuple[int, int]:
+def second_differences(t_ns: I64, values: F64, usual_ns: float, even: float, gap: float, sums: F64) -> tuple[int, int]:
     """Sums (2,2) of the squared second differences of samples (n,6), by samples and by means of two neighbours.
 
     Columns: gyro, accelerometer; each is a mean over three axes, and over the variance of white noise. Samples count

@@ -1,7 +1,5 @@
 """Watch for missing IMU samples, and for accelerations that are not in m/s^2 with gravity."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from kiteline_core.frame import ImuBatch

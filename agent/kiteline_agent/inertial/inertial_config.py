@@ -1,7 +1,5 @@
 """Options of the inertial stage."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 from kiteline_agent.inertial.calibration.self_calibration import SelfCalibrationConfig

@@ -5,10 +5,7 @@ are [rotation (on the right), position, velocity, gyro bias, accel bias]. All st
 two tilt angles about x and y of m.
 """
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.inertial.imu_kernels import (
     mul33,
@@ -18,10 +15,8 @@ from kiteline_agent.inertial.imu_kernels import (
     so3_exp,
     so3_log,
 )
+from kiteline_core.arrays import F64, Bool
 from kiteline_core.jit import helper, njit
-
-F64 = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 _D = 15  # degrees of freedom of a state
 _W = 32  # of two states and gravity
@@ -48,7 +43,7 @@ def down_of_tilt(tilt: F64, down: F64, jac: F64) -> None:
 @helper
 def visual_terms(
     r: F64, p: F64, r_cb: F64, t_cb: F64, camera: F64, n: int, xyz: F64, ray: F64, observed: F64, sigma_px: F64,
-    use: Bools, chi2: float, scale: float, h: F64, b: F64,
+    use: Bool, chi2: float, scale: float, h: F64, b: F64,
 ) -> float:  # fmt: skip
     """Information h (6,6) and right-hand side b (6,) of [rotation, position] of a body pose from its points.
 

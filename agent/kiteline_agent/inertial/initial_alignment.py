@@ -6,22 +6,20 @@ motion", 2014). The gyro bias and the refinement that imposes the length of grav
 "VINS-Mono", 2018, section V-B.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.inertial.preintegration import Preintegrated
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
-
-F64 = NDArray[np.float64]
 
 # Columns of the unknowns: first position, then these. With the length of gravity imposed, its two turns and q = 1 / s.
 _VELOCITY, _BIAS, _GRAVITY, _TURNS, _Q = slice(3, 6), slice(6, 9), slice(9, 12), slice(9, 11), 11
 _MIN_POSES = 5
+_POSITION_SIGMA_M = 0.003  # of a position by images
+_ACCEL_BIAS_SIGMA = 0.1  # m/s^2, of the first guess
 _ITERATIONS = 8  # of the direction of gravity, each one least-squares solve
 _RANK_TOL = 1e-10  # singular values below it, over the largest, leave an unknown open: poses at rest
 _GRAVITY_RANGE = 0.3, 3.0  # times the true length: beyond, poses and IMU do not belong together
@@ -96,14 +94,11 @@ def align(
     gravity_m_s2: float,
     *,
     with_scale: bool,
-    position_sigma_m: float = 0.003,
-    accel_bias_sigma: float = 0.1,
 ) -> ImuAlignment | None:
     """Velocities, gravity, accelerometer bias and scale from n >= 5 poses by least squares; None if degenerate.
 
     T_m_b: (n,4,4) poses. The *camera* is at s p_c, p_c = p_b + R p_b_c, with p_b_c (3,) in metres, and the body at
-    s p_c - R p_b_c. motions: the n - 1 between them. bias: (6,) first guess. position_sigma_m: of a position by
-    images. accel_bias_sigma: m/s^2, of the guess.
+    s p_c - R p_b_c. motions: the n - 1 between them. bias: (6,) first guess.
     """
     n = len(T_m_b)
     if n < _MIN_POSES:
@@ -113,7 +108,7 @@ def align(
     by_imu = _integrated(T_m_b, motions, bias)
     integrated = (rotated + by_imu.p).reshape(-1)
     free = _derivatives(by_imu)
-    bias_weight = position_sigma_m / accel_bias_sigma
+    bias_weight = _POSITION_SIGMA_M / _ACCEL_BIAS_SIGMA
     if with_scale:
         up, length = by_imu.v[-1], gravity_m_s2  # in the mean, an accelerometer measures the opposite of gravity
         unit = -up / float(np.linalg.norm(up))

@@ -1,17 +1,13 @@
 """Preintegration of IMU samples between two instants, with covariance and bias Jacobians."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.inertial import imu_kernels
+from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry import se3
-
-F64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

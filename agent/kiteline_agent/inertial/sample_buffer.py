@@ -1,20 +1,14 @@
 """The newest IMU samples, and the noise that they show."""
 
-from __future__ import annotations
-
 from copy import copy
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.inertial import imu_kernels
 from kiteline_agent.inertial.preintegration import Samples
+from kiteline_core.arrays import F64, I64, Bool
 from kiteline_core.frame import ImuBatch
 from kiteline_core.order_statistics import median
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 
 _NOISE_MEMORY_S = 0.5  # over which the noise is averaged: rotors change speed faster than biases do
 _AT_ONCE = 20  # samples whose noise is measured together
@@ -44,7 +38,7 @@ class SampleBuffer:
         self._gap_ns = int(max_gap_s * 1e9)
         self._t: I64 = np.zeros(0, np.int64)
         self._values = np.zeros((0, 6))
-        self._clipped: Bools = np.zeros((0, 2), np.bool_)
+        self._clipped: Bool = np.zeros((0, 2), np.bool_)
         self._largest = np.array([_RANGE_GYRO_RAD_S, _RANGE_ACCEL_M_S2])  # magnitudes so far
         self._unmeasured = 0  # new samples whose noise was not measured yet
         self._step_ns: float | None = None  # usual time between two samples
@@ -71,7 +65,7 @@ class SampleBuffer:
                 self._measure_noise(min(self._unmeasured, len(self._t)))
                 self._unmeasured = 0
 
-    def extended(self, imu: ImuBatch | None) -> SampleBuffer:
+    def extended(self, imu: ImuBatch | None) -> "SampleBuffer":
         """A copy with more samples; this buffer stays as it is."""
         other = copy(self)
         other._largest, other._variance = self._largest.copy(), self._variance.copy()  # `push` replaces the others

@@ -5,19 +5,15 @@ gyro. Neither displacements of images nor those of the IMU are free of noise, so
 other would be biased: the update is linearised at the displacement that both give together.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.inertial.inertial_config import ScaleFilterConfig
 from kiteline_agent.inertial.preintegration import Samples, preintegrate
+from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry import se3
-
-F64 = NDArray[np.float64]
 
 _ITERATIONS = 3
 _UNITS, _GRAVITY, _VELOCITY, _BIAS = 0, slice(1, 4), slice(4, 7), slice(7, 10)

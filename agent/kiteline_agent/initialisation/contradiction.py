@@ -1,15 +1,11 @@
 """Images and IMU that contradict each other: how a window shows it, and the event once it lasts."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.inertial.preintegration import BiasPrior
 from kiteline_agent.inertial_start_config import ContradictionConfig
 from kiteline_agent.initialisation.inertial_window import WindowSolution
-
-F64 = NDArray[np.float64]
+from kiteline_core.arrays import F64
 
 _WARNING = (
     "imu: images and IMU contradict each other, so that no scale is known: check the camera's place in the IMU's axes "

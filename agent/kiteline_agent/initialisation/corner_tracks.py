@@ -1,22 +1,15 @@
 """Corners followed by optical flow over a window of monocular keyframes, before there is a map."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.imaging import features
 from kiteline_agent.imaging.features import DetectorConfig, Pyramid
 from kiteline_agent.inertial_start_config import CornerTracksConfig
+from kiteline_core.arrays import F64, I64, U8, Bool
 from kiteline_core.geometry.cameras import RectifiedCamera
-
-U8 = NDArray[np.uint8]
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 
 _BORDER_PX = 8.0  # a window of the flow and its gradients lie inside
 
@@ -36,10 +29,10 @@ class CornerObservations:
     """Corners seen by K keyframes. xy: (K,P,2) x/z, y/z in the camera. seen: (K,P). ids: (P,)."""
 
     xy: F64
-    seen: Bools
+    seen: Bool
     ids: I64
 
-    def part(self, keep: Bools | I64) -> CornerObservations:
+    def part(self, keep: Bool | I64) -> "CornerObservations":
         """The corners in these columns."""
         return CornerObservations(
             np.ascontiguousarray(self.xy[:, keep]), np.ascontiguousarray(self.seen[:, keep]), self.ids[keep]
@@ -112,7 +105,7 @@ class CornerTracks:
         order = np.argsort(-length, kind="stable")
         return CornerObservations(xy, seen, ids).part(order[length[order] >= 3])
 
-    def _followed(self, before: U8, after: U8, uv: F64, guess: F64 | None, levels: int) -> tuple[F64, Bools]:
+    def _followed(self, before: U8, after: U8, uv: F64, guess: F64 | None, levels: int) -> tuple[F64, Bool]:
         """Pixels (n,2) of corners in the next image, and which of them are found, forward and backward."""
         size = {"winSize": (self._config.window_px, self._config.window_px), "maxLevel": levels}
         flags = 0 if guess is None else cv2.OPTFLOW_USE_INITIAL_FLOW
@@ -125,7 +118,7 @@ class CornerTracks:
         same = np.linalg.norm(back - start, axis=1) < self._config.backward_px
         return found.astype(np.float64), (ok.ravel() == 1) & (ok_back.ravel() == 1) & inside & same
 
-    def _keep(self, uv: F64, good: Bools) -> None:
+    def _keep(self, uv: F64, good: Bool) -> None:
         self._uv, self._ids, self._keyframe_uv = uv[good], self._ids[good], self._keyframe_uv[good]
 
     def _replenish(self, left: Pyramid) -> None:

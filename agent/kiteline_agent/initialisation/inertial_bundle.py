@@ -6,12 +6,9 @@ two follow T. Qin et al., "VINS-Mono", 2018, section V; the last one is that of 
 optimization for visual-inertial initialization", 2020, with the landmarks among the unknowns.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.inertial import initial_alignment
 from kiteline_agent.inertial.preintegration import BiasPrior, Samples
@@ -23,11 +20,9 @@ from kiteline_agent.initialisation.inertial_window import WarmStart, WindowSolut
 from kiteline_agent.initialisation.lens_correction import TERMS
 from kiteline_agent.initialisation.window_kernels import add_observations
 from kiteline_agent.initialisation.window_noise import WindowNoise
+from kiteline_core.arrays import F64, I64
 from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry import se3
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 _MAX_DAMPING = 1e4
 _PLACE_ITERATIONS = 4  # of landmarks alone

@@ -1,12 +1,9 @@
 """Starts a monocular map in metres from corners and IMU, once the scale is known; until then there is no pose."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.governor.cost_model import Work
@@ -22,10 +19,9 @@ from kiteline_agent.initialisation.metric_restart import MetricPoints, metric_po
 from kiteline_agent.initialisation.vibration_levels import Vibration, vibration
 from kiteline_agent.initialisation.window_noise import LEAST, MOST, WindowNoise
 from kiteline_agent.tracking.frame_context import FrameContext
+from kiteline_core.arrays import F64, I64
 from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry.cameras import RectifiedCamera
-
-F64 = NDArray[np.float64]
 
 _NEARLY = 1.3  # times the deviation of a known scale: below it the landmarks are aligned again, to know it sooner
 _MIN_VIEWS = 3  # keyframes in which a landmark is aligned again, to be kept
@@ -59,7 +55,7 @@ class _Window:
     """A solution, stamps of its K keyframes, ids (P,) of its corners and their places (P,3) m."""
 
     t_ns: tuple[int, ...]
-    ids: NDArray[np.int64]
+    ids: I64
     xyz: F64
     solution: WindowSolution
 
@@ -70,7 +66,7 @@ class _Solved:
 
     solution: WindowSolution
     xyz: F64
-    first: NDArray[np.int64]
+    first: I64
 
 
 class InertialStart:
@@ -321,7 +317,7 @@ def _lengths_apart(a: F64, b: F64) -> float:
     return abs(float(np.log(length_b / length_a)))
 
 
-def _covering(corners: CornerObservations, longest: int, each: int) -> NDArray[np.int64]:
+def _covering(corners: CornerObservations, longest: int, each: int) -> I64:
     """Columns of the longest tracks, and of the `each` longest ones of every keyframe."""
     chosen = np.arange(len(corners.ids)) < longest
     for seen in corners.seen:
@@ -329,9 +325,7 @@ def _covering(corners: CornerObservations, longest: int, each: int) -> NDArray[n
     return np.flatnonzero(chosen)
 
 
-def _with_found(
-    corners: CornerObservations, columns: NDArray[np.int64], aligned: CornerObservations
-) -> CornerObservations:
+def _with_found(corners: CornerObservations, columns: I64, aligned: CornerObservations) -> CornerObservations:
     """The corners, and where alignment found those in `columns` in keyframes in which they were not followed."""
     xy, seen = corners.xy.copy(), corners.seen.copy()
     found = aligned.seen & ~seen[:, columns]

@@ -1,21 +1,17 @@
 """The inertial part of a window: errors of the IMU's samples and of priors, and how large these errors turn out."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.inertial.preintegration import BiasPrior, Preintegrated, Samples, preintegrate
 from kiteline_agent.inertial_start_config import InertialBundleConfig
 from kiteline_agent.initialisation.inertial_window import WindowState, tangent
 from kiteline_agent.initialisation.vibration_levels import vibration
 from kiteline_agent.initialisation.window_noise import NoiseEvidence, WindowNoise
+from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry import se3
-
-F64 = NDArray[np.float64]
 
 STATE = 12  # unknowns of a keyframe: rotation (right), position, velocity, accelerometer bias
 SHARED = 5  # unknowns of the window: gyro bias, direction of gravity

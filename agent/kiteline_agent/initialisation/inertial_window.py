@@ -1,16 +1,12 @@
 """States of a window of monocular keyframes with an IMU, and its solution."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.initialisation.lens_correction import TERMS
 from kiteline_agent.initialisation.window_noise import NoiseEvidence
-
-F64 = NDArray[np.float64]
+from kiteline_core.arrays import F64
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,10 +3,7 @@
 Optical flow drifts from keyframe to keyframe; an alignment with one template, warped by the geometry, does not.
 """
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.config import AlignConfig
 from kiteline_agent.imaging import alignment_kernels
@@ -15,10 +12,8 @@ from kiteline_agent.initialisation import lens_correction
 from kiteline_agent.initialisation.corner_tracks import CornerObservations, TrackedKeyframe
 from kiteline_agent.initialisation.inertial_window import WindowState
 from kiteline_agent.tracking.frame_images import NO_GRID
+from kiteline_core.arrays import F64, I64, U8
 from kiteline_core.geometry.cameras import RectifiedCamera
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 _OFFSET_PX = 4.0  # px: half of a patch, over which the warp is linear
 _MARGIN_PX = 12.0  # px to the image's border
@@ -65,7 +60,7 @@ def realigned(
     return CornerObservations(xy, seen, observations.ids)
 
 
-def _templates(keyframes: list[TrackedKeyframe], uv: F64, first: I64) -> NDArray[np.uint8]:
+def _templates(keyframes: list[TrackedKeyframe], uv: F64, first: I64) -> U8:
     """Templates (P,3,21,21) of the landmarks, each from the keyframe that saw it first, there at uv (P,2)."""
     templates = np.zeros((len(uv), TEMPLATE_LEVELS, TEMPLATE, TEMPLATE), np.uint8)
     for k, keyframe in enumerate(keyframes):

@@ -4,14 +4,10 @@ A pixel at (x, y), r from the axis, is moved by (x, y) (focal + r^2 radial + r^4
 rotation of the camera in the body, which a shift of the centre resembles.
 """
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64
 from kiteline_core.geometry.cameras import RectifiedCamera
-
-F64 = NDArray[np.float64]
 
 TERMS = 8  # focal, centre x, centre y, radial, outer, rotation about x, y, z of the camera
 FARTHEST = 1.0  # r^2 beyond which the radial factors grow no more: outside of all but the widest images

@@ -3,12 +3,9 @@
 Shared values keep their unit, so a scale found late begins a new submap instead of rescaling the old one.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.imaging import features
 from kiteline_agent.imaging.feature_kernels import BORDER
@@ -16,10 +13,9 @@ from kiteline_agent.keyframes.new_landmarks import NewPoints
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_agent.tracking.track import Track
+from kiteline_core.arrays import F64, U8
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import KeyframeId
-
-F64 = NDArray[np.float64]
 
 _MIN_SIGMA_PX = 0.06  # px of virtual disparity, of depths that many frames have sharpened
 
@@ -49,7 +45,7 @@ def metric_points(ctx: FrameContext, track: Track, local_map: LocalMap, unit_m: 
 
 
 def metric_points_at(
-    ctx: FrameContext, uv: F64, octave: NDArray[np.uint8], depth_m: F64, depth_sigma: F64, camera: RectifiedCamera
+    ctx: FrameContext, uv: F64, octave: U8, depth_m: F64, depth_sigma: F64, camera: RectifiedCamera
 ) -> MetricPoints:
     """Pixels (n,2) of a frame as new landmarks, at depths (n,). depth_sigma: (n,) their relative deviations."""
     margin = (BORDER + 1.0) * (1 << octave.astype(np.int64))[:, None]

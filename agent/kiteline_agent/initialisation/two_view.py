@@ -5,22 +5,17 @@ A homography and a fundamental matrix are fitted; the ratio of their scores tell
 views is refined by bundle adjustment.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.config import TwoViewConfig
 from kiteline_agent.initialisation import two_view_models
+from kiteline_core.arrays import F64, Bool
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.triangulation import nearest_point, parallax, project, rays
 from kiteline_core.optimisation.bundle import BundleProblem, bundle
-
-F64 = NDArray[np.float64]
-Bool = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)

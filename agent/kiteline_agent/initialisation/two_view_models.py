@@ -4,15 +4,11 @@ All draws are fitted and scored at once, as stacks of small matrices. Scores are
 each inlier adds its distance to the outlier bound, so that scores of both models compare.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
-F64 = NDArray[np.float64]
-Bool = NDArray[np.bool_]
+from kiteline_core.arrays import F64, Bool
 
 _CHI2_POINT = 5.991  # 95 % of a chi-square with 2 degrees of freedom: point to point
 _CHI2_LINE = 3.841  # 95 % with 1 degree of freedom: point to line

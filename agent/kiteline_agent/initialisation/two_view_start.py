@@ -3,13 +3,10 @@
 The scale is free: the median depth of the first landmarks is set to a convention, and the map keeps that scale.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.governor.cost_model import Work
@@ -20,12 +17,11 @@ from kiteline_agent.keyframes.new_landmarks import NewPoints
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_agent.tracking.frame_images import NO_GRID, FrameImages
+from kiteline_core.arrays import F64, U8
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import KeyframeId
 from kiteline_core.order_statistics import median
-
-F64 = NDArray[np.float64]
 
 _MAX_RETURN_PX = 1.0  # px between a corner and where it lies when it is followed back
 _MARGIN_PX = 4.0  # px to the border, within which the flow's window hangs over it
@@ -72,7 +68,7 @@ class TwoViewStart:
         self._first: FrameImages | None = None
         self._first_t_ns = 0
         self._frames = 0
-        self._last: NDArray[np.uint8] = np.zeros((0, 0), np.uint8)
+        self._last: U8 = np.zeros((0, 0), np.uint8)
         self._uv0 = np.zeros((0, 2))
         self._octave = np.zeros(0, np.uint8)
         self._templates = np.zeros((0, 3, alignment_kernels.TEMPLATE, alignment_kernels.TEMPLATE), np.uint8)

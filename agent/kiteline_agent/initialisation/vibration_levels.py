@@ -1,17 +1,13 @@
 """How much an accelerometer vibrates over a window, and in each of its intervals."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.inertial import imu_kernels
 from kiteline_agent.inertial.preintegration import Samples
-
-F64 = NDArray[np.float64]
+from kiteline_core.arrays import F64
 
 _FEWEST = 12  # second differences that tell the noise of an interval, to a fifth
 _EVEN, _GAP = 1.5, 2.5  # as in SampleBuffer: steps that are compared

@@ -1,14 +1,10 @@
 """Normal equations of a monocular window's observations, before landmarks are eliminated."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.initialisation.lens_correction import FARTHEST, TERMS
+from kiteline_core.arrays import F64
 from kiteline_core.jit import njit
-
-F64 = NDArray[np.float64]
 
 
 @njit

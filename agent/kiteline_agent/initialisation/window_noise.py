@@ -1,13 +1,10 @@
 """How noisy the IMU is beside its calibration, as the errors of a window show it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-F64 = NDArray[np.float64]
+from kiteline_core.arrays import F64
 
 MOST = 25.0  # largest factor on a deviation
 LEAST = 0.2  # and the smallest

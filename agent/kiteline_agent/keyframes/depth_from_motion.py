@@ -4,10 +4,7 @@ Two rays are intersected by least squares; successive inverse depths are average
 "SVO", 2014, section V). A seed becomes a landmark of the map once its depth is known well enough.
 """
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.governor.cost_model import Work
@@ -18,11 +15,8 @@ from kiteline_agent.local_map.local_map import Candidates, LocalMap
 from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_agent.tracking.frame_images import FrameImages
 from kiteline_agent.tracking.track import Track
+from kiteline_core.arrays import F64, I8, I64, Bool
 from kiteline_core.order_statistics import quantiles
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-Bool = NDArray[np.bool_]
 
 _MARGIN_PX = 8.0
 _PER_FRAME_STEREO = 24  # seeds searched in a frame with stereo, which leaves only far and doubtful ones
@@ -100,7 +94,7 @@ class DepthFromMotion:
         order = np.lexsort((-fine, self._map.tried.take(rows), -self._map.hits.take(rows)))
         return np.sort(fine[order[:limit]])
 
-    def _search(self, images: FrameImages, rows: I64, warp: F64, start: F64, end: F64) -> tuple[F64, NDArray[np.int8]]:
+    def _search(self, images: FrameImages, rows: I64, warp: F64, start: F64, end: F64) -> tuple[F64, I8]:
         """Find the templates: correlation along the segment, then alignment. Pixels (n,2), found (n,) 1 or 0."""
         align = self._config.align
         octave = self._map.octave[rows]

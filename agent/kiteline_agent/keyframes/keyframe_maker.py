@@ -4,12 +4,9 @@ The local map keeps what was measured, whatever is shared of it and however it i
 the agent tracks.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.governor.cost_model import Work
 from kiteline_agent.imaging import alignment_kernels
@@ -22,10 +19,9 @@ from kiteline_agent.tracking.track import Track
 from kiteline_codec.channel import RecordChannel
 from kiteline_codec.coding import quantise
 from kiteline_codec.schema import KeyframeHeader, NewLandmarks, Observations
+from kiteline_core.arrays import F32, F64, I64
 from kiteline_core.geometry import se3
 from kiteline_core.ids import NO_KEYFRAME, KeyframeId
-
-F64 = NDArray[np.float64]
 
 _MIN_RHO = 1e-4  # 1/m; farther counts as infinitely far
 _DEPTH_CAMERA_SIGMA_RHO = 2.85e-3  # 1/m, of a structured-light camera, constant (K. Khoshelham, S. Elberink, 2012)
@@ -114,7 +110,7 @@ class KeyframeMaker:
         self._store(ctx, KeyframeHeader(keyframe, ctx.t_ns, parent, T_m_k, 0), T_m_k, points, order, landmarks)
         self._map.share(keyframe, 0)
 
-    def _inliers(self, track: Track) -> tuple[NDArray[np.int64], F64]:
+    def _inliers(self, track: Track) -> tuple[I64, F64]:
         """Rows (n,) and observations (n,3) of the inliers, by landmark id."""
         keep = np.flatnonzero(track.inlier)
         keep = keep[np.argsort(self._map.landmark_ids(track.rows[keep]), kind="stable")]
@@ -126,9 +122,7 @@ class KeyframeMaker:
         self._work.new_landmarks += landmarks
         self._work.observations += observations
 
-    def _new_landmarks(
-        self, keyframe: KeyframeId, points: NewPoints, order: NDArray[np.int64]
-    ) -> tuple[NewLandmarks, F64]:
+    def _new_landmarks(self, keyframe: KeyframeId, points: NewPoints, order: I64) -> tuple[NewLandmarks, F64]:
         """The record of all new landmarks, and their strengths (n,)."""
         disparity = points.disparity[order]
         n = len(order)
@@ -144,7 +138,7 @@ class KeyframeMaker:
         )
         return landmarks, np.where(disparity > 0.0, 1.0, 0.0) - order / (2.0 * max(n, 1))
 
-    def _observations(self, keyframe: KeyframeId, rows: NDArray[np.int64], seen: F64, first: int) -> Observations:
+    def _observations(self, keyframe: KeyframeId, rows: I64, seen: F64, first: int) -> Observations:
         return Observations(
             keyframe,
             0,
@@ -155,13 +149,13 @@ class KeyframeMaker:
             self._map.landmark_ids(rows),
         )
 
-    def _measured_rho(self, disparity: F64, uv: F64) -> NDArray[np.float32]:
+    def _measured_rho(self, disparity: F64, uv: F64) -> F32:
         """Inverse depths (n,) 1/m to share, 0 for none: with the stereo offset, which the base estimates."""
         raw = disparity + self._map.offset_px(uv)
         return np.where((disparity > 0.0) & (raw > 0.0), raw / self._camera.bf, 0.0).astype(np.float32)
 
     def _store(
-        self, ctx: FrameContext, header: KeyframeHeader, T_m_k: F64, points: NewPoints, order: NDArray[np.int64],
+        self, ctx: FrameContext, header: KeyframeHeader, T_m_k: F64, points: NewPoints, order: I64,
         landmarks: NewLandmarks,
     ) -> F64:  # fmt: skip
         """Cut the templates where the image shows the landmarks, and add the keyframe to the local map.
@@ -189,7 +183,7 @@ class KeyframeMaker:
         return seen_uv
 
 
-def _in_order_of_rows(points: NewPoints, cell_px: float, first: int) -> NDArray[np.int64]:
+def _in_order_of_rows(points: NewPoints, cell_px: float, first: int) -> I64:
     """Order of the strongest `first` points, then of the others, by image rows: neighbours code shortest."""
     band = points.uv[:, 1] // cell_px
     return np.lexsort((points.uv[:, 0], band, np.arange(len(band)) >= first))

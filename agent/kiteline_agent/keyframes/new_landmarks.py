@@ -1,19 +1,15 @@
 """Corners that become the new landmarks of a keyframe."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.imaging import features, stereo_kernels
 from kiteline_agent.tracking.frame_images import NO_GRID, FrameImages, depth_at
 from kiteline_agent.tracking.rolling_shutter import RollingShutter
+from kiteline_core.arrays import F64, U8
 from kiteline_core.geometry.cameras import RectifiedCamera
-
-F64 = NDArray[np.float64]
 
 _SEARCH_PX = 2.5  # px of the level: range of sub-pixel stereo around the coarse search, whose step is 2 px
 _UNIQUENESS = 1.15  # second-best cost over best; below it the row repeats itself
@@ -29,9 +25,9 @@ class NewPoints:
 
     uv: F64
     disparity: F64
-    octave: NDArray[np.uint8]
-    angle: NDArray[np.uint8]
-    descriptor: NDArray[np.uint8]
+    octave: U8
+    angle: U8
+    descriptor: U8
     roll_px: F64 | None = None
 
 

@@ -1,21 +1,17 @@
 """Decides when a frame becomes a keyframe."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.config import KeyframeConfig
 from kiteline_agent.tracking.track import Track
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.order_statistics import median
-
-F64 = NDArray[np.float64]
 
 _COVER_KEPT = 0.8  # share of the reference's cover: a keyframe that regains a fifth of the landmarks is worth its bytes
 _COVER_CELLS = 39  # of the image, 8 x 5 at 752x480: coarse enough that an even track fills nearly all

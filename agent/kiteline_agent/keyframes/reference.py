@@ -3,21 +3,17 @@
 Beside it the newest of all is known: where a link carries fewer keyframes than tracking needs, some are not shared.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.keyframes.policy import KeyframeNeed, coverage, keyframe_need, situation
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_agent.tracking.track import Track
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
 from kiteline_core.ids import MAX_KEYFRAMES, NO_KEYFRAME, KeyframeId, SubmapId, keyframe_id, submap_of_keyframe
-
-F64 = NDArray[np.float64]
 
 _UNSHARED = 1024  # sequence numbers of keyframes that are not shared, used in turn: many times those in a local map
 _LAST = MAX_KEYFRAMES - _UNSHARED - 1  # the highest sequence number of a keyframe that is shared

@@ -1,7 +1,5 @@
 """Kernels of landmarks without depth: where they may be in a frame, and their depth where they were found."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from kiteline_core.jit import helper, njit

@@ -9,23 +9,18 @@ all the same, 3 % of lengths at 20 m: unless the rig is worn, it gets the most p
 calibrations, about what earlier flights found.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.config import DisparityConfig
 from kiteline_agent.local_map import disparity_kernels as kernels
 from kiteline_agent.local_map.local_map import LocalMap
+from kiteline_core.arrays import F64, I64
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.disparity_offset import TERMS, none, terms
 from kiteline_core.ids import NO_KEYFRAME
 from kiteline_core.order_statistics import median
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 _LEAST_RHO = 1e-4  # 1/m
 _LEAST_PARALLAX = 0.02  # distance over depth of a first pair, but for `growth`
@@ -282,7 +277,7 @@ class DisparityAlignment:
 
     def _own_share(self) -> float:
         """Share of the pairs' information that does not repeat the errors of other keyframes."""
-        keyframes = self._evicted + np.count_nonzero(self._score)
+        keyframes = self._evicted + int(np.count_nonzero(self._score))
         return 1.0 if self._moves_sideways() else min(1.0, _FORWARD_KEYFRAMES / max(keyframes, 1))
 
     def _believed_share(self) -> float:

@@ -1,13 +1,9 @@
 """Kernels that compare the disparities of landmarks in two frames with the parallax between them."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64
 from kiteline_core.jit import njit
-
-F64 = NDArray[np.float64]
 
 UNKNOWNS = 11  # pose (left perturbation [translation, rotation]), then five terms of the disparity offset
 _SIZE = UNKNOWNS + 2  # of a row: derivatives by the unknowns and by the point's inverse depth, residual

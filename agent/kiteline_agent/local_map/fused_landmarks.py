@@ -1,7 +1,5 @@
 """Landmarks of the local map that the base found to be one with another one, their root."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from kiteline_agent.local_map.local_map import LocalMap

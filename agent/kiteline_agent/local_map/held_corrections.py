@@ -5,20 +5,16 @@ offset moves keyframes here, and the base does not know: from then on a part of 
 that it computed before would undo the change.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.local_map.offset_history import OffsetHistory
 from kiteline_codec.schema import CulledLandmarks, RemovedObservations
+from kiteline_core.arrays import F64, I64
 from kiteline_core.geometry import se3
 from kiteline_core.ids import NO_KEYFRAME, SEQUENCE_BITS, KeyframeId, SubmapId, keyframe_id
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 Removed = RemovedObservations | CulledLandmarks
 
 _MOST_KNOWN = 1024  # keyframes of which it is known whether the base has placed them: many local maps

@@ -1,14 +1,8 @@
 """New landmarks of a keyframe, as the local map stores them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
-F64 = NDArray[np.float64]
-U8 = NDArray[np.uint8]
+from kiteline_core.arrays import F64, I64, U8
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,4 +21,4 @@ class KeyframeLandmarks:
     angle: U8
     descriptor: U8
     templates: U8
-    order: NDArray[np.int64] | None = None
+    order: I64 | None = None

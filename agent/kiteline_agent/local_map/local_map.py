@@ -5,8 +5,6 @@ keypoint i. A landmark is a bearing in its keyframe and an inverse depth, so tha
 landmarks. Keyframes of several submaps are stored; only those of the active one are tracked.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any
@@ -20,13 +18,11 @@ from kiteline_agent.local_map import projection_kernels as kernels
 from kiteline_agent.local_map.held_corrections import HeldCorrections, Removed
 from kiteline_agent.local_map.keyframe_landmarks import KeyframeLandmarks
 from kiteline_codec.schema import KeyframeHeader, KeyframePose, RefinedLandmarks
+from kiteline_core.arrays import F64, I64, Bool
 from kiteline_core.geometry import disparity_offset, se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import KEYPOINT_BITS, NO_KEYFRAME, SEQUENCE_BITS, KeyframeId, SubmapId
 from kiteline_core.order_statistics import median
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 _SEED_DEPTH_M = 1e4  # stands for infinity in landmarks without depth
 _MIN_TRIES = 12  # frames that must have searched a landmark before it is given up
@@ -165,7 +161,7 @@ class LocalMap:
         """Note how many of a keyframe's landmarks, the first ones, are shared with the base."""
         self.shared[self.slot_of(keyframe)] = landmarks
 
-    def is_shared(self, rows: I64) -> NDArray[np.bool_]:
+    def is_shared(self, rows: I64) -> Bool:
         """Which landmarks of rows (n,) are shared with the base."""
         return np.asarray(rows % self.slot_size < self.shared[rows // self.slot_size])
 
@@ -199,9 +195,7 @@ class LocalMap:
         far = self.sigma_rho.take(rows) / rho**2  # d(1/rho) = d(rho) / rho^2
         return T[:, :3, 3] + ray / rho[:, None], ray * far[:, None]
 
-    def update_depths(
-        self, T_c_m: F64, rows: I64, inlier: NDArray[np.bool_], observed: F64, sigma_px: F64, inflate: float
-    ) -> None:
+    def update_depths(self, T_c_m: F64, rows: I64, inlier: Bool, observed: F64, sigma_px: F64, inflate: float) -> None:
         """Update the inverse depths of rows (n,) by observations (n,3) from T_c_m (4,4)."""
         floor = _FLOOR_PX / self.camera.bf
         kernels.update_depths(
@@ -209,7 +203,7 @@ class LocalMap:
             self.T_m_k, self.bearing, self.rho, self.sigma_rho,
         )  # fmt: skip
 
-    def note_tracking(self, rows: I64, inlier: NDArray[np.bool_], frame_number: int) -> None:
+    def note_tracking(self, rows: I64, inlier: Bool, frame_number: int) -> None:
         """Count tries and hits; landmarks that keep failing are no longer searched."""
         self.tried[rows] += 1
         good = rows[inlier]
@@ -344,7 +338,7 @@ class LocalMap:
             self.due |= len(px) > 0 and median(px) >= self._config.moved_px
         return False
 
-    def _is_fresh(self, slot: int, index: I64) -> NDArray[np.bool_]:
+    def _is_fresh(self, slot: int, index: I64) -> Bool:
         """Which landmarks of a slot have no depth of their own: only the base could triangulate them.
 
         The base refines landmarks that others observe even where it has removed the one of this keyframe.

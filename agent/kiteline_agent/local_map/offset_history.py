@@ -4,20 +4,15 @@ Poses of the base are computed with the offset that it knew then, over a thin li
 moved since only once they are moved likewise.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64, I64
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.disparity_offset import none, terms
 from kiteline_core.ids import NO_KEYFRAME
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 _TOLD_M = 1e-3  # rms of keyframes: by less nothing tells which offset the base knew; poses are told to a millimetre
 

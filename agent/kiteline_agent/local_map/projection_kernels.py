@@ -1,7 +1,5 @@
 """Projection of landmarks into a camera, choice of those to search, and depth updates from observations."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from kiteline_core.jit import njit

@@ -1,9 +1,6 @@
 """Where the camera is: pose, motion, covariance, reference keyframe and submap, which change together."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.covariance.pose_covariance import PoseCovariance
@@ -19,12 +16,11 @@ from kiteline_agent.tracking.map_anchor import MapMotion
 from kiteline_agent.tracking.pose_state import PoseState
 from kiteline_agent.tracking.track import Track
 from kiteline_codec.schema import GravityAlignment
+from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuBatch, ImuCalibration
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraRig
 from kiteline_core.ids import SubmapId
-
-F64 = NDArray[np.float64]
 
 
 class CameraState:

@@ -1,10 +1,5 @@
 """Makes keyframes of frames, and enters them in all that reads keyframes."""
 
-from __future__ import annotations
-
-from numpy import float64
-from numpy.typing import NDArray
-
 from kiteline_agent.governor.cost_model import Work
 from kiteline_agent.governor.governor import Extra, Governor
 from kiteline_agent.keyframes.keyframe_maker import KeyframeMaker
@@ -14,10 +9,9 @@ from kiteline_agent.relocalisation.relocaliser import Relocaliser
 from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_agent.tracking.track import Track
 from kiteline_codec.channel import RecordChannel
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
 from kiteline_core.ids import NO_KEYFRAME, KeyframeId
-
-F64 = NDArray[float64]
 
 _WAIT_DEPTH_S = 0.26  # s that a keyframe waits for a lost right or depth image; slow depth cameras have 5 a second
 _DEAD_RECKONING_RAD = 0.02  # rad: standard deviation up to which dead reckoning extends the map, a degree

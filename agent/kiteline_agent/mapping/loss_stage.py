@@ -1,11 +1,6 @@
 """Handles a frame that was not tracked: dead reckoning, relocalisation, or a new submap."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
-
-from numpy import float64
-from numpy.typing import NDArray
 
 from kiteline_agent.governor.governor import Extra, Governor
 from kiteline_agent.mapping.camera_state import CameraState
@@ -14,9 +9,8 @@ from kiteline_agent.mapping.submap_stage import SubmapStage
 from kiteline_agent.relocalisation.relocaliser import Relocaliser
 from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_agent.tracking.track import Track
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
-
-F64 = NDArray[float64]
 
 
 @dataclass(frozen=True, slots=True)

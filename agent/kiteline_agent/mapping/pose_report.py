@@ -1,9 +1,6 @@
 """Reports the pose of each processed frame, and predicts it for the time after that frame."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.exchange.corrections import Corrections
 from kiteline_agent.mapping.camera_state import CameraState
@@ -14,11 +11,10 @@ from kiteline_agent.step import Estimate, PredictedPose
 from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_codec.channel import RecordChannel
 from kiteline_codec.schema import LivePose
+from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuBatch
 from kiteline_core.geometry import se3
 from kiteline_core.ids import NO_KEYFRAME, AgentId
-
-F64 = NDArray[np.float64]
 
 
 class PoseReport:

@@ -1,9 +1,6 @@
 """Estimates the errors of the right camera's rows and disparities in flight, and shares them with the base."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.imaging.row_alignment import RowAlignment
@@ -14,11 +11,10 @@ from kiteline_agent.mapping.camera_state import CameraState
 from kiteline_agent.tracking.track import Track
 from kiteline_codec.channel import RecordChannel
 from kiteline_codec.schema import DisparityCalibration, StereoAlignment
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import disparity_offset
 from kiteline_core.geometry.cameras import Rectifier
 from kiteline_core.ids import AgentId
-
-F64 = NDArray[np.float64]
 
 
 class RightCamera:

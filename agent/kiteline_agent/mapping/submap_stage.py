@@ -1,11 +1,8 @@
 """Opens submaps, joins new ones to older ones, continues full ones, and restarts monocular ones in metres."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.governor.governor import Extra, Governor
 from kiteline_agent.inertial.imu_initialisation import InertialStartState
@@ -26,11 +23,10 @@ from kiteline_agent.tracking.track import Track
 from kiteline_agent.tracking.tracker import Tracker
 from kiteline_codec.channel import RecordChannel
 from kiteline_codec.schema import SubmapScale, SubmapTie
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import Rectifier
 from kiteline_core.ids import NO_KEYFRAME, KeyframeId, SubmapId
-
-F64 = NDArray[np.float64]
 
 _FAILURES = 2  # failed searches in frames with texture before a new submap is opened
 
@@ -180,10 +176,7 @@ class SubmapStage:
             return None
         if camera.submaps.any:
             camera.leave_submap()
-        events = [
-            "submap: opened",
-            f"mono: scale by convention, median depth {two_views.median_depth_m:.3g} m",
-        ]
+        events = ["submap: opened", f"mono: scale by convention, median depth {two_views.median_depth_m:.3g} m"]
         camera.motion.begin_unscaled_map()
         camera.open_submap()
         camera.pose.reset_motion()

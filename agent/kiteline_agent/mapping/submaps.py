@@ -1,7 +1,5 @@
 """Which submap is active, and how many were opened."""
 
-from __future__ import annotations
-
 from kiteline_agent.step import Identity
 from kiteline_core.ids import MAX_SUBMAPS, SubmapId, submap_id
 

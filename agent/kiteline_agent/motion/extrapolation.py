@@ -1,16 +1,10 @@
 """The motion since the last frame, for a pose between frames or of a frame that was skipped."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import StrEnum
 
-import numpy as np
-from numpy.typing import NDArray
-
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
-
-F64 = NDArray[np.float64]
 
 
 class MotionSource(StrEnum):

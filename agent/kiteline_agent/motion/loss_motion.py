@@ -5,19 +5,15 @@ A quarter of a second of images in a new submap tells the velocity there, and by
 error of the position, as in a Kalman smoother.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.inertial.inertial_config import LossMotionConfig
 from kiteline_agent.inertial.inertial_tracker import InertialTracker
 from kiteline_agent.inertial.preintegration import preintegrate
+from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuCalibration
-
-F64 = NDArray[np.float64]
 
 _LEAST_VARIANCE = 1e-12  # a record holds no deviation of 0
 

@@ -1,13 +1,9 @@
 """Motion model of the tracker: IMU, odometer or constant velocity."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy import float64
-from numpy.typing import NDArray
 
 from kiteline_agent.config import OdometerConfig
 from kiteline_agent.covariance.pose_covariance import adjoint
@@ -25,12 +21,11 @@ from kiteline_agent.motion.step_recorder import StepRecorder
 from kiteline_agent.tracking.pose_state import PoseState
 from kiteline_agent.tracking.track import Track
 from kiteline_codec.schema import InertialSteps
+from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuBatch, ImuCalibration, OdometryBatch
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import KeyframeId
-
-F64 = NDArray[float64]
 
 _MOST_UP_RAD = 0.2  # deviation of a direction of gravity that is of use
 

@@ -5,22 +5,18 @@ gives the odometer's scale (tyre wear), its actual noise, and whether it may be 
 stamps or swapped axes raise that noise; above a tolerance the odometer is not used until it agrees again.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.config import OdometerConfig
 from kiteline_agent.inertial.fixed_lag import BodyVelocity
 from kiteline_agent.motion.extrapolation import Extrapolation, MotionSource, along_twist
 from kiteline_agent.motion.odometer_samples import MeanVelocity, OdometerSamples, measured_part
 from kiteline_agent.motion.unit_scale import WINDOW_S, UnitScale
+from kiteline_core.arrays import F64
 from kiteline_core.frame import OdometryBatch
 from kiteline_core.geometry import se3
-
-F64 = NDArray[np.float64]
 
 _UNMATCHED = 10  # windows without a sample, after which the stamps are reported to be wrong
 _WELL = 0.09  # (m/s)^2 or (rad/s)^2; directions measured worse than this count less and less
@@ -196,13 +192,13 @@ class Odometer:
         self._rate, self._rate_cov, self._rate_slow = update.value, update.cov, update.slow
         return True
 
-    def _updated_velocity(self, mean: MeanVelocity, prior: F64) -> _KalmanUpdate:
+    def _updated_velocity(self, mean: MeanVelocity, prior: F64) -> "_KalmanUpdate":
         """The velocity (3,) in b by a sample. prior: (3,3) its covariance before."""
         c, z = self._config, self.scale * mean.velocity
         slow = (self._noise + c.floor_m_s**2) * np.eye(3) + self._scale_var * np.outer(z, z)
         return _blend(self._velocity, prior, z, mean.velocity_cov, slow, _SURPRISE)
 
-    def _updated_rate(self, mean: MeanVelocity, prior: F64) -> _KalmanUpdate:
+    def _updated_rate(self, mean: MeanVelocity, prior: F64) -> "_KalmanUpdate":
         """The same of the rate (3,), never rejected: a gust turns the vehicle at once."""
         slow = (self._rate_noise + self._config.floor_rad_s**2) * np.eye(3)
         return _blend(self._rate, prior, mean.rate, mean.rate_cov, slow, np.inf)

@@ -1,16 +1,12 @@
 """Buffer of odometer samples and their means over an interval."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_core import odometry
+from kiteline_core.arrays import F64
 from kiteline_core.frame import OdometryBatch
-
-F64 = NDArray[np.float64]
 
 _ANY = 100.0  # (m/s)^2 or (rad/s)^2; any measured direction is far more precise
 

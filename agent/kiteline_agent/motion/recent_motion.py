@@ -1,15 +1,9 @@
 """Velocity of the vehicle by its last poses, as of an instant after them, where no sensor measures it."""
 
-from __future__ import annotations
-
 from collections import deque
 
-import numpy as np
-from numpy.typing import NDArray
-
+from kiteline_core.arrays import F64
 from kiteline_core.geometry.end_rates import end_rates
-
-F64 = NDArray[np.float64]
 
 _WINDOW_NS = 250_000_000  # ns of poses that count: longer, and the acceleration is not constant
 _AHEAD_NS = 50_000_000  # ns after the last pose up to which its acceleration is believed

@@ -4,20 +4,16 @@ Only short steps tell it: between keyframes, a second apart, an accelerometer's 
 and IMU would have to differ by.
 """
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.inertial.inertial_tracker import InertialTracker
 from kiteline_agent.inertial.preintegration import preintegrate
 from kiteline_codec.schema import InertialSteps
 from kiteline_codec.schema.agent.inertial_steps import MAX_STEPS
+from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry import se3
 from kiteline_core.ids import NO_KEYFRAME, KeyframeId
-
-F64 = NDArray[np.float64]
 
 _LONGEST_S = 2.0  # of a step
 _LARGEST = 30.0  # of a step's m, m/s: more is no flight, and has no code

@@ -1,11 +1,8 @@
 """Scale of a monocular map of unknown unit, from displacements by the odometer and by the images."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
-F64 = NDArray[np.float64]
+from kiteline_core.arrays import F64
 
 WINDOW_S = 0.4  # s; window of a comparison
 _WINDOWS = 40  # newest windows that are kept

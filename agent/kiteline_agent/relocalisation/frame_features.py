@@ -1,18 +1,13 @@
 """Corners and descriptors of a whole frame, to match it with keyframes."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.imaging import features
 from kiteline_agent.imaging.features import DetectorConfig
 from kiteline_agent.tracking.frame_images import FrameImages
-
-F64 = NDArray[np.float64]
-U8 = NDArray[np.uint8]
+from kiteline_core.arrays import F64, U8
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,18 +3,16 @@
 They have landmarks and descriptors but no image, so a lost frame is matched with them by descriptor.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.config import MapCacheConfig
 from kiteline_agent.local_map import projection_kernels
 from kiteline_agent.relocalisation.frame_features import FrameFeatures
 from kiteline_codec.schema import CachedKeyframe, CachedLandmarks, Key
+from kiteline_core.arrays import F64, I64
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, KeyframeId, SubmapId
@@ -23,10 +21,6 @@ from kiteline_core.imaging.matching import MatchConfig, Matches, match, match_ne
 from kiteline_core.places.place_index import PlaceIndex, Vocabulary
 from kiteline_core.pose.pnp import RansacConfig, solve_pnp
 from kiteline_core.pose.pose_kernels import optimise_pose
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-U8 = NDArray[np.uint8]
 
 _MARGIN_PX = 4.0  # px beyond the border: landmarks just out of view have no corner
 _NO_SUBMAP = -1  # in the array of submaps: the keyframe's pose has not arrived

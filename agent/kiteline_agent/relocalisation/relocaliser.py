@@ -5,13 +5,10 @@ is found, one keyframe is made in each, with the same stamp. Both are the same c
 T_old_new = T_old_k1 @ inverse(T_new_k2). The agent continues in the old submap; the base moves the other keyframes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.governor.cost_model import Work
@@ -21,13 +18,12 @@ from kiteline_agent.relocalisation.map_cache import MapCache
 from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_agent.tracking.track import Track, track_without_landmarks
 from kiteline_agent.tracking.tracker import Tracker
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
 from kiteline_core.ids import NO_KEYFRAME, KeyframeId, SubmapId, submap_of_keyframe
 from kiteline_core.imaging import matching
 from kiteline_core.places.place_index import PlaceIndex, Vocabulary
 from kiteline_core.pose.pnp import PoseFit, solve_pnp
-
-F64 = NDArray[np.float64]
 
 _MIN_CORNERS = 60  # with fewer there is no texture in view, and a search would prove nothing
 _MIN_PNP_INLIERS = 12  # inliers of P3P; chance matches reach 8

@@ -1,7 +1,5 @@
 """One agent in flight: source, agent, log and modelled link, driven step by step."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import deque
@@ -24,13 +22,7 @@ from kiteline_agent.runtime.flight_log import STEP
 from kiteline_agent.runtime.flight_record import FlightRecord, metadata
 from kiteline_agent.runtime.frame_counts import CpuAccount, FrameCounts
 from kiteline_agent.runtime.frame_reader import SAMPLES, FrameReader
-from kiteline_agent.runtime.options import (
-    LOG_STEM,
-    AgentOptions,
-    agent_config,
-    channel_for,
-    is_filter,
-)
+from kiteline_agent.runtime.options import LOG_STEM, AgentOptions, agent_config, channel_for, is_filter
 from kiteline_agent.runtime.rig_file import RigFile
 from kiteline_agent.runtime.warm import warm
 from kiteline_agent.step import Identity, StepInput, StepOutput

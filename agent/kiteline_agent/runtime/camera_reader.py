@@ -1,7 +1,5 @@
 """Reads a live camera: frames as they come, with the samples since the last one."""
 
-from __future__ import annotations
-
 from collections import deque
 from typing import Protocol
 

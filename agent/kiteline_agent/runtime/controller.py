@@ -1,14 +1,9 @@
 """A flight controller beside the source: poses out, velocities and IMU samples in."""
 
-from __future__ import annotations
-
 from contextlib import ExitStack
 
 from kiteline_agent.onboard import OnboardAgent
-from kiteline_agent.runtime.options import (
-    AgentOptions,
-    agent_config,
-)
+from kiteline_agent.runtime.options import AgentOptions, agent_config
 from kiteline_agent.runtime.pose_schedule import PoseSchedule
 from kiteline_agent.step import Estimate, PredictedPose, StepOutput
 from kiteline_hw.ports import ControllerLink, FrameSource, LinkError, PoseSample

@@ -3,16 +3,14 @@
 Each step begins with a /step message that counts the messages after it. Numbers are logged bit for bit.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.step import Estimate, PredictedPose, StepInput, StepOutput
+from kiteline_core.arrays import F64
 from kiteline_core.frame import Frame, ImuBatch, OdometryBatch
 
 STEP, IMU, ODOMETER, PACKETS_IN, PACKETS_OUT, ESTIMATE, PREDICTED, EVENTS = (
@@ -33,7 +31,7 @@ class StepLog(Protocol):
     def blob(self, topic: str, t_ns: int, data: bytes) -> None: ...
     def json(self, topic: str, t_ns: int, value: object) -> None: ...
     def fields(self, topic: str, t_ns: int, values: Mapping[str, object]) -> None: ...
-    def pose(self, topic: str, t_ns: int, frame_id: str, pose: NDArray[np.float64]) -> None: ...
+    def pose(self, topic: str, t_ns: int, frame_id: str, pose: F64) -> None: ...
     def text(self, topic: str, t_ns: int, level: str, text: str) -> None: ...
 
 
@@ -107,7 +105,7 @@ def estimate_from_json(value: Mapping[str, Any]) -> Estimate:
     return Estimate(**fields_of)
 
 
-def _matrix(numbers: Sequence[float]) -> NDArray[np.float64]:
+def _matrix(numbers: Sequence[float]) -> F64:
     a = np.array(numbers, np.float64)
     side = {9: 3, 16: 4, 36: 6}.get(a.size)
     return a if side is None else a.reshape(side, side)

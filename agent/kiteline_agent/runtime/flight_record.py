@@ -1,7 +1,5 @@
 """Log and trajectories of a flight. Pure: the files are handed in."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import asdict
 from typing import Protocol

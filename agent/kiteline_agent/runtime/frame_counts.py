@@ -1,21 +1,15 @@
 """Counts and CPU time of a flight, frame by frame, and its trajectory lines. The clock is handed in; no file."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol
 
-from numpy import float64
-from numpy.typing import NDArray
-
 from kiteline_agent.runtime.frame_reader import SAMPLES
 from kiteline_agent.step import Estimate, PredictedPose
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import tum
 from kiteline_core.ids import NO_KEYFRAME, KeyframeId, SubmapId, submap_of_keyframe
-
-F64 = NDArray[float64]
 
 
 @dataclass(slots=True)

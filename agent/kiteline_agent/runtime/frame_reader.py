@@ -1,7 +1,5 @@
 """Reads a source one frame ahead, and measures what decoding costs."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable, Iterable
 

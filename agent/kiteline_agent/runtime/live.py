@@ -1,7 +1,5 @@
 """A live flight: real clocks, a real link, and a flight controller if there is one."""
 
-from __future__ import annotations
-
 import os
 import threading
 from collections.abc import Sequence
@@ -114,7 +112,7 @@ class _LiveFlight:
     """The loop of a live flight: waits for frames and poses that are due, steps the agent, sends packets."""
 
     def __init__(
-        self, runtime: AgentRuntime, base: _BaseEnd, controller: ControllerLink | None, clock: MonotonicClock,
+        self, runtime: AgentRuntime, base: "_BaseEnd", controller: ControllerLink | None, clock: MonotonicClock,
         parent: process.Parent | None, stop: process.StopSignal,
     ) -> None:  # fmt: skip
         self._runtime, self._base, self._controller = runtime, base, controller

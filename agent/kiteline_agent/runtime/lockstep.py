@@ -1,7 +1,5 @@
 """A lock-step flight: each tick waits for the base at a barrier."""
 
-from __future__ import annotations
-
 import os
 import signal
 

@@ -1,7 +1,5 @@
 """Options of one agent process, from the command line or from `fly`; its configuration and channel."""
 
-from __future__ import annotations
-
 import argparse
 from dataclasses import dataclass, replace
 from pathlib import Path

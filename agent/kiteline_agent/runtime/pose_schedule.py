@@ -1,7 +1,5 @@
 """When poses and obstacles go to a flight controller. No clock."""
 
-from __future__ import annotations
-
 
 class PoseSchedule:
     """Times at a fixed rate. A late one does not delay those after it."""

@@ -1,7 +1,5 @@
 """The rig file: what flights found of a rig, as TOML. Read when an agent starts, written while and after it flies."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Status messages of a live flight for a terminal: important events, and a summary every 10 s. No clock."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from kiteline_agent.runtime.frame_counts import FrameCounts, live_pose

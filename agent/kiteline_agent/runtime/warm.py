@@ -1,11 +1,8 @@
 """Compile all kernels of the onboard half before the first frame, by flying a few frames of noise."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.agent import Agent
 from kiteline_agent.config import AgentConfig, TwoViewConfig
@@ -24,6 +21,7 @@ from kiteline_agent.scans.range_error import RangeError
 from kiteline_agent.scans.scan_stage import Scanned
 from kiteline_agent.step import Identity, StepInput
 from kiteline_agent.tracking.frame_images import NO_GRID
+from kiteline_core.arrays import F64, U8
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration
 from kiteline_core.geometry.cameras import CameraModel, CameraRig, Rectifier
 from kiteline_core.geometry.se3 import from_rt
@@ -87,7 +85,7 @@ def _warm_scans(rig: CameraRig) -> None:
     grid.around(np.eye(4), None, {}, GroundConfig().bands_m)
 
 
-def _warm_relocalisation(vocabulary: Vocabulary, noise: NDArray[np.uint8]) -> None:
+def _warm_relocalisation(vocabulary: Vocabulary, noise: U8) -> None:
     """A place looked up, descriptors matched, and a pose from points, on 40 corners of noise."""
     descriptor, angle = noise[:1280].reshape(40, 32).copy(), np.zeros(40, np.uint8)
     places = PlaceIndex(vocabulary)
@@ -113,7 +111,7 @@ def _resting(k: int) -> ImuBatch:
     return ImuBatch(t_ns, np.zeros((10, 3)), np.tile([0.0, 0.0, 9.81], (10, 1)))
 
 
-def _warm_monocular(image: NDArray[np.uint8], draw: NDArray[np.float64]) -> None:
+def _warm_monocular(image: U8, draw: F64) -> None:
     """Both starts, on a cloud of points (3,n) drawn from 0 to 1 and on one point, and the search of a seed."""
     x, y, z = draw[0] - 0.5, draw[1] - 0.5, 1.0 + draw[2]
     a, b = (np.column_stack([200.0 * (x - shift) / z + 159.5, 200.0 * y / z + 119.5]) for shift in (0.0, 0.2))

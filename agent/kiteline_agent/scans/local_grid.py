@@ -1,14 +1,11 @@
 """What stands around the vehicle at its height: its own newest scans, and the base's grid where those saw nothing."""
 
-from __future__ import annotations
-
 import operator
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.scan_config import LocalGridConfig
 from kiteline_agent.scans import local_grid_kernels as kernels
@@ -16,10 +13,8 @@ from kiteline_agent.scans.range_error import RangeError
 from kiteline_agent.scans.scan_stage import Scanned
 from kiteline_codec.schema import GridTile
 from kiteline_codec.schema.base.grid_tile import FREE, TILE_CELLS
+from kiteline_core.arrays import F64, I8
 from kiteline_core.ground.column_scan import ColumnScan, level_rotation
-
-F64 = NDArray[np.float64]
-I8 = NDArray[np.int8]
 
 SECTORS = 72  # of 5 degrees
 _CELLS = 512  # along each side of the local grid
@@ -44,7 +39,7 @@ class _Drawn:
     _ranges: tuple[RangeError, F64, F64] | None = None  # what `ranges` returned last, and by which error
 
     @staticmethod
-    def of(p: F64, ahead: F64, scan: ColumnScan, offset_px: F64) -> _Drawn:
+    def of(p: F64, ahead: F64, scan: ColumnScan, offset_px: F64) -> "_Drawn":
         """That of a camera at p (3,) whose azimuth 0 lies towards ahead (3,)."""
         return _Drawn(float(p[0]), float(p[1]), float(p[2]), float(np.arctan2(ahead[1], ahead[0])), scan, offset_px)
 
@@ -54,7 +49,7 @@ class _Drawn:
             self._ranges = error, *error.ranges(self.scan, self.offset_px, sigma_m)
         return self._ranges[1:]
 
-    def turned(self, R: F64) -> _Drawn:
+    def turned(self, R: F64) -> "_Drawn":
         """The same in axes turned by R (3,3)."""
         ahead = np.array([np.cos(self.heading), np.sin(self.heading), 0.0])
         return _Drawn.of(R @ [self.x_m, self.y_m, self.z_m], R @ ahead, self.scan, self.offset_px)

@@ -1,7 +1,5 @@
 """Kernels of the local grid: rays of scans are drawn into it, and distances are read from it."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from kiteline_core.jit import njit

@@ -1,16 +1,12 @@
 """How much ranges of scans deviate, and what they are once more is known of the rig's disparities."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64
 from kiteline_core.geometry.disparity_offset import TERMS, terms
 from kiteline_core.ground.column_scan import ColumnScan, level_rotation
-
-F64 = NDArray[np.float64]
 
 _LEAST_CHANGE_PX, _LEAST_CHANGE = 0.05, 0.2  # of the offset, and in the logarithm of the deviation
 _LEAST_FORWARD = 0.1  # of a column's direction along the optical axis: farther to the side nothing is in the image
@@ -30,7 +26,7 @@ class RangeError:
     cov_px: F64
 
     @staticmethod
-    def of_noise(bf: float, sigma_px: float) -> RangeError:
+    def of_noise(bf: float, sigma_px: float) -> "RangeError":
         """That of a camera whose disparities have noise alone."""
         return RangeError(bf, sigma_px, np.zeros(TERMS), np.zeros((TERMS, TERMS)))
 
@@ -39,11 +35,11 @@ class RangeError:
         """Deviation of what disparities in the middle of the image have in common."""
         return float(np.sqrt(self.cov_px[0, 0]))
 
-    def moved(self, other: RangeError) -> bool:
+    def moved(self, other: "RangeError") -> bool:
         """True if the offset is not that of the other one."""
         return bool(np.abs(self.offset_px - other.offset_px).max() > _LEAST_CHANGE_PX)
 
-    def differs(self, other: RangeError) -> bool:
+    def differs(self, other: "RangeError") -> bool:
         """True if ranges drawn by the other one have to be drawn anew."""
         mine, theirs = (float(np.hypot(e.sigma_px, e.common_px)) for e in (self, other))
         return self.moved(other) or abs(float(np.log(mine / theirs))) > _LEAST_CHANGE

@@ -1,7 +1,5 @@
 """Scans that wait for room on the link."""
 
-from __future__ import annotations
-
 from kiteline_codec.channel import RecordChannel
 from kiteline_codec.schema import Key, KeyframeScan, Record, messages
 

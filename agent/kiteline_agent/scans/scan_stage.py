@@ -5,12 +5,9 @@ and then. The height of the ground is followed from scan to scan; those that saw
 If the base makes the scans, their images are sent in place of all that, except while the link does not carry them.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.governor.cost_model import Work
 from kiteline_agent.governor.governor import Governor
@@ -24,6 +21,7 @@ from kiteline_agent.scans.sent_images import SentImages
 from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_codec.channel import RecordChannel
 from kiteline_codec.schema import KeyframeScan, ScanImages
+from kiteline_core.arrays import F32, F64, U8
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import Rectifier
 from kiteline_core.ground.column_scan import ColumnScan
@@ -34,10 +32,6 @@ from kiteline_core.ground.image_codes import encode_pair
 from kiteline_core.ground.segmentation import GroundSegmenter
 from kiteline_core.ground.wide_view import WideView
 from kiteline_core.ids import NO_KEYFRAME, KeyframeId
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-U8 = NDArray[np.uint8]
 
 _MOST_PARTS = 2  # of a scan in one frame, after a gap too
 

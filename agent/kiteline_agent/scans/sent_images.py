@@ -1,7 +1,5 @@
 """Images of which the base makes scans, while they are under way to it."""
 
-from __future__ import annotations
-
 from kiteline_codec.channel import RecordChannel
 from kiteline_codec.schema import Key, ScanImages
 

@@ -1,19 +1,13 @@
 """What every stage may read of the frame in work."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
-
-from numpy import float64
-from numpy.typing import NDArray
 
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.tracking.frame_images import FrameImages
 from kiteline_agent.tracking.rolling_shutter import RollingShutter
+from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuBatch
 from kiteline_core.geometry import se3
-
-F64 = NDArray[float64]
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,23 +1,17 @@
 """Image pyramids of one frame, rectified only where they are read."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.config import PyramidConfig
 from kiteline_agent.imaging import stereo_kernels
 from kiteline_agent.imaging.features import Pyramid, build_pyramid
+from kiteline_core.arrays import F32, F64, U8, Bool
 from kiteline_core.frame import Frame
 from kiteline_core.geometry.cameras import Rectifier
-
-U8 = NDArray[np.uint8]
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
 
 NO_GRID = np.zeros((0, 0, 2), np.float32)  # the image needs no rectification
 _MIN_NCC = 0.85  # correlation of the two patches; lower at occlusions and depth edges
@@ -59,8 +53,8 @@ class RightImage:
         return np.asarray(cv2.pyrDown(self._image), np.uint8) if self._raw is None else self._raw[1]
 
     def refine(
-        self, left: Pyramid, left_grid: F32, uv: F64, octave: U8, sure: NDArray[np.bool_], search_px: float,
-        disparity: F64, found: NDArray[np.bool_],
+        self, left: Pyramid, left_grid: F32, uv: F64, octave: U8, sure: Bool, search_px: float,
+        disparity: F64, found: Bool,
     ) -> None:  # fmt: skip
         """Measure disparities to sub-pixel (stereo_kernels.refine_rows); rectifies only the patches that it reads."""
         grid = self._rectifier.right_grid
@@ -90,7 +84,7 @@ class FrameImages:
 
     sampled: Pyramid
     right: RightImage | None
-    depth_m: NDArray[np.float32] | None
+    depth_m: F32 | None
     first: int = 0
     grid: F32 = field(default_factory=lambda: NO_GRID)
     rectifier: Rectifier | None = None
@@ -116,7 +110,7 @@ class FrameImages:
         """The whole level 0, and coarser levels rectified at half size, as the right image's: for templates."""
         return self.left if self.rectifier is None else (self.left[0], *self._halves(self.rectifier))
 
-    def rectified_by(self, rectifier: Rectifier) -> FrameImages:
+    def rectified_by(self, rectifier: Rectifier) -> "FrameImages":
         """The same frame, read through a rectifier that has changed."""
         grid = NO_GRID if rectifier.left_grid is None else rectifier.left_grid
         used = None if rectifier.left_grid is None else rectifier
@@ -157,7 +151,7 @@ def frame_images(
     return FrameImages(pyramid, right, depth_m, first, grid, rectifier)
 
 
-def depth_at(depth_m: NDArray[np.float32], uv: F64) -> F64:
+def depth_at(depth_m: F32, uv: F64) -> F64:
     """Depth (n,) in m at pixels (n,2); 0 where unknown or where the 3x3 neighbourhood is an edge (spread above 5 %)."""
     h, w = depth_m.shape
     x = np.clip(np.round(uv[:, 0]).astype(np.int64), 1, w - 2)

@@ -4,17 +4,13 @@ After G. Klein and D. Murray, "Improving the agility of keyframe-based SLAM" (20
 their alignment. It finds the large shifts of a quick rotation, which template alignment cannot.
 """
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.imaging.features import Pyramid
+from kiteline_core.arrays import F32, F64, U8
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import Rectifier
-
-F64 = NDArray[np.float64]
 
 _LEVEL = 3  # 94x60 px for 752x480: shifts of up to half the image are found
 _MIN_RESPONSE = 0.05  # height of the correlation peak; below it the two images have nothing in common
@@ -25,9 +21,9 @@ class ImageShift:
 
     def __init__(self, rectifier: Rectifier) -> None:
         self._rectifier, self._camera = rectifier, rectifier.camera
-        self._image: NDArray[np.uint8] | None = None
+        self._image: U8 | None = None
         self._T_c_m = np.eye(4)
-        self._hanning: NDArray[np.float32] | None = None
+        self._hanning: F32 | None = None
 
     def remember(self, left: Pyramid, T_c_m: F64) -> None:
         """Keep the image of a frame that was tracked at T_c_m (4,4). left: its pyramid as it came."""

@@ -4,23 +4,18 @@ Keyframe and landmarks do not move alike: a refined landmark moves relative to i
 hang on many keyframes. The camera moves with what it sees, so that the next frame is where odometry expects it.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.tracking.track import Track
+from kiteline_core.arrays import F64, Bool
 from kiteline_core.geometry import se3
 from kiteline_core.ids import KeyframeId
 from kiteline_core.order_statistics import median
 from kiteline_core.pose import pose_kernels
-
-F64 = NDArray[np.float64]
-
 
 _LEAST_DEPTH_M = 1e-3  # m
 
@@ -76,7 +71,7 @@ class MapAnchor:
         )
         return MapMotion(se3.orthonormalise(se3.inverse(T_c_new) @ T_c_old), median(depth_after / depth_before))
 
-    def _pose(self, xyz: F64, left: NDArray[np.bool_]) -> F64:
+    def _pose(self, xyz: F64, left: Bool) -> F64:
         """T_c_m (4,4) from the frame's observations of landmarks at xyz (n,3)."""
         track, config = self._track, self._config.pose
         T = track.T_c_m.copy()

@@ -1,13 +1,9 @@
 """Pose of the camera in the submap and in the odometry frame, and its constant-velocity motion."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
-
-F64 = NDArray[np.float64]
 
 _EVEN_SPACING = 0.2  # relative; frame intervals that differ by less count as equal
 

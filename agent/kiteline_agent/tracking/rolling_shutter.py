@@ -1,15 +1,11 @@
 """Rolling shutter: pixels moved from the time of their row to that of the frame, by the camera's predicted motion."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F32, F64
 from kiteline_core.geometry.cameras import GRID_STEP, RectifiedCamera
-
-F64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,7 +20,7 @@ class RollingShutter:
     camera: RectifiedCamera
     readout_s: float
     height: int
-    grid: NDArray[np.float32] | None
+    grid: F32 | None
     twist: F64
 
     def to_frame(self, uv: F64, rho: F64) -> F64:

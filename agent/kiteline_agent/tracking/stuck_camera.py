@@ -1,14 +1,10 @@
 """Detects a camera that repeats its last image while the vehicle moves."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64, U8
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
-
-F64 = NDArray[np.float64]
 
 _ROW_STEP = 16  # every 16th row of an image is compared: sensor noise makes no two of them alike
 _MIN_REPEATS = 2  # some drivers fill a gap with a single repetition
@@ -30,7 +26,7 @@ class StuckCamera:
         """True if the last image equals the one before."""
         return self._repeats > 0
 
-    def update(self, left: NDArray[np.uint8], T_o_c: F64) -> bool:
+    def update(self, left: U8, T_o_c: F64) -> bool:
         """True if image (h,w) is an old one although the camera should be at T_o_c (4,4) by now."""
         rows = left[::_ROW_STEP]
         middle = len(rows) // 2  # tells most images apart by itself

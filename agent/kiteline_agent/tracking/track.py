@@ -1,18 +1,12 @@
 """The measured pose of one frame, and the observations behind it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.config import PoseConfig
+from kiteline_core.arrays import F64, I64, Bool
 from kiteline_core.geometry import se3
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +24,7 @@ class Track:
     observed: F64
     sigma_px: F64
     depth_m: F64
-    inlier: Bools
+    inlier: Bool
     inliers: int
     rms: float
     tried: int

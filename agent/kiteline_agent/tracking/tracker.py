@@ -1,9 +1,6 @@
 """Measures the pose of a frame: align templates, search disparities along the row, optimise the pose."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.governor.cost_model import Work
@@ -13,12 +10,10 @@ from kiteline_agent.local_map.local_map import Candidates, LocalMap
 from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_agent.tracking.frame_images import FrameImages, depth_at
 from kiteline_agent.tracking.track import Track
+from kiteline_core.arrays import F64, I64, U8
 from kiteline_core.geometry import se3
 from kiteline_core.order_statistics import median
 from kiteline_core.pose import pose_kernels
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 _SURE_PX = 0.4  # px of the octave: deviation of the predicted disparity below which no coarser level is searched
 _COARSEST = 2  # template level at which the coarse pass begins
@@ -176,7 +171,7 @@ class Tracker:
         )  # fmt: skip
 
     def _add_disparities(
-        self, images: FrameImages, rows: I64, octave: NDArray[np.uint8], depth: F64, observed: F64, config: AgentConfig
+        self, images: FrameImages, rows: I64, octave: U8, depth: F64, observed: F64, config: AgentConfig
     ) -> None:
         """Fill observed[:, 2] from the right image or the depth image, where it can be measured."""
         bf, stereo, uv = self._map.camera.bf, config.stereo, np.ascontiguousarray(observed[:, :2])

@@ -1,15 +1,11 @@
 """Velocity of an agent between two plans of what it is sent."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64
 from kiteline_core.ids import SubmapId
-
-F64 = NDArray[np.float64]
 
 _LONGEST = 4.0  # periods between two plans, beyond which the velocity between them is out of date
 

@@ -5,8 +5,6 @@ agent can wait for all of it. On a thin link a batch is as large as the link car
 coded over several steps.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

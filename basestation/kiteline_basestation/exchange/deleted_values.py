@@ -1,7 +1,5 @@
 """Own values of deleted maps: removed once the agent has everything, so that they take no memory of either side."""
 
-from __future__ import annotations
-
 from collections.abc import Collection
 
 from kiteline_codec.channel import CodedChannel

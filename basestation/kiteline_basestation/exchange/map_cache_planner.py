@@ -5,13 +5,10 @@ now or after a short prediction. They are sent in the frame of the submap that t
 others are needed more.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.config import LoopConfig, MapCacheConfig
 from kiteline_basestation.exchange.agent_velocity import AgentVelocity
@@ -20,12 +17,9 @@ from kiteline_basestation.map.map_tables import CULLED, LANDMARK, NO_POSE
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_codec.channel import RecordChannel
 from kiteline_codec.schema import CACHED_KINDS, CachedKeyframe, CachedLandmarks, GridTile, Key, LivePose, messages
+from kiteline_core.arrays import F64, I32, Bool
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import SUBMAP_BITS, AgentId, KeyframeId, SubmapId, agent_of_keyframe, submap_of_keyframe
-
-F64 = NDArray[np.float64]
-I32 = NDArray[np.int32]
-I64 = NDArray[np.int64]
 
 _MAX_CANDIDATES = 60  # keyframes whose landmarks are projected
 _MIN_LANDMARKS = 8  # landmarks of a keyframe that will be in view: fewer are not worth their bytes
@@ -144,7 +138,7 @@ class MapCachePlanner:
         live &= (self._map.inverse_depths(slots) > 0.0) & table.descriptor[slots].any(axis=1)
         return np.asarray(slots[live])
 
-    def _in_view(self, agent: AgentId, T_w_c: F64, xyz: F64) -> NDArray[np.bool_]:
+    def _in_view(self, agent: AgentId, T_w_c: F64, xyz: F64) -> Bool:
         camera = self._map.cameras[agent]
         local = (xyz - T_w_c[:3, 3]) @ T_w_c[:3, :3]
         z = np.maximum(local[:, 2], 1e-3)

@@ -1,13 +1,10 @@
 """Collects changes of the map as records for the agents that own the keyframes."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Collection, Iterable, Mapping
 from itertools import chain, islice
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.config import PublishConfig
 from kiteline_basestation.exchange.correction_batches import MEMBERS
@@ -25,10 +22,8 @@ from kiteline_codec.schema import (
     messages,
 )
 from kiteline_codec.schema.owners import submap_of
+from kiteline_core.arrays import F64, I32, U16
 from kiteline_core.ids import AgentId, KeyframeId, SubmapId, agent_of_keyframe, agent_of_submap, submap_of_keyframe
-
-F64 = NDArray[np.float64]
-I32 = NDArray[np.int32]
 
 _MEMBER_KINDS = frozenset(record.KIND for record in MEMBERS)
 _POSE_BYTES = 24  # of a keyframe's pose on the wire, and of what else stands beside landmarks
@@ -229,7 +224,7 @@ class Publisher:
             return CulledLandmarks(keyframe, self._index(here), int(sparse_map.keyframes.culled[row]))
         raise ValueError(f"the base writes record of kind {kind} for a keyframe")
 
-    def _index(self, slots: I32) -> NDArray[np.uint16]:
+    def _index(self, slots: I32) -> U16:
         return self._map.keypoint_of(slots).astype(np.uint16)
 
 

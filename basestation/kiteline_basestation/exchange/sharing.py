@@ -1,7 +1,5 @@
 """Which agents share their maps with each other."""
 
-from __future__ import annotations
-
 from kiteline_core.ids import AgentId
 
 

@@ -4,14 +4,11 @@ A tile is sent when enough of its cells differ from what the agent has, the most
 for each of the agent's keyframes. Tiles far away are removed again.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.config import TileConfig
 from kiteline_basestation.exchange.agent_velocity import AgentVelocity
@@ -21,11 +18,9 @@ from kiteline_basestation.grid.tile_store import Place
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_codec.channel import RecordChannel
 from kiteline_codec.schema import GridTile, LivePose, messages
+from kiteline_core.arrays import F64, I8
 from kiteline_core.geometry import sim3
 from kiteline_core.ids import AgentId, SubmapId, agent_of_submap, submap_of_keyframe
-
-F64 = NDArray[np.float64]
-I8 = NDArray[np.int8]
 
 _KEPT_RATIO = 1.5  # of the option reach_m; tiles farther away are removed
 _SOLID_WEIGHT = 4  # cells added for each one that became an obstacle, or is none any more

@@ -1,14 +1,11 @@
 """Draws the grid: the scans of new keyframes, and anew those of keyframes that moved."""
 
-from __future__ import annotations
-
 import copy
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.grid.kept_scan import KeptScan, keep
@@ -17,13 +14,9 @@ from kiteline_basestation.grid.sparse_scan import sparse_scan
 from kiteline_basestation.map.map_tables import LANDMARK
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_codec.schema import KeyframeScan
+from kiteline_core.arrays import F64, I32, U8
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import AgentId, KeyframeId, SubmapId, agent_of_keyframe, agent_of_submap, submap_of_keyframe
-
-F64 = NDArray[np.float64]
-I32 = NDArray[np.int32]
-U8 = NDArray[np.uint8]
-
 
 _LOOKED = 16  # keyframes looked at for each that one step may draw: most may not have moved
 
@@ -110,7 +103,7 @@ class GridUpdates:
             drawn += self._draw(self.grid, keyframe)
 
     def _is_scanless(self, agent: AgentId) -> bool:
-        """True if an agent's landmarks are to be drawn: it has one eye, or would have sent a scan by now."""
+        """True if an agent's landmarks are to be drawn: it has one camera, or would have sent a scan by now."""
         camera = self._map.cameras.get(agent)
         own = (len(keyframes) for submap, keyframes in self._map.submaps.items() if agent_of_submap(submap) == agent)
         return camera is None or not camera.stereo or sum(own) > self._config.scanless_keyframes

@@ -1,24 +1,18 @@
 """The grid for others than its own stage: coded tiles for pages and links, and files for map_server."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.grid.scan_grid import ScanGrid
 from kiteline_basestation.grid.scan_kernels import SIDE
 from kiteline_basestation.grid.tile_store import Place
 from kiteline_codec.schema import GridTile, messages
 from kiteline_codec.schema.base.grid_tile import FREE, UNKNOWN
-
-I8 = NDArray[np.int8]
-I64 = NDArray[np.int64]
-F64 = NDArray[np.float64]
+from kiteline_core.arrays import F64, I8, I64
 
 FREE_GREY, UNKNOWN_GREY, SOLID_GREY = 254, 205, 0  # as map_server writes them
 _BLOCK = 16  # tiles along a block; blocks without a neighbour lie apart

@@ -4,17 +4,11 @@ First the lowest peak of the height histogram below the cameras, propagated from
 a plane for each patch, fitted to the points near it in narrowing bands (a hard-limited M-estimator).
 """
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.config import GroundConfig
 from kiteline_basestation.grid import ground_kernels as kernels
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-Bool = NDArray[np.bool_]
+from kiteline_core.arrays import F32, F64, I64, Bool
 
 
 def ground_heights(config: GroundConfig, points: F64, camera_z: F64) -> F64:
@@ -132,7 +126,7 @@ def _box3(values: F64, axis: int) -> F64:
     return out
 
 
-def _lowest_peak(count: NDArray[np.float32], config: GroundConfig) -> int | None:
+def _lowest_peak(count: F32, config: GroundConfig) -> int | None:
     """The lowest bin that is a peak with enough points and a share of the highest count; None without a peak."""
     after = np.append(count[1:], 0.0)
     need = max(config.peak_share * float(count.max()), config.min_peak_points)

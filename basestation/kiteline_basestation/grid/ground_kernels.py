@@ -1,14 +1,9 @@
 """Kernel that propagates the height of the ground."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F32, I32
 from kiteline_core.jit import njit
-
-I32 = NDArray[np.int32]
-F32 = NDArray[np.float32]
 
 
 @njit

@@ -1,19 +1,17 @@
 """Scans of agents that send images: one job at a time for each agent, as each needs the ground that others saw."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.grid.scan_job import SCAN, ScanInputs, ScanResult
 from kiteline_basestation.jobs import Job, JobDone
 from kiteline_basestation.map.map_tables import LANDMARK
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_codec.schema import Key, KeyframeScan, ScanImages, WireError, messages
+from kiteline_core.arrays import F64, I64
 from kiteline_core.geometry import disparity_offset
 from kiteline_core.ground.brightness import Brightness
 from kiteline_core.ground.config import GroundConfig
@@ -27,9 +25,6 @@ from kiteline_core.ids import (
     agent_of_keyframe,
     submap_of_keyframe,
 )
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 _WAITING = 64  # images of an agent, 1.6 MB: the oldest are dropped
 _STRETCHES = 8  # of flights whose ground is followed: the oldest are forgotten

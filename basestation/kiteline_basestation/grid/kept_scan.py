@@ -1,21 +1,17 @@
 """Column scans as the base keeps them: small, and in whole numbers."""
 
-from __future__ import annotations
-
 import math
 import zlib
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.config import GridConfig
 from kiteline_codec.schema.base.grid_tile import MAX_STOREY
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import sim3
 from kiteline_core.ground.column_scan import ColumnScan, level_rotation
-
-F64 = NDArray[np.float64]
 
 _RANGE_STEPS = 256  # codes in 1 m: 4 mm
 _MOST = 65535

@@ -1,20 +1,14 @@
 """The placed part of the map in w: input of exports and of the status page."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.map.sparse_map import SparseMap
+from kiteline_core.arrays import F64, I32, I64, Bool
 from kiteline_core.geometry import sim3
 from kiteline_core.ids import KEYPOINT_BITS, SEQUENCE_BITS, SubmapId
-
-F64 = NDArray[np.float64]
-I32 = NDArray[np.int32]
-I64 = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +25,7 @@ class PlacedMap:
     landmark_ids: I64
     points: F64
     observations: I64
-    metric: NDArray[np.bool_]
+    metric: Bool
 
     @property
     def rays(self) -> I64:

@@ -15,8 +15,6 @@ Method: log-odds of A. Hornung et al., "OctoMap", 2013, equation 2, in the secto
 and the opening of the result after "Segfloor", equation 5.3 and section 5.6.
 """
 
-from __future__ import annotations
-
 import itertools
 from bisect import insort
 from collections import Counter
@@ -25,7 +23,6 @@ from math import floor
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.config import GridConfig
 from kiteline_basestation.grid import scan_kernels as kernels
@@ -33,11 +30,7 @@ from kiteline_basestation.grid.kept_scan import KeptScan, Lattice, position_cell
 from kiteline_basestation.grid.scan_kernels import ALL, BANDS, SIDE
 from kiteline_basestation.grid.sectors import Sectors, sectors_of
 from kiteline_basestation.grid.tile_store import Place, TileStore
-
-F64 = NDArray[np.float64]
-I8 = NDArray[np.int8]
-I32 = NDArray[np.int32]
-U16 = NDArray[np.uint16]
+from kiteline_core.arrays import F64, I8, I16, I32, U16
 
 Name = int | tuple[int, int]
 
@@ -159,7 +152,7 @@ class ScanGrid:
         main = self.main_storey()
         return sorted({s for storeys in self._storeys if main not in storeys for s in storeys if s != main})
 
-    def log_odds(self, place: Place) -> NDArray[np.int16]:
+    def log_odds(self, place: Place) -> I16:
         """Log-odds (BANDS, 64, 64) int16 of a tile."""
         slot = int(self._store.open_box(place.storey, place.row, place.column, 1, 1)[0, 0])
         if slot < 0:
@@ -189,7 +182,7 @@ class ScanGrid:
         self._store.close()
         return cells, int(known)
 
-    def redrawn(self, config: GridConfig) -> ScanGrid:
+    def redrawn(self, config: GridConfig) -> "ScanGrid":
         """The same scans where they lie now, all of them, drawn with other weights and thresholds."""
         grid = ScanGrid(config)
         for placed in self._placed.values():

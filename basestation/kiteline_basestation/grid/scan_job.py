@@ -1,22 +1,15 @@
 """Makes a column scan of images that an agent sent, as a job: what the agent would do with them on board."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
 from kiteline_basestation.jobs import JobKind
+from kiteline_core.arrays import F64, U8
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ground.brightness import Brightness
 from kiteline_core.ground.config import GroundConfig
 from kiteline_core.ground.disparity import DisparityStripes
 from kiteline_core.ground.image_codes import decode_pair
 from kiteline_core.ground.segmentation import ExpectedGround, GroundSegmenter, Segmented
-
-F64 = NDArray[np.float64]
-U8 = NDArray[np.uint8]
 
 _PIXEL_OPS = 110  # of matching, ground and labels, by pixel of a disparity image
 

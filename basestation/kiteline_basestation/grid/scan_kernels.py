@@ -6,20 +6,10 @@ plane 1 + b what band b has beyond it. All drawing is the sum of integers, so th
 leaves no trace.
 """
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64, I8, I16, I32, I64, U8, U16
 from kiteline_core.jit import helper, njit
-
-I8 = NDArray[np.int8]
-I16 = NDArray[np.int16]
-I32 = NDArray[np.int32]
-I64 = NDArray[np.int64]
-U8 = NDArray[np.uint8]
-U16 = NDArray[np.uint16]
-F64 = NDArray[np.float64]
 
 SIDE = 64  # cells along a side of a tile: the shape of a GridTile record
 BANDS = 3  # height bands

@@ -1,20 +1,13 @@
 """Sectors of free cells and obstacles around a camera, from the columns of a scan, in cells of w."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.config import GridConfig
 from kiteline_basestation.grid.kept_scan import KeptScan, Lattice, position_cells, scale_of
 from kiteline_basestation.grid.scan_kernels import BANDS, SIDE
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-U8 = NDArray[np.uint8]
-Bool = NDArray[np.bool_]
+from kiteline_core.arrays import F64, I64, U8, Bool
 
 _AT_BORDER = 0.1  # of a scan's columns, at least, in which ground is seen from the image's lower border on
 _HIDDEN = 1.25  # times that distance, from which on something hides the ground before

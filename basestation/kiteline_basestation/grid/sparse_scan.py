@@ -1,22 +1,16 @@
-"""A column scan from sparse landmarks, where an agent sends none: with one eye, or with the grid turned off.
+"""A column scan from sparse landmarks, where an agent sends none: with one camera, or with the grid turned off.
 
 Method: "Segfloor", section 5.6, points above the ground and rays to points of the ground, with the heights of the rays:
 a ray over a box clears neither the box nor the floor below.
 """
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.config import GridConfig
 from kiteline_basestation.grid.ground_height import ground_heights
+from kiteline_core.arrays import F64, U8, Bool
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ground.column_scan import ColumnScan, level_rotation
-
-F64 = NDArray[np.float64]
-U8 = NDArray[np.uint8]
-Bool = NDArray[np.bool_]
 
 UNLABELLED, GROUND, OBSTACLE = 0, 1, 2  # labels of landmarks
 

@@ -1,18 +1,13 @@
 """Tiles of log-odds by place, in memory as few as are drawn on at a time; the others are kept deflated."""
 
-from __future__ import annotations
-
 import zlib
 from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.grid.scan_kernels import PLANES, SIDE
-
-I16 = NDArray[np.int16]
-I32 = NDArray[np.int32]
+from kiteline_core.arrays import I16, I32
 
 _SHAPE = (PLANES, SIDE, SIDE)
 

@@ -1,13 +1,9 @@
 """Kernel for normal equations of a chain: a symmetric band, with a border of a few unknowns that all rows share."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64
 from kiteline_core.jit import njit
-
-F64 = NDArray[np.float64]
 
 
 @njit

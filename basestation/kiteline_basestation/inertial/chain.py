@@ -1,23 +1,18 @@
 """The agents' inertial steps along the keyframes of a map, and the path of the body that poses and steps give."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.inertial.ties import body_poses, moved
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_codec.schema import InertialSteps
+from kiteline_core.arrays import F64, I32, I64, Bool
 from kiteline_core.geometry import se3
 from kiteline_core.ids import KeyframeId, agent_of_keyframe, submap_of_keyframe
 from kiteline_core.optimisation.bundle import BundleProblem
-
-F64 = NDArray[np.float64]
-I32 = NDArray[np.int32]
 
 _MAX_STEPS = 8000  # of a map, the newest: twenty minutes
 _LEAST_M = 0.05  # distance between keyframes from which the path's length follows theirs
@@ -48,11 +43,11 @@ class Path:
     position. noise, depth_m: (n,) of each step's segment.
     """
 
-    begin: NDArray[np.int64]
+    begin: I64
     R_w_b: F64
     camera: F64
     lever: F64
-    fresh: NDArray[np.bool_]
+    fresh: Bool
     dt_s: F64
     velocity: F64
     position: F64
@@ -115,7 +110,7 @@ def path_along(segments: tuple[Segment, ...], T_w_c: F64) -> Path:
 
     Between them it has the shape that the agent saw, bent so that it ends where the keyframes are.
     """
-    begin, fresh = list[NDArray[np.int64]](), list[NDArray[np.bool_]]()
+    begin, fresh = list[I64](), list[Bool]()
     R, camera, lever = list[F64](), list[F64](), list[F64]()
     end = -1  # keyframe at which the path ends so far
     for s in segments:

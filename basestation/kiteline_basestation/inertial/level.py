@@ -1,18 +1,14 @@
 """Roll and pitch of maps whose agents know gravity: loop closures keep them, merges have to agree with them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.map.sparse_map import SparseMap
+from kiteline_core.arrays import F64, I64
 from kiteline_core.geometry import sim3
 from kiteline_core.ids import KeyframeId, SubmapId
-
-F64 = NDArray[np.float64]
 
 _MOST_BENT = 0.5  # length of the mean of unit vectors: below it they have no common direction
 
@@ -25,7 +21,7 @@ class Level:
     is bent against that.
     """
 
-    rows: NDArray[np.int64]
+    rows: I64
     up_w: F64
     sigma: F64
 

@@ -7,20 +7,16 @@ accelerates, and taken as exact they would make the scale too small. Nor is it o
 (`scale_drift`).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.config import InertialScaleConfig
 from kiteline_basestation.inertial import band_kernels
 from kiteline_basestation.inertial.chain import Path, Segment, path_along, told_units
 from kiteline_basestation.inertial.scale_drift import ScaleDrift, bent, drift_along, shared_landmarks
+from kiteline_core.arrays import F64
 from kiteline_core.optimisation.bundle import BundleProblem, BundleResult
-
-F64 = NDArray[np.float64]
 
 _NODE = 9  # unknowns of a node: position, velocity, accelerometer bias
 _SHARED = 2  # of the map: direction of gravity; and units of w in a metre at the knots of its drift

@@ -6,20 +6,15 @@ turns over a shallow scene. The scale is piecewise linear along the path, in vie
 where the path comes back to landmarks, the two passes have nearly the same scale.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.config import InertialScaleConfig
 from kiteline_basestation.inertial.chain import Path, Segment
+from kiteline_core.arrays import F64, I64, Bool
 from kiteline_core.geometry import se3
 from kiteline_core.optimisation.bundle import BundleProblem, BundleResult
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 _TURN_RAD = 1.0  # rad by which the view has changed: what a usual lens sees
 _CHAIN_VIEWS = 2.0  # from the end of a chain to the begin of the next one, wherever that is
@@ -52,7 +47,7 @@ class ScaleDrift:
         return float(np.max(np.abs(np.diff(values)) / self.sigma, initial=0.0))
 
 
-def shared_landmarks(problem: BundleProblem, inlier: NDArray[np.bool_]) -> F64:
+def shared_landmarks(problem: BundleProblem, inlier: Bool) -> F64:
     """Number (k,k) of points that two cameras of a bundle observe; 0 on the diagonal."""
     k = len(problem.T_c_m)
     point = np.repeat(np.arange(len(problem.points)), np.diff(problem.starts))[inlier]

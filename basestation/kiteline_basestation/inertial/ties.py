@@ -4,21 +4,17 @@ A monocular agent begins such a submap to correct its scale. The steps from the 
 first one of the new submap give the relative pose, the agent's record the scale; images need not recognise anything.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.inertial.units import units_of
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_codec.schema import InertialSteps
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import SubmapId, agent_of_keyframe, submap_of_keyframe
-
-F64 = NDArray[np.float64]
 
 _RUN = 20  # keyframes before a tie whose steps tell how long the agent's unit is there
 

@@ -1,15 +1,10 @@
 """The length in w of the unit in which a monocular agent measured its motion, along the keyframes of a map."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.map.sparse_map import SparseMap
+from kiteline_core.arrays import F64, I32
 from kiteline_core.ids import KeyframeId, submap_of_keyframe
-
-F64 = NDArray[np.float64]
-I32 = NDArray[np.int32]
 
 _MIN_RUN = 5  # steps that tell a length
 _MOST_GROWTH = 1.1  # by which lengths along a map differ from those of its unit

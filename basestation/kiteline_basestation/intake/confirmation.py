@@ -1,7 +1,5 @@
 """Whether what an agent sent of a keyframe agrees with older keyframes: who makes things up cannot fill the memory."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from kiteline_basestation.map.sparse_map import SparseMap

@@ -1,7 +1,5 @@
 """Puts the agents' records into the map, in any order of arrival, and names keyframes that are ready to be used."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from itertools import compress

@@ -5,22 +5,18 @@ may have another unit of length than w. w keeps the unit in which it began until
 first submap, or an agent reports how long that unit is.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.exchange.publisher import Publisher
 from kiteline_basestation.intake.intake import Intake
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_codec.schema import SubmapPlacement
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import KeyframeId, SubmapId, agent_of_submap, submap_of_keyframe
-
-F64 = NDArray[np.float64]
 
 _ODOMETRY_GAP_S = 1.5  # s; a submap that begins within this time of the last one is placed by odometry
 _TIE_M = 0.2  # m; deviation of the motion over a loss up to which it places a submap: half a metre at worst

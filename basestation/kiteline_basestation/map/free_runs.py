@@ -1,7 +1,5 @@
 """Rows and slots that were freed, for the next ones that are needed."""
 
-from __future__ import annotations
-
 from bisect import bisect_left, insort
 from collections.abc import Iterable
 

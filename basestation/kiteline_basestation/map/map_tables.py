@@ -1,19 +1,11 @@
 """Tables of the sparse map: one row per keyframe, one row per keypoint, with spare capacity."""
 
-from __future__ import annotations
-
 from array import array
 from dataclasses import dataclass, fields
 
 import numpy as np
-from numpy.typing import NDArray
 
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-U8 = NDArray[np.uint8]
-I32 = NDArray[np.int32]
-I64 = NDArray[np.int64]
-Bool = NDArray[np.bool_]
+from kiteline_core.arrays import F32, F64, I32, I64, U8
 
 EMPTY, LANDMARK, OBSERVATION = 0, 1, 2  # keypoint: not received yet, first observation of a new landmark, observation
 REMOVED, CULLED, REFINED = 1, 2, 4  # flag bits: observation rejected, landmark culled, landmark refined by the base

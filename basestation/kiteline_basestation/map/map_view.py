@@ -1,13 +1,10 @@
 """Queries of the sparse map; `sparse_map` holds what changes it."""
 
-from __future__ import annotations
-
 from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
 from dataclasses import fields
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.map import sparse_map_kernels as kernels
 from kiteline_basestation.map.free_runs import FreeRuns
@@ -22,6 +19,7 @@ from kiteline_basestation.map.map_tables import (
     empty_keypoints,
 )
 from kiteline_codec.schema import InertialSteps
+from kiteline_core.arrays import F32, F64, I32, I64, Bool
 from kiteline_core.geometry import disparity_offset
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import (
@@ -33,12 +31,6 @@ from kiteline_core.ids import (
     agent_of_submap,
     submap_of_keyframe,
 )
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-I32 = NDArray[np.int32]
-I64 = NDArray[np.int64]
-Bool = NDArray[np.bool_]
 
 
 class Rows:

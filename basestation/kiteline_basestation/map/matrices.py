@@ -1,15 +1,11 @@
 """Poses (4,4) as 16 numbers in JSON, row by row, to the last bit."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import sim3
-
-F64 = NDArray[np.float64]
 
 _MOST = 1e9  # of a number in a matrix
 _TOLERANCE = 1e-6  # of a rotation matrix

@@ -1,17 +1,13 @@
 """Calibrations and disparity offsets of the agents' cameras."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.map.map_view import MapView
 from kiteline_codec.schema import StereoAlignment
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import disparity_offset
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import AgentId, agent_of_keyframe
-
-F64 = NDArray[np.float64]
 
 _REPAIRED_PX = 0.5  # difference of a number of a disparity offset; flights of one rig differ by a tenth
 

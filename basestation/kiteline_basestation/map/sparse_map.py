@@ -5,13 +5,10 @@ with that keyframe. Each keypoint has one slot (row of `keypoints`), and a landm
 landmark that a keypoint observes; for a fused landmark, the root landmark. Records may come in any order, repeatedly.
 """
 
-from __future__ import annotations
-
 from bisect import bisect_right
 from collections.abc import Collection, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.map import sparse_map_kernels as kernels
 from kiteline_basestation.map.map_tables import (
@@ -29,6 +26,7 @@ from kiteline_basestation.map.map_tables import (
 from kiteline_basestation.map.map_view import Rows
 from kiteline_basestation.map.rig_values import RigValues, parameters
 from kiteline_basestation.map.world_poses import in_submap, place_in_world
+from kiteline_core.arrays import F32, F64, I32, I64, U8, U16, Bool
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import (
     KEYPOINT_BITS,
@@ -41,13 +39,6 @@ from kiteline_core.ids import (
     agent_of_keyframe,
     submap_of_keyframe,
 )
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-U8 = NDArray[np.uint8]
-I32 = NDArray[np.int32]
-I64 = NDArray[np.int64]
-Bool = NDArray[np.bool_]
 
 _MOST_WAITED_FOR = 100_000  # keyframes that observations name and that were not received: only a faulty agent has more
 
@@ -121,7 +112,7 @@ class SparseMap(RigValues):
             self.measured_with_px[keyframe] = offset
 
     def put_new_landmarks(
-        self, keyframe: KeyframeId, part: int, index: NDArray[np.uint16], uv: F32, inv_depth: F32, octave: U8,
+        self, keyframe: KeyframeId, part: int, index: U16, uv: F32, inv_depth: F32, octave: U8,
         angle: U8, descriptor: U8,
     ) -> None:  # fmt: skip
         """Set the new landmarks of a known keyframe (see codec NewLandmarks); a part replaces its older version."""
@@ -140,7 +131,7 @@ class SparseMap(RigValues):
         self._refresh_usable(self.rows[keyframe])
 
     def put_observations(
-        self, keyframe: KeyframeId, part: int, index: NDArray[np.uint16], uv: F32, inv_depth: F32, octave: U8,
+        self, keyframe: KeyframeId, part: int, index: U16, uv: F32, inv_depth: F32, octave: U8,
         landmark: I64,
     ) -> None:  # fmt: skip
         """Set the observations of a known keyframe (see codec Observations); a part replaces its older version."""
@@ -298,9 +289,7 @@ class SparseMap(RigValues):
         table.landmark[new] = NO_LANDMARK
         return start
 
-    def _slots_of_record(
-        self, keyframe: KeyframeId, part: int, index: NDArray[np.uint16], kind: int
-    ) -> tuple[I32, Bool]:
+    def _slots_of_record(self, keyframe: KeyframeId, part: int, index: U16, kind: int) -> tuple[I32, Bool]:
         """Slots for the rows of a record, and which rows fit the header. Clears rows of the record's older version."""
         row = self.rows[keyframe]
         keep = index < self.keyframes.count[row]

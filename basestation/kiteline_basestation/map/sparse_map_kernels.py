@@ -4,8 +4,6 @@ Each keypoint has one slot. `root[s]`: slot of the landmark that keypoint s obse
 observation of landmark p. `next_[s]`: observation after s in the list, -1 at its end.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from kiteline_core.jit import njit

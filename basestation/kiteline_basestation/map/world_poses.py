@@ -1,15 +1,10 @@
 """Poses of many keyframes at once: a pose graph moves all of a map within one step."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.map.map_tables import KeyframeTable
+from kiteline_core.arrays import F64, I32
 from kiteline_core.geometry import se3, sim3
-
-F64 = NDArray[np.float64]
-I32 = NDArray[np.int32]
 
 
 def place_in_world(table: KeyframeTable, rows: I32, S_w_m: F64 | None, scale: float) -> None:

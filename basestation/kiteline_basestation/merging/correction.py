@@ -1,13 +1,10 @@
 """Corrections of whole maps: pose graphs and full bundle windows, and how keyframes take on their results."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import compress
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.config import BaseConfig, GraphConfig, PublishConfig
 from kiteline_basestation.exchange.publisher import Publisher
@@ -19,11 +16,9 @@ from kiteline_basestation.merging.loop_edges import LoopEdge, depth_of, graph_ed
 from kiteline_basestation.refinement.bundle_window import BundleWindow, bundle_window
 from kiteline_basestation.refinement.full_bundle_schedule import Part
 from kiteline_codec.schema import KeyframePose, RefinedLandmarks
+from kiteline_core.arrays import F64, I32, Bool
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import KeyframeId, SubmapId, submap_of_keyframe
-
-F64 = NDArray[np.float64]
-I32 = NDArray[np.int32]
 
 _SAME = 1e-4  # relative change of depths that is not sent: a fifth of the code of an inverse depth
 _MIN_SHARED = 100  # landmarks of two covisible keyframes joined by an edge
@@ -138,7 +133,7 @@ def move_keyframes(
     return has_moved
 
 
-def _differ(a: F64, b: F64, publish: PublishConfig) -> NDArray[np.bool_]:
+def _differ(a: F64, b: F64, publish: PublishConfig) -> Bool:
     """Whether poses (n,4,4) differ by as much as is sent."""
     change = np.linalg.inv(a) @ b
     moved = np.linalg.norm(change[:, :3, 3], axis=1)

@@ -1,7 +1,5 @@
 """Which maps are due for a pose graph or a full bundle, and which of these jobs are pending."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 

@@ -12,18 +12,15 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.config import GraphConfig
 from kiteline_basestation.inertial.level import Level
+from kiteline_core.arrays import F64, I64, Bool
 from kiteline_core.geometry import se3
 
 if TYPE_CHECKING:
     import gtsam
 
-Bools = NDArray[np.bool_]
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 _ITERATIONS = 8  # of Gauss-Newton
 _SCALE_ITERATIONS = 30  # of Levenberg-Marquardt, with scales: these graphs bend farther
@@ -41,11 +38,11 @@ class GraphInputs:
 
     keyframes: I64
     T_w_k: F64
-    held: Bools
+    held: Bool
     edges: I64
     T_a_b: F64
     sigma: F64
-    loop: Bools
+    loop: Bool
     config: GraphConfig
     scaled: Scaled | None = None
     level: Level | None = None
@@ -58,7 +55,7 @@ class Scaled:
     scale: (m,) of each edge, the scale at a over that at b. sigma: (m,) of its logarithm.
     """
 
-    free: Bools
+    free: Bool
     scale: F64
     sigma: F64
 

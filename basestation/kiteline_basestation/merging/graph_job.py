@@ -1,7 +1,5 @@
 """The job that optimises the essential graph of a map."""
 
-from __future__ import annotations
-
 from kiteline_basestation.jobs import JobKind
 from kiteline_basestation.merging.essential_graph import GraphInputs, GraphResult, optimise
 

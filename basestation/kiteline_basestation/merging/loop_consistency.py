@@ -1,20 +1,16 @@
 """Checks that distinguish loop closures from places that only look alike."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.config import LoopConfig
 from kiteline_basestation.inertial.level import tilt_between
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.merging.loop_edges import LoopEdge, LoopMatch, correction_of, depth_of, similarity
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import KeyframeId, submap_of_keyframe
-
-F64 = NDArray[np.float64]
 
 _PLANE_ROUNDS = 4  # plane fits, each to the points near the last one
 _DRIFT_RAD = 0.1  # rad; correction of a loop that drift explains

@@ -4,14 +4,11 @@ Each new keyframe queries the place index, and candidates are verified geometric
 accepted when enough keyframes agree on one correction and few or none contradict it (`loop_consistency`).
 """
 
-from __future__ import annotations
-
 from bisect import insort
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.config import LoopConfig
 from kiteline_basestation.exchange.sharing import SharingPolicy
@@ -24,11 +21,11 @@ from kiteline_basestation.merging.loop_verification import (
     observations_of,
     verify_loop,
 )
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import AgentId, KeyframeId, SubmapId, agent_of_keyframe, submap_of_keyframe
 from kiteline_core.places.place_index import PlaceIndex, Vocabulary
 
-F64 = NDArray[np.float64]
 SubmapPair = tuple[SubmapId, SubmapId]  # the smaller id first
 _Frame = tuple[AgentId, int]  # an agent, and a time stamp
 

@@ -1,21 +1,15 @@
 """Verified matches of two keyframes, and the edges of the pose graph that they become."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.map.sparse_map import SparseMap
+from kiteline_core.arrays import F64, I32, I64
 from kiteline_core.geometry import sim3
 from kiteline_core.ids import KeyframeId
-
-F64 = NDArray[np.float64]
-I32 = NDArray[np.int32]
-I64 = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -6,12 +6,9 @@ pose by RANSAC and guided matching follow (ORB-SLAM2, section III-E). The matche
 image and make up most of those expected in view.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.config import LoopConfig
 from kiteline_basestation.map.map_tables import LANDMARK
@@ -19,18 +16,13 @@ from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.merging.loop_edges import LoopMatch, correction_of
 from kiteline_basestation.merging.similarity import align_views
 from kiteline_basestation.refinement.landmark_matching import predict_projections
+from kiteline_core.arrays import F64, I32, U8, Bool
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import KeyframeId, agent_of_keyframe, submap_of_keyframe
 from kiteline_core.imaging import matching
 from kiteline_core.imaging.descriptors import comparable
 from kiteline_core.pose import pnp
 from kiteline_core.pose.pose_kernels import optimise_pose
-
-Bools = NDArray[np.bool_]
-F64 = NDArray[np.float64]
-I32 = NDArray[np.int32]
-U8 = NDArray[np.uint8]
-
 
 _UNIT_RATIO = 1.15  # of depths in two maps: monocular scale drift stays below it
 _NEAREST_M = 0.1  # of a landmark before a camera
@@ -59,7 +51,7 @@ class KeyframeObservations:
     angle: U8
     descriptor: U8
     xyz: F64
-    known: Bools
+    known: Bool
 
 
 def observations_of(sparse_map: SparseMap, keyframe: KeyframeId) -> KeyframeObservations:

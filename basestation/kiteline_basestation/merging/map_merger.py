@@ -5,13 +5,10 @@ bundle (job). A newer closure in a map cancels its pending jobs. A merge that th
 undone. Every method that moves maps returns what the mapper has to apply.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.exchange.publisher import Publisher
@@ -37,12 +34,11 @@ from kiteline_basestation.refinement import landmark_matching
 from kiteline_basestation.refinement.apply_bundle import apply_bundle, keep_scales
 from kiteline_basestation.refinement.odometry_factors import without_odometry_factors
 from kiteline_codec.schema import FusedLandmarks
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import sim3
 from kiteline_core.ids import SEQUENCE_BITS, KeyframeId, SubmapId, submap_of_keyframe
 from kiteline_core.optimisation.bundle import BundleResult
 from kiteline_core.places.place_index import Vocabulary
-
-F64 = NDArray[np.float64]
 
 _LOOP_GAP = 30  # keyframes; landmarks observed again after so many count as a loop
 _REQUERIES = 2  # keyframes of merged maps that are matched to the other map in one step

@@ -1,21 +1,16 @@
 """Merges of maps, and what a step of the map merger changed."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.refinement.bundle_window import BundleWindow
+from kiteline_core.arrays import F64, I64
 from kiteline_core.ids import SEQUENCE_BITS, KeyframeId, SubmapId
 from kiteline_core.optimisation.bundle import BundleResult
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 _MIN_KEPT = 0.5  # share of inliers among observations that a merge fused: below it the merge is undone
 
@@ -70,7 +65,7 @@ class MergeResult:
     requeried: tuple[KeyframeId, ...] = ()
     bent: frozenset[int] = frozenset()
 
-    def __add__(self, later: MergeResult) -> MergeResult:
+    def __add__(self, later: "MergeResult") -> "MergeResult":
         factors = {submap: self.rescaled.get(submap, 1.0) * factor for submap, factor in later.rescaled.items()}
         return MergeResult(
             self.moved | later.moved, {**self.rescaled, **factors}, {**self.scale_sigma, **later.scale_sigma},

@@ -1,17 +1,12 @@
 """Similarity transform between two sets of points, or between two cameras that observe the same points."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.merging import similarity_kernels
+from kiteline_core.arrays import F64, U8, Bool
 from kiteline_core.pose.pnp import RansacConfig, generator_state
-
-Bools = NDArray[np.bool_]
-F64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,7 +15,7 @@ class SimilarityFit:
 
     S_a_b: F64
     scale: float
-    inlier: Bools
+    inlier: Bool
     inliers: int
 
 
@@ -33,8 +28,8 @@ def align_points(a: F64, b: F64, with_scale: bool = False) -> F64 | None:
 
 
 def align_views(
-    a: F64, uv_a: F64, octave_a: NDArray[np.uint8], camera_a: F64,
-    b: F64, uv_b: F64, octave_b: NDArray[np.uint8], camera_b: F64,
+    a: F64, uv_a: F64, octave_a: U8, camera_a: F64,
+    b: F64, uv_b: F64, octave_b: U8, camera_b: F64,
     *, with_scale: bool, seed: int, config: RansacConfig | None = None,
 ) -> SimilarityFit | None:  # fmt: skip
     """Similarity between two cameras from common points: three-point RANSAC, with inliers counted in both images.

@@ -1,20 +1,14 @@
 """Kernels of point-set alignment, with or without scale, in a RANSAC seeded by the caller."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64, U64, Bool
 from kiteline_core.jit import njit
 from kiteline_core.pose.ransac_kernels import draws_needed, reprojection_cost, three
 
-Bools = NDArray[np.bool_]
-F64 = NDArray[np.float64]
-U64 = NDArray[np.uint64]
-
 
 @njit
-def align_points(a: F64, b: F64, chosen: Bools, with_scale: bool, S_a_b: F64) -> bool:
+def align_points(a: F64, b: F64, chosen: Bool, with_scale: bool, S_a_b: F64) -> bool:
     """Least-squares similarity a = S_a_b b over the chosen rows (B. Horn, 1987; scale symmetric in a and b).
 
     a, b: (n,3). S_a_b: (4,4) out, its upper left part scale times rotation. False if degenerate.
@@ -129,7 +123,7 @@ def _invert(S: F64, out: F64) -> None:
 
 
 @njit
-def _store(S: F64, marked: Bools, S_a_b: F64, inlier: Bools) -> None:
+def _store(S: F64, marked: Bool, S_a_b: F64, inlier: Bool) -> None:
     """Copy a similarity and its inliers to the outputs."""
     for i in range(4):
         for j in range(4):
@@ -141,7 +135,7 @@ def _store(S: F64, marked: Bools, S_a_b: F64, inlier: Bools) -> None:
 @njit
 def align_ransac(
     a: F64, uv_a: F64, limit_a_px: F64, camera_a: F64, b: F64, uv_b: F64, limit_b_px: F64, camera_b: F64,
-    with_scale: bool, most_draws: int, confidence: float, state: U64, S_a_b: F64, inlier: Bools,
+    with_scale: bool, most_draws: int, confidence: float, state: U64, S_a_b: F64, inlier: Bool,
 ) -> int:  # fmt: skip
     """The similarity between the points of two views with the most inliers in both images.
 
@@ -187,7 +181,7 @@ def align_ransac(
 @njit
 def _mark_pairs(
     S: F64, back: F64, a: F64, uv_a: F64, limit_a: F64, camera_a: F64, b: F64, uv_b: F64, limit_b: F64, camera_b: F64,
-    inlier: Bools,
+    inlier: Bool,
 ) -> int:  # fmt: skip
     count = 0
     for i in range(a.shape[0]):

@@ -1,11 +1,8 @@
 """Applies the result of a bundle to the map: poses, landmark positions, rejected observations."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.config import PublishConfig
 from kiteline_basestation.exchange.publisher import Publisher
@@ -13,12 +10,10 @@ from kiteline_basestation.map.map_tables import CULLED, LANDMARK, REFINED_POSE, 
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.refinement.bundle_window import BundleWindow
 from kiteline_codec.schema import CulledLandmarks, KeyframePose, RefinedLandmarks, RemovedObservations
+from kiteline_core.arrays import F64, I32, Bool
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import KeyframeId, SubmapId
 from kiteline_core.optimisation.bundle import BundleResult
-
-F64 = NDArray[np.float64]
-I32 = NDArray[np.int32]
 
 _ENDS = 8  # keyframes at the begin or the end of a submap where the change of scale is measured
 _MIN_LANDMARKS = 20  # landmarks for that
@@ -75,9 +70,7 @@ def _move_culled(sparse_map: SparseMap, window: BundleWindow, before: F64, publi
             publisher.mark_changed(KeyframePose.KIND, keyframe)
 
 
-def _observations(
-    sparse_map: SparseMap, window: BundleWindow, result: BundleResult, publisher: Publisher
-) -> NDArray[np.bool_]:
+def _observations(sparse_map: SparseMap, window: BundleWindow, result: BundleResult, publisher: Publisher) -> Bool:
     """Remove outliers, and cull landmarks with too few observations left. Returns which of the window (n,)."""
     table = sparse_map.keypoints
     starts = window.problem.starts
@@ -94,7 +87,7 @@ def _observations(
 
 
 def _points(
-    sparse_map: SparseMap, window: BundleWindow, result: BundleResult, dropped: NDArray[np.bool_], publisher: Publisher,
+    sparse_map: SparseMap, window: BundleWindow, result: BundleResult, dropped: Bool, publisher: Publisher,
     publish: PublishConfig,
 ) -> None:  # fmt: skip
     table = sparse_map.keypoints

@@ -1,7 +1,5 @@
 """The two kinds of bundle adjustment jobs: of a local window, and of a whole map."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 
 from kiteline_basestation.config import InertialScaleConfig

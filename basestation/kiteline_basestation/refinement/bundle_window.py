@@ -1,23 +1,17 @@
 """The part of the map that a bundle adjusts, as a bundle problem."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.config import BundleWindowConfig, MeasurementConfig
 from kiteline_basestation.map.map_tables import LANDMARK, NO_POSE
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.refinement.disparity_calibration import offsets
+from kiteline_core.arrays import F64, I32
 from kiteline_core.ids import BOOT_BITS, SEQUENCE_BITS, SUBMAP_BITS, AgentId, KeyframeId, submap_of_keyframe
 from kiteline_core.optimisation.bundle import BundleProblem
-
-F64 = NDArray[np.float64]
-I32 = NDArray[np.int32]
-Bool = NDArray[np.bool_]
 
 _SIGMA_GROWTH = 1.4  # factor per octave; less than 2, as alignment is finer than the octave's pixels
 _SIGMA_CALIBRATED_PX = 0.2  # px at octave 0; of a disparity once the agent's disparity offset is known

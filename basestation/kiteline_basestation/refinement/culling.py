@@ -1,7 +1,5 @@
 """Culls landmarks that too few later keyframes observe, and redundant keyframes (ORB-SLAM2)."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from kiteline_basestation.exchange.publisher import Publisher

@@ -4,22 +4,16 @@ Motion gives depths up to scale. With a disparity offset, stereo depths of near 
 parts of the image, cannot agree with them at one scale; so the offset (`disparity_offset`) is observable.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.config import DisparityConfig
 from kiteline_basestation.map.sparse_map import SparseMap
+from kiteline_core.arrays import F64, I32, I64
 from kiteline_core.geometry.disparity_offset import TERMS, none, terms
 from kiteline_core.ids import BOOT_BITS, SEQUENCE_BITS, SUBMAP_BITS, AgentId
 from kiteline_core.optimisation.bundle import Border, BundleProblem, BundleResult
-
-F64 = NDArray[np.float64]
-I32 = NDArray[np.int32]
-I64 = NDArray[np.int64]
 
 _PRIOR_PX = 0.1  # px; standard deviation of a constant offset: the accuracy of calibrations
 _PRIOR_RAD = 3e-4  # rad; of the right camera's rotation (times the focal length: px where x or y is 1)

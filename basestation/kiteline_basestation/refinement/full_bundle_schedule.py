@@ -5,8 +5,6 @@ Local bundles see a window only, and disparity offsets are observable in whole m
 quiet base includes all keyframes, so that the map does not depend on when it is read.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping
 
 from kiteline_basestation.config import GraphConfig

@@ -4,10 +4,7 @@ Known landmarks are projected into a new keyframe, and its new landmarks into ol
 stereo PTAM", sections 2.4.4 and 3.1.2). The older landmark of a match becomes the root.
 """
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.config import LandmarkMatchingConfig
 from kiteline_basestation.exchange.publisher import Publisher
@@ -15,12 +12,9 @@ from kiteline_basestation.map.map_tables import CULLED, LANDMARK, NO_POSE, REFIN
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.refinement import landmark_matching_kernels as kernels
 from kiteline_codec.schema import FusedLandmarks, RefinedLandmarks
+from kiteline_core.arrays import F64, I32, U8, U64
 from kiteline_core.ids import KeyframeId, agent_of_keyframe, submap_of_keyframe
 from kiteline_core.imaging.descriptors import comparable
-
-F64 = NDArray[np.float64]
-I32 = NDArray[np.int32]
-U64 = NDArray[np.uint64]
 
 _MAX_COVISIBLE = 12  # covisible keyframes searched
 _MAX_NEARBY = 8  # other keyframes searched that view the same place: revisits
@@ -113,7 +107,7 @@ def _match_projected(
 
 def predict_projections(
     sparse_map: SparseMap, points: I32, target: KeyframeId, T_w_k: F64 | None = None
-) -> tuple[I32, F64, F64, NDArray[np.uint8], F64]:  # fmt: skip
+) -> tuple[I32, F64, F64, U8, F64]:  # fmt: skip
     """Predict pixel, octave, angle and disparity of landmarks (n,) in a keyframe; returns those inside its image.
 
     T_w_k: (4,4) pose to assume for the keyframe; None: its pose in the map.

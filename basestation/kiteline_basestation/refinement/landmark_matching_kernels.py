@@ -1,17 +1,10 @@
 """Kernels that match descriptors: of projected landmarks in a circle, of keypoints along epipolar lines."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64, I32, U8, U64
 from kiteline_core.imaging.matching_kernels import hamming, take
 from kiteline_core.jit import njit
-
-F64 = NDArray[np.float64]
-I32 = NDArray[np.int32]
-U8 = NDArray[np.uint8]
-U64 = NDArray[np.uint64]
 
 
 @njit

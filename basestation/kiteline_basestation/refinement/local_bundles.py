@@ -1,7 +1,5 @@
 """Local bundle adjustments: around which keyframe the next one is, and what becomes of its result."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator, Mapping
 
 import numpy as np

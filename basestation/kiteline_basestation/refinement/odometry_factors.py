@@ -12,25 +12,21 @@ its IMU, or, where the map's own accelerations have corrected lengths, those tha
 tie the first keyframe of a submap to the last one of the submap before.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.config import OdometryFactorConfig
 from kiteline_basestation.inertial.ties import moved_camera
 from kiteline_basestation.inertial.units import units_of
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.refinement.bundle_window import BundleWindow
+from kiteline_core.arrays import F64, I32
 from kiteline_core.geometry import disparity_offset, se3, sim3
 from kiteline_core.ids import AgentId, KeyframeId, agent_of_keyframe, submap_of_keyframe
 from kiteline_core.optimisation.bundle import BundleProblem, BundleResult
-
-F64 = NDArray[np.float64]
 
 _GRID = np.stack(np.meshgrid((-0.6, 0.0, 0.6), (-0.4, 0.4)), -1).reshape(-1, 2)  # x/z, y/z: as wide as a usual lens
 _PX_OF_ROTATION = 1.7  # factor from a rotation's error to the standard deviation of 6 far points, each observed twice
@@ -99,7 +95,7 @@ def with_odometry_factors(sparse_map: SparseMap, window: BundleWindow, config: O
 
 
 def _steps(
-    sparse_map: SparseMap, window: BundleWindow, config: OdometryFactorConfig, of_camera: NDArray[np.int32]
+    sparse_map: SparseMap, window: BundleWindow, config: OdometryFactorConfig, of_camera: I32
 ) -> Iterator[_Step]:
     """The steps between keyframes of a window. of_camera: see `_groups`."""
     problem, table = window.problem, sparse_map.keyframes
@@ -153,7 +149,7 @@ def _following_offset(lens: F64, step: _Step, change_px: F64) -> _Step:
     return step._replace(in_k=in_k, in_p=in_p, terms=terms[seen], world=step.world[seen])
 
 
-def _groups(problem: BundleProblem) -> NDArray[np.int32]:
+def _groups(problem: BundleProblem) -> I32:
     """Group (k,) of each camera in the problem's border; none where its disparities are taken as corrected."""
     out = np.full(len(problem.T_c_m), _NO_GROUP, np.int32)
     if problem.border is not None:

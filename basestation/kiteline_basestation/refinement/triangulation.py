@@ -4,10 +4,7 @@ Source: "Monocular EKF-SLAM with delayed landmark initialisation" (the point nea
 reprojection tests of ORB-SLAM2.
 """
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.config import TriangulationConfig
 from kiteline_basestation.exchange.publisher import Publisher
@@ -16,23 +13,17 @@ from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.refinement import landmark_matching_kernels as kernels
 from kiteline_basestation.refinement.landmark_matching import descriptors, fuse_landmarks
 from kiteline_codec.schema import RefinedLandmarks
+from kiteline_core.arrays import F64, I32, Bool
 from kiteline_core.geometry.se3 import skew
 from kiteline_core.geometry.triangulation import nearest_point, parallax, project, rays
 from kiteline_core.ids import KeyframeId
-
-F64 = NDArray[np.float64]
-I32 = NDArray[np.int32]
-Bool = NDArray[np.bool_]
 
 _MAX_COVISIBLE = 6  # covisible keyframes searched
 _MIN_BASELINE_RATIO = 0.01  # baseline over median depth: below it two keyframes have one viewpoint
 
 
 def triangulate_landmarks(
-    sparse_map: SparseMap,
-    keyframe: KeyframeId,
-    config: TriangulationConfig,
-    publisher: Publisher,
+    sparse_map: SparseMap, keyframe: KeyframeId, config: TriangulationConfig, publisher: Publisher
 ) -> int:
     """Triangulate landmarks of a new keyframe that have no depth. Returns the number triangulated."""
     return _from_observations(sparse_map, keyframe, config, publisher) + _from_epipolar_matches(

@@ -1,7 +1,5 @@
 """The base in flight: the station with its store, its log and a modelled link to each agent."""
 
-from __future__ import annotations
-
 import importlib.util
 import time
 from collections import deque

@@ -4,8 +4,6 @@ Each step begins with a /step record. Only the fingerprint of a job's result is 
 passes the result at the same step.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence

@@ -1,15 +1,11 @@
 """Numbers of a base's flight for report.json: counts, keyframe poses, CPU times. Pure."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
 from kiteline_basestation.job_kinds import KINDS
 from kiteline_basestation.mapper import Mapper
+from kiteline_core.arrays import F64
 from kiteline_core.ids import KeyframeId
 
 _COUNTS = (
@@ -32,9 +28,9 @@ def flight_summary(mapper: Mapper) -> FlightSummary:
     return FlightSummary(counts(mapper), {str(k): pose.ravel().tolist() for k, pose in poses.items()})
 
 
-def keyframe_poses(mapper: Mapper) -> dict[KeyframeId, NDArray[np.float64]]:
+def keyframe_poses(mapper: Mapper) -> dict[KeyframeId, F64]:
     """S_w_k (4,4) of every keyframe of a placed submap that has a pose: T_w_k, with the scale of its submap in w."""
-    poses: dict[KeyframeId, NDArray[np.float64]] = {}
+    poses: dict[KeyframeId, F64] = {}
     for submap, S_w_m in sorted(mapper.placements.items()):
         for keyframe in mapper.map.submaps.get(submap, []):
             pose = mapper.map.pose(keyframe)

@@ -1,7 +1,5 @@
 """Reads maps and logs that are imported: a store, a base's log, or the log of an agent."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

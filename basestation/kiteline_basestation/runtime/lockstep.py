@@ -1,7 +1,5 @@
 """A lock-step flight as a child process: the base steps when all agents have sent their messages."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal

@@ -1,7 +1,5 @@
 """The map's files, as bytes by file name. Pure."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from kiteline_basestation.grid.grid_view import grid_files
@@ -15,7 +13,4 @@ def map_files(mapper: Mapper) -> dict[str, bytes]:
     placed = placed_map(mapper.map, mapper.placements)
     labels = mapper.labels(mapper.map.find_landmarks(placed.landmark_ids))
     views = np.bincount(placed.observations[:, 1], minlength=len(placed.points)).astype(np.int64)
-    return {
-        "map.ply": map_ply(placed.points, labels, views),
-        **grid_files(mapper.settled_grid()),
-    }
+    return {"map.ply": map_ply(placed.points, labels, views), **grid_files(mapper.settled_grid())}

@@ -5,17 +5,11 @@ tum(t_ns, T_w_b) -> base/agentN.tum
 g2o(keyframes, T_w_k, edges) -> the keyframe graph
 """
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64, I64, U8
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.tum import line
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-U8 = NDArray[np.uint8]
 
 LABEL_COLOURS: U8 = np.array([[150, 150, 150], [88, 160, 96], [214, 96, 60]], np.uint8)  # unlabelled, ground, obstacle
 

@@ -1,7 +1,5 @@
 """Options of the base process, from the command line or from `fly`; its configuration and channels."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Questions of other programs to a base: who may ask what, and on which endpoint."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import secrets

@@ -1,7 +1,5 @@
 """The base's side of seals: the hub through which packets pass, keys that change while it runs, and what is wrong."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from kiteline_basestation.runtime.options import BaseOptions

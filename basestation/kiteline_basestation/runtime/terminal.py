@@ -1,7 +1,5 @@
 """Status messages of a base for the terminal: events, and a summary every few seconds while something changes. Pure."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Sequence
 
 import numpy as np

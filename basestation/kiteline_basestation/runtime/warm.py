@@ -1,7 +1,5 @@
 """Compiles all kernels of the base before the first packet, by mapping a small synthetic flight."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

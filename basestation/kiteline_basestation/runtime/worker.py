@@ -1,7 +1,5 @@
 """Runs jobs: in worker processes, or in lock-step flights in this process with modelled time."""
 
-from __future__ import annotations
-
 import contextlib
 import heapq
 import importlib.util

@@ -4,8 +4,6 @@ A row's checksum is BLAKE2b of 8 bytes over its key and its content. The totals 
 their checksums modulo 2^64, so that a row that is gone is missed.
 """
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import sqlite3
@@ -95,7 +93,7 @@ class Changes:
         self._rows = {"code": 0, "state": 0}  # by which the totals change
         self._sums = {"code": 0, "state": 0}
 
-    def __enter__(self) -> Changes:
+    def __enter__(self) -> "Changes":
         return self
 
     def __exit__(

@@ -1,7 +1,5 @@
 """Combines two saved maps. Where the second lies in the first is unknown: loop closures find it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from kiteline_basestation.intake.placements import PlacementState

@@ -3,8 +3,6 @@
 `check` works on the saved values, `contradictions` on the map that was restored from them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 

@@ -4,8 +4,6 @@ The loop gathers changes a few times a second, and only once the last batch is w
 batches and does not delay the loop.
 """
 
-from __future__ import annotations
-
 import contextlib
 import queue
 import sys

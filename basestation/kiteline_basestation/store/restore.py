@@ -1,7 +1,5 @@
 """Restores a station from a saved map."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from kiteline_basestation.exchange.map_cache_planner import is_cached_key

@@ -1,7 +1,5 @@
 """Files of a store on a disk that fails: read where nothing can be written, written anew from what is sound."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import shutil

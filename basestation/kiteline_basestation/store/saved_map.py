@@ -4,8 +4,6 @@ Packed for a base's log: 8 bytes magic; for each agent a header (agent, number o
 values (kind, id, part, length, code); the texts (lengths of name and text, both); a BLAKE2b digest of all before it.
 """
 
-from __future__ import annotations
-
 import hashlib
 import struct
 from collections.abc import Mapping

@@ -4,8 +4,6 @@ A dataclass is one text, named by the fields that lead to it ("merger.detector")
 dataclasses is a text of its own ("merger.edges/000012"). Types and fields follow the dataclasses' annotations.
 """
 
-from __future__ import annotations
-
 import json
 import types
 import typing

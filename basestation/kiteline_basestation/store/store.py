@@ -12,8 +12,6 @@ that dies loses nothing that was committed, for the kernel holds it; a power cut
 tears a batch, and what is lost then the agents send again. FULL would wait for the disk at every batch.
 """
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import fcntl

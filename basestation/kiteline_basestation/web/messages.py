@@ -6,22 +6,17 @@ A binary message starts with 16 bytes, little endian: kind u8, agent u8, 0 u16, 
 3 path of an agent's keyframes: int16 (n,3) times scale = metres in w.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.grid.grid_view import GridView
 from kiteline_basestation.grid.tile_store import Place
 from kiteline_basestation.web.numbers import AGENT_COUNTS, TOTALS, as_json
 from kiteline_basestation.web.snapshot import AgentStatus, PageSnapshot
-
-F64 = NDArray[np.float64]
-U8 = NDArray[np.uint8]
+from kiteline_core.arrays import F64, U8
 
 POINTS, TILES, PATH = 1, 2, 3  # kinds of binary messages
 

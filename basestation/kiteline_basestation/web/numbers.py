@@ -3,8 +3,6 @@
 A number that `Mapper.summary` has is read from `PageSnapshot.counts`; for any other, add a field in `snapshot.py`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar

@@ -5,8 +5,6 @@ sites (Origin) and, on loopback, other host names (DNS rebinding). Who only open
 the process nor the places of viewers.
 """
 
-from __future__ import annotations
-
 import asyncio
 import ipaddress
 import json
@@ -57,7 +55,7 @@ def address(text: str) -> tuple[str, int]:
 class Handle:
     """A running server."""
 
-    def __init__(self, page: _Page, thread: threading.Thread, url: str) -> None:
+    def __init__(self, page: "_Page", thread: threading.Thread, url: str) -> None:
         self._page = page
         self._thread = thread
         self.url = url
@@ -84,7 +82,7 @@ def serve(host: str, port: int, snapshot: Callable[[], PageSnapshot]) -> Handle:
 class _Connection(ServerConnection):
     """A connection to the page. unanswered: all those without an answer yet, of this page, in order of arrival."""
 
-    def __init__(self, unanswered: dict[_Connection, None], *args: Any, **options: Any) -> None:
+    def __init__(self, unanswered: "dict[_Connection, None]", *args: Any, **options: Any) -> None:
         self._unanswered = unanswered
         super().__init__(*args, **options)
 

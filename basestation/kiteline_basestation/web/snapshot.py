@@ -1,13 +1,10 @@
 """The snapshot of the station that the status page shows."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.grid.grid_view import GridView
 from kiteline_basestation.grid.placed_map import some_landmarks
@@ -15,10 +12,8 @@ from kiteline_basestation.map.map_tables import NO_POSE
 from kiteline_basestation.mapper import Mapper
 from kiteline_basestation.station import Station
 from kiteline_codec.channel import CodedChannel
+from kiteline_core.arrays import F64, U8
 from kiteline_core.ids import AgentId, agent_of_submap
-
-F64 = NDArray[np.float64]
-U8 = NDArray[np.uint8]
 
 POINTS_SHARE = 20  # changes of the map, in parts of its keyframes, after which its points are gathered again
 LOOKED_AT = 60_000  # keypoints from which they are gathered: a quarter of them are points, and the page shows 12,000

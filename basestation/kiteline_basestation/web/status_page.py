@@ -1,7 +1,5 @@
 """The status page of a running base; its loop replaces the snapshot, so that no lock is needed."""
 
-from __future__ import annotations
-
 from kiteline_basestation.station import Station
 from kiteline_basestation.web.server import address, serve
 from kiteline_basestation.web.snapshot import empty_snapshot, take_snapshot

@@ -1,7 +1,5 @@
 """Whether poses err as their covariance says: NEES, quality, image losses and tilt, over simulated flights."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from dataclasses import dataclass, field
 from pathlib import Path

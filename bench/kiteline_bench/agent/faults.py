@@ -1,7 +1,5 @@
 """The agent's bars under faults and forced losses: no exception, a pose again soon, no wrong merge."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The agent's bars: accuracy, cost, the governor beside the same flights without it, faults, losses, memory, start."""
 
-from __future__ import annotations
-
 from kiteline_bench.agent import governor, odometry
 from kiteline_bench.agent.faults import fault_bars, loss_bars
 from kiteline_bench.harness import processes

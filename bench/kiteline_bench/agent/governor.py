@@ -1,7 +1,5 @@
 """The governor's bars: flights on a share of their own load, modelled and by the kernel, governor on and off."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Figure: CPU against error, with the governor and without it."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path

@@ -4,8 +4,6 @@ Two flights that begin half a second apart differ in error by up to twice: numbe
 relative to the same flights at full effort.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The agent's bars for odometry: it bridges image losses, gives a monocular map its metre, costs nothing where bad."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 

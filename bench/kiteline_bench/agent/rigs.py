@@ -3,19 +3,17 @@
 Their calibration is true: of a tenth of a pixel that it is off by otherwise, a short baseline makes per cents of depth.
 """
 
-from __future__ import annotations
-
 import os
 from dataclasses import replace
 from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_bench.harness.bars import Bar, Bench, at_most, table
 from kiteline_bench.harness.recording import Item, Recording, items_of
 from kiteline_bench.harness.run import fly_alone
+from kiteline_core.arrays import F64
 from kiteline_hw.sim.source import open_sim
 
 SEED, START_S, SECONDS = 4, 20.0, 8.0
@@ -81,7 +79,7 @@ def _measured_depth(item: Item, number: int) -> Item:
     if true is None:
         return item
     rng = np.random.default_rng([number, 31])
-    depth: NDArray[np.float64] = true + _DEPTH_NOISE * true.astype(np.float64) ** 2 * rng.standard_normal(true.shape)
+    depth: F64 = true + _DEPTH_NOISE * true.astype(np.float64) ** 2 * rng.standard_normal(true.shape)
     coarse = rng.random((true.shape[0] // 16, true.shape[1] // 16))
     smooth = cv2.resize(coarse, (true.shape[1], true.shape[0]))
     hole = smooth < np.quantile(smooth, _HOLES)

@@ -1,7 +1,5 @@
 """CPU time of an agent's stages, in frames and in keyframes, flown again from the log of a flight."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

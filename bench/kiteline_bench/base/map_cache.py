@@ -1,7 +1,5 @@
 """The bars of the map cache: an agent flies in what others mapped, is relocalised there, and its link may fail."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

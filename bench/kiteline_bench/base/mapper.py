@@ -1,7 +1,5 @@
 """The base's bars: accuracy of single and merged maps, loops, losses, CPU and memory."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from functools import partial
@@ -9,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.config import GraphConfig
 from kiteline_basestation.map.sparse_map import SparseMap
@@ -19,13 +16,12 @@ from kiteline_bench.harness.bars import Bar, Bench, at_most, is_true
 from kiteline_bench.harness.result import FlownProcesses
 from kiteline_bench.harness.simulated import rendered_paths
 from kiteline_bench.harness.starts import compared_with_monolith, cut, in_pieces, length_s, pieces
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
 from kiteline_core.ids import NO_KEYFRAME, keyframe_id, submap_id
 from kiteline_core.optimisation.bundle import BundleConfig, BundleProblem, bundle
 from kiteline_lab.evaluation import metrics, trajectories
 from kiteline_lab.tools import logs
-
-F64 = NDArray[np.float64]
 
 _CUT_OVERLAP = 0.05  # of the uncut flight's frames, that two neighbouring pieces share
 _PIECES = 3

@@ -6,8 +6,6 @@ prints a table of what each further keyframe takes. The process that measures do
 or leaves behind would be counted; kernels have to be compiled before.
 """
 
-from __future__ import annotations
-
 import argparse
 import gc
 import json

@@ -1,7 +1,5 @@
 """The bars of monocular maps without IMU: loops correct the drift of scale, merges give the map its metre."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -5,18 +5,16 @@ queries all frames of its own flight that are older than four seconds and all fr
 is accepted when P3P over its matches has enough inliers; it is right when that pose is the true one.
 """
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.imaging import features
 from kiteline_agent.tracking.frame_images import depth_at
 from kiteline_bench.harness.bars import Bar, Bench, at_most, is_true
+from kiteline_core.arrays import F64, U8
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import Rectifier
 from kiteline_core.imaging import matching
@@ -27,8 +25,6 @@ from kiteline_hw.system.vocabulary import shipped_vocabulary
 
 TITLE = "Places"
 
-F64 = NDArray[np.float64]
-U8 = NDArray[np.uint8]
 
 FLIGHTS = (("room", "V1_02_medium.txt"), ("hall", "MH_03_medium.txt"), ("hall", "MH_01_easy.txt"))
 _EVERY = 20  # frames between two places: 1 s

@@ -1,7 +1,5 @@
 """The bars of the base's store: fifty kills in one flight, an earlier session's map, and the cost of writing."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

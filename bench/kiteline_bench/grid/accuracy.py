@@ -1,13 +1,10 @@
 """Precision and recall of the base's grid, beside those of the reference methods, and objects that must be in it."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_bench.grid.flown import FlownGrid, fly_grid, picture_path
 from kiteline_bench.grid.ideal import by_centres, by_whole_cells
@@ -15,11 +12,10 @@ from kiteline_bench.grid.places import Place, all_places
 from kiteline_bench.grid.sparse import binary_grid, labels_by_height, log_odds_grid
 from kiteline_bench.harness.bars import Bar, Bench, table
 from kiteline_bench.harness.recording import load
+from kiteline_core.arrays import F64, Bool
 from kiteline_lab.grids.files import OCCUPIED, GridFile
 from kiteline_lab.grids.picture import draw_comparison, resampled
 from kiteline_lab.grids.prm import GridScore, score
-
-F64 = NDArray[np.float64]
 
 _PRECISION, _RECALL = 99.5, 97.0  # percent
 _REFERENCE_CELLS_M = (0.05, 0.01)
@@ -108,7 +104,7 @@ def objects_present(place: Place, grid: GridFile, T_true_est: F64) -> list[Bar]:
     ]
 
 
-def _covered(grid: GridFile, box: F64) -> NDArray[np.bool_]:
+def _covered(grid: GridFile, box: F64) -> Bool:
     """Cells (rows, columns) whose centres lie within half a cell of a box (8,), seen from above."""
     r, c = np.indices(grid.state.shape)
     at = np.stack([c + 0.5, r + 0.5], -1) @ grid.T_map_cell[:2, :2].T + grid.T_map_cell[:2, 2] - box[:2]

@@ -1,14 +1,11 @@
 """What grids cost an agent and the link: CPU of a scan and of the frames it is spread over, bytes up and down."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.scans.local_grid import LocalGrid
@@ -19,6 +16,7 @@ from kiteline_bench.harness.run import fly_alone, fly_recording
 from kiteline_codec.channel import RecordChannel
 from kiteline_codec.schema import GridTile, KeyframeScan, Record, messages
 from kiteline_codec.schema.base.grid_tile import TILE_CELLS
+from kiteline_core.arrays import I64
 
 _ROUNDS = 3  # flights with and without scans, in turn
 _WARM = 3  # scans before time is taken
@@ -105,6 +103,6 @@ def _agent_memory() -> Bar:
     """The agent's grid at its largest."""
     config = AgentConfig().local_grid
     arrays = [v for v in vars(LocalGrid(config)).values() if isinstance(v, np.ndarray)]
-    own: NDArray[np.int64] = np.array([v.nbytes for v in arrays])
+    own: I64 = np.array([v.nbytes for v in arrays])
     mib = (int(own.sum()) + config.tiles * TILE_CELLS**2) / 2**20
     return at_most("the agent's grid: own cells and the most tiles that it keeps", mib, _AGENT_MIB, "MiB", 2)

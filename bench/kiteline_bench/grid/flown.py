@@ -1,13 +1,10 @@
 """A flight with a base, its grid, and the motion from the base's world to the true one."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.config import AgentConfig
 from kiteline_basestation.config import BaseConfig
@@ -19,11 +16,10 @@ from kiteline_bench.harness.bars import Bench
 from kiteline_bench.harness.recording import Recording
 from kiteline_bench.harness.run import RecordingRun, fly_recording
 from kiteline_codec.channel import RecordChannel
+from kiteline_core.arrays import F64
 from kiteline_core.geometry.cameras import Rectifier
 from kiteline_lab.evaluation import metrics
 from kiteline_lab.grids.files import GridFile, planar, read_grid
-
-F64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,5 @@
 """The occupancy grid: what `kiteline bench grid` measures, part by part."""
 
-from __future__ import annotations
-
 from kiteline_bench.grid import accuracy, costs, maps, obstacles, robust, street
 from kiteline_bench.harness.bars import Run
 

@@ -1,14 +1,10 @@
 """The truth itself as a grid on the cells of a flown one: what precision and recall lose to the cells alone."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64, I8
 from kiteline_lab.grids.files import FREE, OCCUPIED, UNKNOWN, GridFile
 from kiteline_lab.grids.picture import resampled
-
-F64 = NDArray[np.float64]
 
 _PLACES = (-0.45, 0.0, 0.45)  # in a cell's width and height, that are looked up of a whole cell
 
@@ -25,7 +21,7 @@ def by_whole_cells(true: GridFile, cells: GridFile, T_true_est: F64) -> GridFile
     return GridFile(cells.cell_m, cells.origin, np.where((states == FREE).all(0), FREE, occupied).astype(np.int8))
 
 
-def _looked_up(true: GridFile, cells: GridFile, T_true_est: F64, x: float, y: float) -> NDArray[np.int8]:
+def _looked_up(true: GridFile, cells: GridFile, T_true_est: F64, x: float, y: float) -> I8:
     """True states (rows, columns) beside the cells' centres, by parts of a cell."""
     beside = np.array([[1.0, 0.0, x], [0.0, 1.0, y], [0.0, 0.0, 1.0]])
     T_cells = cells.T_map_cell

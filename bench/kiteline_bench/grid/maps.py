@@ -1,13 +1,10 @@
 """The base's grid as a map: equal to one from scratch after corrections, and what it costs in time and memory."""
 
-from __future__ import annotations
-
 import copy
 import time
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.config import GridConfig
 from kiteline_basestation.grid.kept_scan import KeptScan, keep
@@ -15,11 +12,11 @@ from kiteline_basestation.grid.scan_grid import ScanGrid
 from kiteline_bench.grid.scans import PosedScan, Scanner, grid_config, scans_of
 from kiteline_bench.harness.bars import Bar, Bench, at_most, is_true
 from kiteline_bench.harness.recording import load
+from kiteline_core.arrays import F64, I8
 from kiteline_core.geometry import se3
 from kiteline_core.ground.column_scan import ColumnScan
 from kiteline_hw.system.memory import rss_mib
 
-F64 = NDArray[np.float64]
 Drawn = Sequence[tuple[KeptScan, F64]]
 
 _MOVED_M = 0.5  # of the last keyframe by a loop closure, in proportion along the way
@@ -77,7 +74,7 @@ def _after_a_loop(config: GridConfig, scans: Drawn) -> list[Bar]:
                     f"{len(after)} tiles, {changed} changed, {'all equal' if same else 'not equal'}")]  # fmt: skip
 
 
-def _states(grid: ScanGrid) -> dict[object, NDArray[np.int8]]:
+def _states(grid: ScanGrid) -> dict[object, I8]:
     states = {place: grid.cells(place) for place in grid.places}
     return {place: cells for place, (cells, known) in states.items() if known}
 

@@ -1,26 +1,22 @@
 """OBSTACLE_DISTANCE in simulated flights, against the true distances."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.config import AgentConfig
 from kiteline_bench.harness.bars import Bar, Bench, at_most, is_true, table
 from kiteline_bench.harness.run import FlyingAgent, fly_recording
 from kiteline_bench.harness.simulated import random_flight
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import Rectifier
 from kiteline_hw.sim.truth.sight_kernels import level_distances
 from kiteline_hw.sim.world.raycast_kernels import NO_SHELL
 from kiteline_hw.sim.world.world import World
-
-F64 = NDArray[np.float64]
 
 # Half of the flights by worn rigs; paths, scenes and lenses change with other periods.
 FLIGHTS = tuple((number, "worn" if number % 4 in (1, 2) else "true") for number in range(401, 421))

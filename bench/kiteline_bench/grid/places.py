@@ -1,7 +1,5 @@
 """The places whose grids are judged: somebody else's recorded room, and simulated ones full of difficult objects."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,14 +1,7 @@
 """Kernel that casts rays over a dense grid. Arrays in, caller's arrays out."""
 
-from __future__ import annotations
-
-import numpy as np
-from numpy.typing import NDArray
-
+from kiteline_core.arrays import F64, I64
 from kiteline_core.jit import njit
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 
 @njit

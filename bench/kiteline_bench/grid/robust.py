@@ -1,16 +1,14 @@
 """Scans that see badly: what was not seen must stay unknown, and nothing may die."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.grid.grid_view import grid_files
 from kiteline_bench.grid.scans import PosedScan, Scanner, as_file, drawn
 from kiteline_bench.harness.bars import Bar, Bench, at_most, is_true
+from kiteline_core.arrays import F32, F64
 from kiteline_core.frame import Frame
 from kiteline_core.geometry import se3
 from kiteline_hw.sim.sensors.camera import Shutter
@@ -19,9 +17,6 @@ from kiteline_hw.sim.truth.occupancy import FREE as FREE_GREY
 from kiteline_hw.sim.truth.sight import SeenWorld, look
 from kiteline_lab.grids.files import FREE, GridFile
 from kiteline_lab.grids.picture import resampled
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
 
 _SEED = 43
 _POSES = 24  # of each case

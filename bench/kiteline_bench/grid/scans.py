@@ -1,19 +1,17 @@
 """Column scans of single images, as an agent makes them, without a flight: at known poses."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.config import GridConfig
 from kiteline_basestation.grid.grid_view import dense
 from kiteline_basestation.grid.kept_scan import keep
 from kiteline_basestation.grid.scan_grid import ScanGrid
 from kiteline_bench.harness.recording import Recording
+from kiteline_core.arrays import F32, F64
 from kiteline_core.frame import Frame
 from kiteline_core.geometry.cameras import CameraRig, Rectifier
 from kiteline_core.ground.column_scan import ColumnScan
@@ -23,9 +21,6 @@ from kiteline_core.ground.ground_height import GroundHeight, Seen, without_groun
 from kiteline_core.ground.segmentation import GroundSegmenter
 from kiteline_core.ground.wide_view import WideView
 from kiteline_lab.grids.files import FREE, OCCUPIED, GridFile
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,9 +77,9 @@ class Scanner:
         ]
 
 
-def scans_of(recording: Recording, every: int, damage: Callable[[F32], F32] | None = None) -> list[PosedScan]:
+def scans_of(recording: Recording, every: int) -> list[PosedScan]:
     """Scans of every n-th frame of a recording that has a right image and a true pose."""
-    scanner = Scanner(recording.rig, damage)
+    scanner = Scanner(recording.rig)
     for item in recording.items[::every]:
         if item.frame.right is not None and item.T_w_b is not None:
             scanner.scan(item.frame, item.T_w_b)

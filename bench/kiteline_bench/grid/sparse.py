@@ -4,22 +4,15 @@
 section 5.6: a layer of obstacle points over a layer of rays to ground points.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.config import GroundConfig
 from kiteline_basestation.grid.ground_height import ground_heights
 from kiteline_bench.grid.ray_kernels import cast_rays
+from kiteline_core.arrays import F64, I64, U8, Bool
 from kiteline_lab.grids.files import FREE, OCCUPIED, UNKNOWN, GridFile
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-U8 = NDArray[np.uint8]
-Bool = NDArray[np.bool_]
 
 UNLABELLED, GROUND, OBSTACLE = 0, 1, 2
 MAX_RAY_M = 20.0  # m; beyond, the error of a stereo point exceeds a cell
@@ -128,7 +121,7 @@ class _Canvas:
         self.low, self.high = np.full(shape, np.inf), np.full(shape, -np.inf)
 
     @classmethod
-    def around(cls, sparse: SparsePoints, seen: I64, cell_m: float) -> _Canvas:
+    def around(cls, sparse: SparsePoints, seen: I64, cell_m: float) -> "_Canvas":
         """A canvas that holds all ends of rays."""
         ends = np.concatenate([sparse.cameras[seen[:, 0], :2], sparse.points[seen[:, 1], :2], np.zeros((1, 2))])
         cells = np.floor(ends / cell_m).astype(np.int64)

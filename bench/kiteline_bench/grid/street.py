@@ -1,21 +1,16 @@
 """The grid of a real street, as a picture: the road free, parked cars and walls occupied."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_bench.grid.flown import FlownGrid, fly_grid
 from kiteline_bench.harness.bars import Bar, Bench, is_true
 from kiteline_bench.harness.recording import load
+from kiteline_core.arrays import F64, U8
 from kiteline_lab.grids.files import FREE, OCCUPIED, UNKNOWN
 from kiteline_lab.grids.picture import shaded
-
-F64 = NDArray[np.float64]
-U8 = NDArray[np.uint8]
 
 _STREET = "kitti_straight"
 _HALF_LANE_M = 0.8  # beside the path, where the car itself drove

@@ -1,7 +1,5 @@
 """Bars that a benchmark measures, and the folder, recordings and flights that it works with."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

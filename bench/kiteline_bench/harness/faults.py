@@ -1,7 +1,5 @@
 """Faults of cameras, put into a recording: single bad frames, image losses, jumps to another place."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -9,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_bench.harness.recording import Item, Recording
+from kiteline_core.arrays import U8
 from kiteline_core.frame import Frame, ImuBatch, joined
 
-U8 = NDArray[np.uint8]
 Change = Callable[[Frame], Frame]
 Fault = Callable[[Recording], Recording]
 

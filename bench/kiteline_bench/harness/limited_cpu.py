@@ -1,7 +1,5 @@
 """Flights on a core of which the agent may use a share: modelled, or limited by the kernel; governor on or off."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass, replace
 

@@ -1,24 +1,20 @@
 """Errors of a flight with a base in its world: keyframes and live poses against the truth."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.runtime.flight_summary import keyframe_poses
 from kiteline_bench.harness.result import AgentRun
 from kiteline_bench.harness.run import JointRun
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.geometry.cameras import Rectifier
 from kiteline_core.ids import SEQUENCE_BITS, SUBMAP_BITS
 from kiteline_hw.sources.open import open_source
 from kiteline_lab.evaluation import metrics
-
-F64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,8 +4,6 @@
 `far-end` is the other side of a link, in a process of its own so that its memory is not counted.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import json

@@ -1,7 +1,5 @@
 """Own CPU time of functions: each is wrapped while `running`, and the time of wrapped functions inside is taken off."""
 
-from __future__ import annotations
-
 import importlib
 import time
 from collections.abc import Callable, Iterator, Sequence

@@ -1,15 +1,13 @@
 """A recording as frames with the sensor data since the frame before: decoded once, flown often, cut and changed."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_core import odometry as odometer
+from kiteline_core.arrays import F64
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration, OdometryBatch, Trajectory, joined
 from kiteline_core.geometry.cameras import CameraRig
 from kiteline_hw.logs.mcap_log import GROUND_TRUTH, IMU, LogWriter
@@ -17,8 +15,6 @@ from kiteline_hw.ports import FrameSource
 from kiteline_hw.sources.open import open_source
 from kiteline_lab.evaluation import metrics
 from kiteline_lab.flights.simulate import encode
-
-F64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,27 +48,27 @@ class Recording:
             return None
         return Trajectory(np.array([t for t, _ in known], np.int64), np.array([pose for _, pose in known]))
 
-    def part(self, begin: int, end: int | None = None) -> Recording:
+    def part(self, begin: int, end: int | None = None) -> "Recording":
         """The recording of frames begin..end alone."""
         return replace(self, items=self.items[begin:end])
 
-    def seconds(self, begin_s: float, end_s: float) -> Recording:
+    def seconds(self, begin_s: float, end_s: float) -> "Recording":
         """The recording from begin_s to end_s after its first frame."""
         first_ns = self.items[0].frame.t_ns
         inside = (item for item in self.items if begin_s <= (item.frame.t_ns - first_ns) * 1e-9 < end_s)
         return replace(self, items=tuple(inside))
 
-    def without_imu(self) -> Recording:
+    def without_imu(self) -> "Recording":
         """The recording without inertial samples."""
         return replace(self, imu=None, items=tuple(replace(item, imu=None) for item in self.items))
 
-    def left_only(self) -> Recording:
+    def left_only(self) -> "Recording":
         """The recording of the left camera and the IMU alone."""
         rig = replace(self.rig, right=None, T_c_r=None, has_depth=False)
         items = (replace(item, frame=replace(item.frame, right=None, depth_m=None)) for item in self.items)
         return replace(self, rig=rig, items=tuple(items))
 
-    def with_odometry(self, batch: OdometryBatch | None) -> Recording:
+    def with_odometry(self, batch: OdometryBatch | None) -> "Recording":
         """The recording with these velocities in place of its own, each given to the first frame after it."""
         items, first = [], 0
         for item in self.items:
@@ -84,7 +80,7 @@ class Recording:
             items.append(replace(item, odometry=part))
         return replace(self, items=tuple(items))
 
-    def between_rests(self) -> Recording:
+    def between_rests(self) -> "Recording":
         """The longest part between two moments at which the vehicle hardly moves: it can be flown to and fro."""
         truth = self.truth
         if truth is None:
@@ -96,7 +92,7 @@ class Recording:
         begin, end = int(np.argmin(speed[: n // 4])), n - n // 4 + int(np.argmin(speed[n - n // 4 :]))
         return self.part(begin, end + 1)
 
-    def backward(self) -> Recording:
+    def backward(self) -> "Recording":
         """The recording played backward: another flight with the same sensors, stamps from the same time on.
 
         A vehicle that flies the same way back has the same specific force, and rotates the other way. A sensor that

@@ -1,7 +1,5 @@
 """What came of a flight: of one agent in this process, with its errors, or of processes with their report."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -9,17 +7,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.step import Estimate
+from kiteline_core.arrays import F64, I64
 from kiteline_core.frame import Trajectory
 from kiteline_core.geometry import se3
 from kiteline_lab.evaluation import metrics, trajectories
 from kiteline_lab.evaluation.metrics import TrajectoryAlignment
 from kiteline_lab.flights.outcome import FlightOutcome
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 _WINDOW_NS = 1_000_000_000
 _FEWEST = 4  # poses from which a trajectory is compared with the truth

@@ -1,7 +1,5 @@
 """The results file: a summary on top, below it one section a benchmark; running one replaces its section only."""
 
-from __future__ import annotations
-
 import importlib
 import os
 import platform

@@ -1,7 +1,5 @@
 """Fly scenarios in this process: an agent alone, or agents that come and go with a base over a link."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Simulated flights: along recorded paths, rendered to a file once; and random ones, rendered into memory."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -3,8 +3,6 @@
 Errors of some millimetres vary by a fifth if a flight begins half a second later: it gets other keyframes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Traffic of a link, from the logs of a flight: bytes in any second, delays of headers, gaps between poses."""
 
-from __future__ import annotations
-
 from collections import deque
 from dataclasses import dataclass
 from itertools import pairwise

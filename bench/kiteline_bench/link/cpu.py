@@ -1,7 +1,5 @@
 """CPU of the codec and of the endpoint, on keyframes of usual size."""
 
-from __future__ import annotations
-
 import random
 import time
 

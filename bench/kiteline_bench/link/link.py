@@ -1,7 +1,5 @@
 """The link's bars: bytes, budgets, delays, outages, serial lines, a flight controller's radio, CPU."""
 
-from __future__ import annotations
-
 import random
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """A long link outage: the agent's end goes on writing, then the link comes back. Simulated time, real memory."""
 
-from __future__ import annotations
-
 import random
 from dataclasses import dataclass
 from pathlib import Path

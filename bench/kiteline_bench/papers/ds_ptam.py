@@ -6,8 +6,6 @@ agent is busy are dropped, as by a live camera. Lock-step flights with the virtu
 out on every machine; beside them flights in real time under the kernel's limit, where that may be set.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor

@@ -1,7 +1,5 @@
 """Throttled flights in real time under the kernel's limit: one computer, or the agent's alone."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -1,17 +1,13 @@
 """Figure of throttled flights: errors and frames with a pose by share of a core, and paths at the smallest share."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_bench.papers.throttled import MODES, Throttled, medians
+from kiteline_core.arrays import F64
 from kiteline_lab.plots.plot import COLOURS, TRUTH_COLOUR
-
-F64 = NDArray[np.float64]
 
 _MARKERS = ("^", "s", "o", "D")
 

@@ -1,13 +1,10 @@
 """`kiteline bench papers/ekf`: the Kalman filter's landmarks, trajectory, honesty and cost, beside its paper."""
 
-from __future__ import annotations
-
 import sys
 import time
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.ekf.ekf_slam import EkfSlam
 from kiteline_agent.ekf_config import EkfConfig
@@ -15,9 +12,8 @@ from kiteline_bench.agent.consistency import nees_band
 from kiteline_bench.harness.bars import Bar, Bench, at_most, is_true, run_command
 from kiteline_bench.papers import simulated_vehicle as vehicle
 from kiteline_bench.papers.initialisation import Outcome, Setting, compare
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
-
-F64 = NDArray[np.float64]
 
 TITLE = "The Kalman filter and its paper"
 

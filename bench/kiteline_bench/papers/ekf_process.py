@@ -1,7 +1,5 @@
 """The filter in a process of its own, whose memory is measured."""
 
-from __future__ import annotations
-
 from kiteline_agent.ekf.ekf_slam import EkfSlam
 from kiteline_agent.ekf_config import EkfConfig
 from kiteline_bench.papers import simulated_vehicle as vehicle

@@ -6,8 +6,6 @@ its rivals make none either; the last one does. Errors of two flights that begin
 up to twice, so every row is a geometric mean over ten starts.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -22,7 +20,7 @@ TITLE = "The governor beside its simplest rivals"
 
 STARTS = tuple(range(0, 120, 12))  # first frames
 SHARES = (0.5, 0.25, 0.12)  # of the flight's own load
-_MONO_SHARES = (0.8,)  # of one eye with an IMU, whose start alone takes half of it: with less it never comes
+_MONO_SHARES = (0.8,)  # of one camera with an IMU, whose start alone takes half of it: with less it never comes
 RIVALS = ("ladder", "every n-th frame", "newest frame", "newest frame, with scans")
 _EVERY = {0.8: 2, 0.5: 3, 0.25: 7, 0.12: 16}  # whose cost is the share, by docs/decisions/governor-ladder.md
 _AIR = "euroc_mh01_air"
@@ -71,7 +69,7 @@ def run(bench: Bench) -> list[Bar]:
 
 
 def _recordings(bench: Bench) -> Iterator[tuple[str, Recording, Sequence[float]]]:
-    """A rendered room with an IMU and without, simulated flights, and a real flight with one eye and IMU."""
+    """A rendered room with an IMU and without, simulated flights, and a real flight with one camera and IMU."""
     frames = STARTS[-1] + _FRAMES
     room = load(bench.source("room_flight.mcap"), frames=frames)
     yield "room_flight", room, SHARES

@@ -1,19 +1,15 @@
 """A landmark's position by its rays against 100 particles along the first one, at the same instant."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.ekf.ray_kernels import position_by_rays
 from kiteline_bench.papers import simulated_vehicle as vehicle
 from kiteline_bench.papers.particle_kernels import position_by_particles
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
-
-F64 = NDArray[np.float64]
 
 PARTICLES = 100
 _DRAWS = 300
@@ -47,7 +43,7 @@ class Outcome:
 
 
 def compare(setting: Setting) -> Outcome:
-    """Both, on the same sightings."""
+    """Both, on the same observations."""
     rng, cam = np.random.default_rng(0), vehicle.camera()
     model = vehicle.VehicleModel(setting.planar)
     poses, sigma = vehicle.loop(setting.planar), model.sigma_px / cam.fx
@@ -89,7 +85,7 @@ def _way(setting: Setting, model: vehicle.VehicleModel, poses: F64, rng: np.rand
 
 
 def _landmark(setting: Setting, T_o_c: F64, sigma: float, rng: np.random.Generator) -> tuple[F64, F64]:
-    """A point (3,) that all poses see under enough parallax, and its noisy sightings (n,2)."""
+    """A point (3,) that all poses see under enough parallax, and its noisy observations (n,2)."""
     cam = vehicle.camera()
     half = np.array([cam.cx / cam.fx, cam.cy / cam.fy])
     while True:

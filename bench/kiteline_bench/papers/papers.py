@@ -1,7 +1,5 @@
 """`kiteline bench papers`: each paper's experiments beside kiteline's."""
 
-from __future__ import annotations
-
 from kiteline_bench.harness.bars import Run
 from kiteline_bench.papers import ds_ptam, ekf, governor, sequences
 from kiteline_bench.papers.logs import logs

@@ -1,20 +1,16 @@
 """The initialisation that the paper compares with: particles along a landmark's first ray."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64
 from kiteline_core.jit import njit
-
-F64 = NDArray[np.float64]
 
 
 @njit
 def position_by_particles(xy: F64, T_o_c: F64, sigma: float, range_m: float, count: int, point: F64) -> None:
     """Set the most probable particle (3,) of those spread evenly along the first ray, up to a range.
 
-    xy: (v,2) x/z, y/z in cameras T_o_c (v,4,4), of deviation sigma. Each later sighting weighs the particles by its
+    xy: (v,2) x/z, y/z in cameras T_o_c (v,4,4), of deviation sigma. Each later observation weighs the particles by its
     likelihood. Source: Zhang et al., 2008, as "Monocular EKF-SLAM with delayed landmark initialisation" describes it.
     """
     length = np.sqrt(xy[0, 0] ** 2 + xy[0, 1] ** 2 + 1.0)

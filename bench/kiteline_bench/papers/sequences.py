@@ -4,8 +4,6 @@ Without `--data` the recordings of the benchmarks are flown. Beside ours stand t
 J. D. Tardos print for ORB-SLAM2 ("ORB-SLAM2", T-RO 2017, tables I to III), and those of "DS-PTAM", section 4.3.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -121,7 +119,7 @@ def run(bench: Bench) -> list[Bar]:
 
 
 def judged(sequence: DataSequence, flown: FlownProcesses) -> SequenceResult:
-    """Compare the refined path with the truth; one eye without IMU is aligned with scale."""
+    """Compare the refined path with the truth; one camera without IMU is aligned with scale."""
     source = open_source(sequence.source)
     truth, monocular = source.ground_truth, source.rig.right is None and not source.rig.has_depth
     has_imu = source.imu is not None

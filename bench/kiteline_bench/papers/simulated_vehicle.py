@@ -1,19 +1,14 @@
 """A vehicle with one camera and odometry in a world of points: a ground robot or a drone, without images."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.ekf.filter_state import Motion
 from kiteline_agent.ekf.odometer_motion import camera_motion
+from kiteline_core.arrays import F64, I64
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 # forward, left, up -> right, down, forward
 _R_B_C = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -101,7 +96,7 @@ def flight(model: VehicleModel, seed: int, laps: float = 1.0) -> list[SimulatedF
         motion, by_odometry = None, np.eye(4)
         if k > 0:
             by_odometry, motion = odometry(model, poses[k - 1], T_o_b, scale, k, believed.T_b_c, rng)
-        ids, uv = _sightings(model, points, T_o_b @ cam.T_b_c, seen_by, in_view, rng)
+        ids, uv = _observations(model, points, T_o_b @ cam.T_b_c, seen_by, in_view, rng)
         in_view = ids
         frames.append(SimulatedFrame(T_o_b, motion, by_odometry, ids, uv))
     return frames
@@ -124,7 +119,7 @@ def odometry(
     return told, camera_motion(told, cov, T_b_c)
 
 
-def _sightings(
+def _observations(
     model: VehicleModel, points: F64, T_o_c: F64, cam: RectifiedCamera, before: I64, rng: np.random.Generator
 ) -> tuple[I64, F64]:
     """Ids and pixels of visible points: those seen before go on, others are added up to the most in a frame."""

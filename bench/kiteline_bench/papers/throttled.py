@@ -1,13 +1,10 @@
 """Throttled flights: one recording in a mode of `kiteline fly` with a share of a core, and the paper's errors of it."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_bench.harness.bars import Bench
 from kiteline_bench.harness.result import FlownProcesses
@@ -16,8 +13,6 @@ from kiteline_hw.ports import SourceError
 from kiteline_lab.evaluation import metrics, trajectories
 from kiteline_lab.evaluation.metrics import Matched, TrajectoryAlignment
 from kiteline_lab.evaluation.trajectories import TrajectoryError
-
-F64 = NDArray[np.float64]
 
 MODES = {
     "tracker": "tracker",

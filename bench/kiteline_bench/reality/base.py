@@ -1,7 +1,5 @@
 """The base beside the tracker alone: on every recording, with and without IMU, over both links."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 from kiteline_bench.harness.bars import Bar, Bench, table

@@ -6,8 +6,6 @@ all threads and rectification included, image decoding taken off. Yardstick and 
 Usage: python -m kiteline_bench.reality.cpu SOURCE    prints the yardstick of a recording as JSON.
 """
 
-from __future__ import annotations
-
 import json
 import sys
 import time

@@ -1,7 +1,5 @@
 """Rolling shutter, exposure, repeated and glossy surfaces, cars: each beside the same flight without it."""
 
-from __future__ import annotations
-
 import os
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Monocular with a real IMU: a real flight from its begin and from later starts, in motion."""
 
-from __future__ import annotations
-
 from kiteline_bench.harness.bars import Bar, Bench, at_most, table
 from kiteline_bench.harness.recording import load
 from kiteline_bench.reality.flown import flown, spread

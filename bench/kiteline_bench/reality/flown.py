@@ -1,14 +1,11 @@
 """One flight with a base, or without, compared with the truth; and tables and bars over several of them."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.agent import Agent
 from kiteline_agent.config import AgentConfig
@@ -19,6 +16,7 @@ from kiteline_bench.harness.bars import Bar, Bench, at_most
 from kiteline_bench.harness.recording import Recording
 from kiteline_bench.harness.result import AgentRun
 from kiteline_bench.harness.run import FlyingAgent, fly_recording
+from kiteline_core.arrays import F64
 from kiteline_core.frame import Trajectory
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import Rectifier
@@ -26,7 +24,6 @@ from kiteline_lab.evaluation import metrics
 from kiteline_lab.evaluation.metrics import Matched, TrajectoryAlignment
 from kiteline_lab.flights.refined_path import refined_path
 
-F64 = NDArray[np.float64]
 Poses = list[tuple[int, F64]]
 
 _WINDOW_S, _STEP_S = 5.0, 1.0  # of the windows whose scale is compared with the truth

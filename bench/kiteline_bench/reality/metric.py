@@ -1,7 +1,5 @@
 """Whether the agent says "metric" only where lengths are right: monocular with IMU from a hundred starts."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from kiteline_bench.harness.bars import Bar, Bench, is_true, table

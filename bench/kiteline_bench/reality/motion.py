@@ -1,7 +1,5 @@
 """Flights that begin in motion: live poses from the fifth frame on."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from kiteline_bench.harness.bars import Bar, Bench, table

@@ -1,7 +1,5 @@
 """Whether poses of worn rigs err as their covariance says: NEES and quality over simulated flights."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """People who walk through the view: a hundred flights beside the same ones in the empty scene."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

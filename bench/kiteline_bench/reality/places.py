@@ -6,27 +6,22 @@ with what matching against every frame finds, by the number of matches. A candid
 over its matches has enough inliers.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.imaging import features
 from kiteline_bench.harness.bars import Bar, Bench, is_true
 from kiteline_bench.harness.recording import load
+from kiteline_core.arrays import F64, U8
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import Rectifier
 from kiteline_core.imaging import matching
 from kiteline_core.places.place_index import PlaceIndex
 from kiteline_hw.system.vocabulary import shipped_vocabulary
-
-F64 = NDArray[np.float64]
-U8 = NDArray[np.uint8]
 
 FLIGHT, STREET = "euroc_mh01_air", "kitti07_mono"
 _EVERY = 5  # frames of the flight between two places: a quarter of a second

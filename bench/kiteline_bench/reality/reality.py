@@ -1,7 +1,5 @@
 """The bars of real and worn recordings."""
 
-from __future__ import annotations
-
 from kiteline_bench.agent import rigs
 from kiteline_bench.reality import (
     base,

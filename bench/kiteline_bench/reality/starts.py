@@ -1,7 +1,5 @@
 """Gross failures of the monocular start with an IMU: random starts in every real recording, forward and backward."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from kiteline_bench.harness.bars import Bar, Bench, at_most, table

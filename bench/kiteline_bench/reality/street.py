@@ -1,7 +1,5 @@
 """A real street from several starts: live poses, and the base beside the tracker alone."""
 
-from __future__ import annotations
-
 from kiteline_bench.harness.bars import Bar, Bench, table
 from kiteline_bench.harness.recording import load
 from kiteline_bench.reality.flown import flown, spread

@@ -4,15 +4,12 @@ Then the IMU of each rig flies twice more, with what its rig file keeps of it. S
 each scene. The seeds are held out: options are tuned on others.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.agent import Agent
 from kiteline_agent.config import AgentConfig
@@ -20,6 +17,7 @@ from kiteline_bench.harness.bars import Bar, Bench, table
 from kiteline_bench.harness.recording import Recording, load
 from kiteline_bench.harness.simulated import render
 from kiteline_bench.reality.flown import Flown, flown, spread
+from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuBatch
 from kiteline_hw.logs.rig_json import rig_from_json
 
@@ -135,7 +133,7 @@ def as_measured_by(flight: Recording, truth: dict[str, Any], other: dict[str, An
     return replace(flight, items=tuple(replace(item, imu=measured(item.imu)) for item in flight.items))
 
 
-def _axes(truth: dict[str, Any], name: str) -> NDArray[np.float64]:
+def _axes(truth: dict[str, Any], name: str) -> F64:
     """(3,3) of measured = axes @ true, of "gyro" or "accel", in the axes of the body by the camera."""
     told, true = (rig_from_json(truth[key])[0].T_b_c[:3, :3] for key in ("told", "true"))
     return np.asarray(np.array(truth[f"{name}_matrix"]) @ true @ told.T)

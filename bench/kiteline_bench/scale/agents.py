@@ -4,8 +4,6 @@ Every agent has a Zenoh session, an endpoint and a submap of its own, and shares
 poses as often as its link allows. All of them are in this process, whose CPU is not counted.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """Copies of a place that was flown and mapped: a large map without the time that its flight would take."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any

@@ -4,8 +4,6 @@
 is measured.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import time

@@ -3,14 +3,11 @@
 Descriptors of a copy are turned by a mask: distances within it stay, and places of different copies do not look alike.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.step import Identity
 from kiteline_bench.harness.recording import items_of
@@ -26,6 +23,7 @@ from kiteline_codec.schema import (
     StereoAlignment,
     messages,
 )
+from kiteline_core.arrays import F64, U8
 from kiteline_core.geometry import se3
 from kiteline_core.ids import (
     KEYPOINT_BITS,
@@ -38,9 +36,6 @@ from kiteline_core.ids import (
     submap_id,
 )
 from kiteline_hw.sources.open import open_source
-
-F64 = NDArray[np.float64]
-U8 = NDArray[np.uint8]
 
 _AGENT_FIELDS, _SUBMAP_FIELDS, _KEYFRAME_FIELDS = ("agent",), ("submap",), ("keyframe", "since", "parent")
 _AFTER_NS = 1_000_000_000  # between the last keyframe of a round and the first one of the next
@@ -96,9 +91,9 @@ def mask_of(number: int) -> U8:
     return np.random.default_rng([number, 9]).integers(0, 256, 32, np.uint8)
 
 
-def record_flight(source: str, most: int, *, imu: bool = True) -> RecordedFlight:
+def record_flight(source: str, most: int) -> RecordedFlight:
     """Fly a recording over a perfect link without a base, until it has `most` keyframes or ends. Raises SourceError."""
-    opened = open_source(source, imu=imu)
+    opened = open_source(source)
     number = AgentId(0)
     ours, theirs = coded_channel(1, 0, "wifi"), coded_channel(1, 0, "wifi", peer=number)
     ours.noting = True

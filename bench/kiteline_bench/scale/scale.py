@@ -1,7 +1,5 @@
 """`kiteline bench scale`: a base of any size."""
 
-from __future__ import annotations
-
 from kiteline_bench.harness.bars import Run
 from kiteline_bench.scale import agents, growth, sizes
 

@@ -1,7 +1,5 @@
 """A map of 20,000 keyframes, and a day of silence and flights: their trials run in processes of their own."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

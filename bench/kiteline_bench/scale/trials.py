@@ -3,8 +3,6 @@
 `python -m kiteline_bench.scale.trials map|day …` prints the outcome as JSON.
 """
 
-from __future__ import annotations
-
 import argparse
 import itertools
 import json
@@ -18,7 +16,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.jobs import JobDone
@@ -34,12 +31,11 @@ from kiteline_codec import warm as codec_warm
 from kiteline_codec.channel import coded_channel
 from kiteline_codec.schema import LivePose, Record
 from kiteline_codec.sync.resumption import agent_session
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
 from kiteline_core.ids import AgentId, SubmapId
 from kiteline_hw.system.memory import return_large_arrays, rss_mib
 from kiteline_hw.system.vocabulary import shipped_vocabulary
-
-F64 = NDArray[np.float64]
 
 _MODULE = "kiteline_bench.scale.trials"
 STEP_NS = 50_000_000

@@ -3,8 +3,6 @@
 Usage: python -m kiteline_bench.system.compile_time [ROOM...]
 """
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """The first flight's bars: accuracy, cost, bytes, agreement, repetition, killed processes, bad input; on recordings."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import json

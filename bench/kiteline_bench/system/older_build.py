@@ -1,7 +1,5 @@
 """The build of an older revision, run beside today's."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

@@ -3,8 +3,6 @@
 They are mounted in a name space of their own, in which agent and base run; where that is not allowed, the bars fail.
 """
 
-from __future__ import annotations
-
 import json
 import shutil
 import sys

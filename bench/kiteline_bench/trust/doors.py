@@ -1,7 +1,5 @@
 """The doors of kiteline beyond packets: questions, stores, and files of each kind; each with valid input to mutate."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import random

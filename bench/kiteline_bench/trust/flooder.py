@@ -3,8 +3,6 @@
 `python -m kiteline_bench.trust.flooder ENDPOINT SECONDS BYTES_S` prints what became of it as JSON.
 """
 
-from __future__ import annotations
-
 import json
 import random
 import sys

@@ -3,8 +3,6 @@
 Only the rooms' own errors may come of them, none may take long, and memory must not grow. `--inputs` sets how many.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

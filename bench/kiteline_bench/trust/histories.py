@@ -4,8 +4,6 @@ A disk forgets at a power cut what was not synchronised, in any part. Cards are 
 operation, clocks set back, and bases ask for later sessions.
 """
 
-from __future__ import annotations
-
 import contextlib
 import random
 from collections.abc import Iterator
@@ -94,7 +92,7 @@ class ModelledFolder:
             file.content = file.kept = self.draw.choice((file.kept, file.content, mixed))
         self._kept_names = dict(self._names)
 
-    def copy(self) -> ModelledFolder:
+    def copy(self) -> "ModelledFolder":
         """Another card with the same content."""
         names = {name: _File(file.content, file.kept) for name, file in self._names.items()}
         return ModelledFolder(self.draw, self.unsynced, None, names, dict(names))

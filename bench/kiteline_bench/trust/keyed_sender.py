@@ -1,7 +1,5 @@
 """Senders that mean harm. With a sound key: packets are well formed, what they say is drawn at random; and without."""
 
-from __future__ import annotations
-
 import random
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """Fly agent and base on small file systems that are filled at random instants. Run in a mount name space of its own."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

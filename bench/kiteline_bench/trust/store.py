@@ -1,7 +1,5 @@
 """Flipped bits in the store of a flight: nothing altered is loaded without a word."""
 
-from __future__ import annotations
-
 import shutil
 
 import numpy as np

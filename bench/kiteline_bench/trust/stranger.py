@@ -3,8 +3,6 @@
 The base is sealed as by default and listens on all interfaces. `--seconds` sets how long (600 for the promise).
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

@@ -1,7 +1,5 @@
 """`kiteline bench trust`: nothing is lost, and nothing comes twice."""
 
-from __future__ import annotations
-
 from kiteline_bench.harness.bars import Run
 from kiteline_bench.trust import disk, histories, store, stranger
 

@@ -1,7 +1,5 @@
 """An agent's process with a modelled pair of cameras in place of real ones, and what a vehicle's bench starts."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import subprocess

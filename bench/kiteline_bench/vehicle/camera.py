@@ -1,7 +1,5 @@
 """A modelled pair of cameras at 20 Hz beside a base, a flight controller and a log, on one core that others load."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal

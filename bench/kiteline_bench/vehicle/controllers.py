@@ -1,7 +1,5 @@
 """Modelled ArduPilot and PX4: what they make of an agent's poses, and how soon wrong axes are named."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 import os

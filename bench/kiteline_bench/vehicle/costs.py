@@ -1,7 +1,5 @@
 """What a controller's IMU costs the agent's process: MAVLink at 200 Hz over a socket, beside a recording's."""
 
-from __future__ import annotations
-
 import contextlib
 import socket
 import subprocess
@@ -11,7 +9,7 @@ import time
 import numpy as np
 
 from kiteline_bench.harness.bars import Bar, Bench, at_most, environment
-from kiteline_core.geometry.se3 import F64
+from kiteline_core.arrays import F64
 from kiteline_hw.mavlink.codec import MavlinkCodec
 from kiteline_hw.mavlink.controller_imu import ControllerImu
 from kiteline_hw.mavlink.coordinate_frames import mounting

@@ -1,7 +1,5 @@
 """Faults in the field: cameras and a flight controller unplugged and back, a line that carries garbage."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal

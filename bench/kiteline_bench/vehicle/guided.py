@@ -1,23 +1,19 @@
 """A worn rig is moved by hand as `kiteline calibrate imu` asks for: what it finds of the IMU, against the truth."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.inertial.calibration.known_imu import KnownImuConfig
 from kiteline_bench.harness.bars import Bar, Bench, at_most
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
 from kiteline_hw.sim.config import read_config
 from kiteline_hw.sim.source import SimSource
 from kiteline_lab.calibration import calibrate
 from kiteline_lab.flights import simulate
-
-F64 = NDArray[np.float64]
 
 SEEDS = (31, 32, 33)
 _WEAR = ("lens", "extrinsics", "imu", "noise", "stamps")  # in a hand nothing vibrates

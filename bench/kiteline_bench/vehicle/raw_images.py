@@ -1,7 +1,5 @@
 """What raw images cost the process that tracks, beside encoded ones: two agents fly the same frames in turn."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import time

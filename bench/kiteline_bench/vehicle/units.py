@@ -1,7 +1,5 @@
 """The services: what systemd's own checkers say, and how an agent ends."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import re

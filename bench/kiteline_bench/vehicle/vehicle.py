@@ -1,7 +1,5 @@
 """On the vehicle: what `kiteline bench vehicle` measures, part by part."""
 
-from __future__ import annotations
-
 from kiteline_bench.harness.bars import Run, in_turn
 from kiteline_bench.vehicle import camera, controllers, costs, faults, guided, raw_images, units
 from kiteline_bench.vehicle.sitl import flights

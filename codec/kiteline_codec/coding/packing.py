@@ -1,17 +1,13 @@
 """Numbers to bytes and back: variable-length integers, floats, and columns of integers."""
 
-from __future__ import annotations
-
 import struct
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_codec.coding.packing_kernels import pack_columns, unpack_columns
 from kiteline_codec.coding.residual_column_kernels import LIMIT, pack_residuals, unpack_residuals
+from kiteline_core.arrays import I64
 from kiteline_core.errors import KitelineError
-
-I64 = NDArray[np.int64]
 
 _F64 = struct.Struct("<d")
 _F32 = struct.Struct("<f")

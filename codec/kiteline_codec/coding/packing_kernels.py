@@ -1,14 +1,9 @@
 """Integer columns as one stream of bits. The layout is described in SPEC.md, "Columns"."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import I64, U8
 from kiteline_core.jit import helper, njit
-
-I64 = NDArray[np.int64]
-U8 = NDArray[np.uint8]
 
 MAX_WIDTH = 40  # bits of one packed number: wider than any column needs
 _MAX_VARINT = 1 << 42  # keeps sums of 2048 differences far from the limits of int64

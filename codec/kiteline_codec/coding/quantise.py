@@ -3,19 +3,13 @@
 Decoding uses only +, -, *, / and the square root of IEEE arithmetic, so every machine gets the same bits.
 """
 
-from __future__ import annotations
-
 from math import frexp, ldexp, sqrt
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_codec.coding import quantise_kernels as kernels
+from kiteline_core.arrays import F32, F64, I64
 from kiteline_core.geometry import se3
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 PIXEL_STEPS = 16  # per px: error <= 1/32 px, below a corner's measurement error
 PIXEL_ORIGIN = -64.0  # px: refined keypoints may lie a little outside the image

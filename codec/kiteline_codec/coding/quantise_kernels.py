@@ -1,17 +1,11 @@
 """Quantisers of arrays. The codes are in SPEC.md, "Quantisers"; `quantise` passes the constants."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F32, F64, I64
 from kiteline_core.jit import njit
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 _LARGEST = 1e6  # 1/m: nearer than this takes the last code
 

@@ -4,15 +4,10 @@ Method: the range coder of G. N. N. Martin, 1979, in the binary form of LZMA. A 
 context the probability of 0, in 1/4096, and the rate at which that adapts.
 """
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import I64, U8
 from kiteline_core.jit import helper
-
-I64 = NDArray[np.int64]
-U8 = NDArray[np.uint8]
 
 HALF = 1 << 11
 _ONE = 1 << 12

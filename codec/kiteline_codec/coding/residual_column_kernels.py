@@ -4,16 +4,11 @@ Numbers are Golomb-Rice coded with a parameter that follows their size (M. Weinb
 LOCO-I lossless image compression algorithm", 2000, section III.C), or in a fixed width where that is shorter.
 """
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_codec.coding.packing_kernels import get_bits, get_varint, put_bits, put_varint, varint_bytes, zigzag
+from kiteline_core.arrays import I64, U8
 from kiteline_core.jit import njit
-
-I64 = NDArray[np.int64]
-U8 = NDArray[np.uint8]
 
 FIXED, ABOVE_LEAST, STEPS, AROUND_ZERO = 0, 1, 2, 3  # modes
 MAX_WIDTH = 30  # bits of one number in fixed width

@@ -4,16 +4,11 @@ Walls and floors go on from column to column, and most of what is seen ends at a
 difference from the column before, unless it is that of the obstacle.
 """
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_codec.coding.range_coder_kernels import begin_reading, begin_writing, code, code_even, finish
+from kiteline_core.arrays import I64, U8
 from kiteline_core.jit import helper, njit
-
-I64 = NDArray[np.int64]
-U8 = NDArray[np.uint8]
 
 OBSTACLE, FREE, FREE_FROM, CLEAR, BANDS = range(5)  # rows of columns
 MAX_CODE = 1 << 14  # bytes; of 128 columns and 2048 labels: up to 90 decisions of less than 8 bits in a column

@@ -3,17 +3,9 @@
 Method: contexts from the neighbours, as in JBIG.
 """
 
-from __future__ import annotations
-
-import numpy as np
-from numpy.typing import NDArray
-
 from kiteline_codec.coding.range_coder_kernels import HALF, begin_reading, begin_writing, finish, get, put
+from kiteline_core.arrays import I8, I64, U8
 from kiteline_core.jit import helper, njit
-
-I8 = NDArray[np.int8]
-I64 = NDArray[np.int64]
-U8 = NDArray[np.uint8]
 
 SIDE = 64  # cells along a side of a tile
 MAX_MASK = 7  # of the height bands that are occupied

@@ -1,7 +1,5 @@
 """A byte budget that holds in every one-second window, wherever the window begins, and is spent evenly."""
 
-from __future__ import annotations
-
 from collections import deque
 
 WINDOW_NS = 1_000_000_000

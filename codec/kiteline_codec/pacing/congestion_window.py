@@ -5,8 +5,6 @@ Vegas (L. Brakmo, L. Peterson, 1995): it grows while round trips stay near the r
 Losses do not shrink it: radios lose packets without being congested.
 """
 
-from __future__ import annotations
-
 _FIRST_PACKETS = 10  # a keyframe of the wide profile
 _LEAST_PACKETS = 3
 _USED = 0.75  # share of the window that must be in flight for it to grow

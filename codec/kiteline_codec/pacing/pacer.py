@@ -1,7 +1,5 @@
 """Chooses the profile of a link, and the pause between two keyframes. Pure."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from kiteline_codec.pacing.profiles import RADIO, WIFI, Profile

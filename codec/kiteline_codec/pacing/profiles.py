@@ -1,19 +1,14 @@
 """What a keyframe may cost on a wide and on a thin link. A profile concerns only what the agent writes."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_codec.coding import quantise
 from kiteline_codec.pacing.sections import split, take
 from kiteline_codec.schema import CachedLandmarks, NewLandmarks, Observations
+from kiteline_core.arrays import F32, F64
 from kiteline_core.imaging.descriptors import narrowed
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,17 +1,13 @@
 """A keyframe's keypoints in sections that are useful alone, best first, each short enough for one packet."""
 
-from __future__ import annotations
-
 from dataclasses import fields, replace
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_codec.coding.packing import Writer
 from kiteline_codec.schema import CachedLandmarks, NewLandmarks, Observations, messages
-
-F64 = NDArray[np.float64]
+from kiteline_core.arrays import F64, I64
 
 SECTION_BYTES = 1000  # leaves room for headers and a live pose in a packet of 1200 bytes
 
@@ -51,7 +47,7 @@ def split(record: _Section, value: F64, section_bytes: int = SECTION_BYTES) -> l
     return parts
 
 
-def take(record: _Section, rows: NDArray[np.int64], part: int | None = None) -> _Section:
+def take(record: _Section, rows: I64, part: int | None = None) -> _Section:
     """Some rows of a record, as this part; None for its own."""
     names = (f.name for f in fields(record) if f.name not in ("keyframe", "part"))
     arrays = {name: getattr(record, name).take(rows, 0) for name in names}

@@ -1,7 +1,5 @@
 """The throughput of a link, measured by acknowledgements. Pure."""
 
-from __future__ import annotations
-
 from collections import deque
 
 _WINDOW_NS = 2_000_000_000  # ns over which deliveries are counted

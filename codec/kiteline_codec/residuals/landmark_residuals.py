@@ -1,21 +1,16 @@
 """Residual codes of new landmarks, which need no prediction, and of refined landmarks, predicted from them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_codec.coding.packing import Reader, WireError, Writer
 from kiteline_codec.residuals import prediction_kernels as kernels
 from kiteline_codec.residuals.predictors import Held, Predictors
 from kiteline_codec.schema import Key, NewLandmarks, RefinedLandmarks
 from kiteline_codec.schema.batches import MAX_BATCH, read_batch, write_batch
+from kiteline_core.arrays import I32, I64
 from kiteline_core.ids import MAX_KEYPOINTS
-
-I32 = NDArray[np.int32]
-I64 = NDArray[np.int64]
 
 _DESCRIPTOR_SIZES = (0, 16, 32)
 _MAX_MASK = (1 << 16) - 1

@@ -1,13 +1,10 @@
 """Residual codes of observations: differences from the predicted projections of the landmarks."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_codec.coding.packing import Reader, WireError, Writer
 from kiteline_codec.residuals import prediction_kernels as kernels
@@ -16,10 +13,8 @@ from kiteline_codec.schema import Key, KeyframeHeader, Observations, messages
 from kiteline_codec.schema.columns import read_landmark_table, write_landmark_table
 from kiteline_codec.schema.poses import read_pose, write_pose
 from kiteline_codec.schema.record import MAX_KEYFRAME_ID
+from kiteline_core.arrays import I32, I64
 from kiteline_core.ids import KEYPOINT_BITS, MAX_KEYPOINTS, NO_KEYFRAME, KeyframeId
-
-I32 = NDArray[np.int32]
-I64 = NDArray[np.int64]
 
 _MAX_SHIFT = 8
 _NO_LANDMARKS: tuple[dict[int, int], I32] = ({}, np.empty((5, 0), np.int32))

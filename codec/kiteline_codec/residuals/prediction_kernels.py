@@ -4,16 +4,8 @@ Only + - * / and comparisons of IEEE doubles, each rounded by itself and in the 
 get the same integers on any machine.
 """
 
-from __future__ import annotations
-
-import numpy as np
-from numpy.typing import NDArray
-
+from kiteline_core.arrays import F64, I32, I64
 from kiteline_core.jit import njit
-
-F64 = NDArray[np.float64]
-I32 = NDArray[np.int32]
-I64 = NDArray[np.int64]
 
 _PIXEL_STEPS = 16.0
 _PIXEL_ORIGIN = -64.0

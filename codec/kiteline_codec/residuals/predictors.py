@@ -1,22 +1,16 @@
 """Values of the agent from which residual codes are predicted, decoded once for each version."""
 
-from __future__ import annotations
-
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_codec.coding.packing import Reader, WireError
 from kiteline_codec.residuals import prediction_kernels as kernels
 from kiteline_codec.schema import CameraIntrinsics, Key, KeyframeHeader, NewLandmarks, messages
+from kiteline_core.arrays import F64, I32, I64
 from kiteline_core.ids import MAX_KEYPOINTS, NO_KEYFRAME, KeyframeId, agent_of_keyframe
-
-I32 = NDArray[np.int32]
-I64 = NDArray[np.int64]
-F64 = NDArray[np.float64]
 
 Held = Callable[[Key], tuple[int, bytes] | None]  # version and code of a value that both sides hold
 

@@ -4,8 +4,6 @@ A residual code is predicted from values that the peer is known to hold. It ends
 versions used; a receiver that holds others refuses it, and the sender then sends the code itself.
 """
 
-from __future__ import annotations
-
 from collections import OrderedDict
 from collections.abc import Sequence
 from struct import pack

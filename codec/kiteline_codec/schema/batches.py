@@ -1,7 +1,5 @@
 """The number of the batch with which a correction is to be applied: the last part of its code."""
 
-from __future__ import annotations
-
 from zlib import crc32
 
 from kiteline_codec.coding.packing import Reader, WireError, Writer

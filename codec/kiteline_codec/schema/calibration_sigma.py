@@ -1,13 +1,11 @@
 """What a stereo rig is off by on the wire: factors, and their standard deviation."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_codec.coding import quantise
 from kiteline_codec.coding.packing import Reader, Writer
 from kiteline_codec.coding.quantise import CALIBRATION_SIGMA_CODES, CALIBRATION_STEPS
+from kiteline_core.arrays import F64
 
 _LIMIT = quantise.CALIBRATION_CODES // 2
 
@@ -24,12 +22,12 @@ def read_sigma(source: Reader) -> float | None:
     return code / CALIBRATION_STEPS if code else None
 
 
-def write_factors(out: Writer, px: NDArray[np.float64]) -> None:
+def write_factors(out: Writer, px: F64) -> None:
     """Append factors in px, clipped."""
     for value in px.tolist():
         out.signed(min(max(round(value * CALIBRATION_STEPS), -_LIMIT), _LIMIT))
 
 
-def read_factors(n: int, source: Reader) -> NDArray[np.float64]:
+def read_factors(n: int, source: Reader) -> F64:
     """n factors in px. Raises WireError."""
     return np.array([source.signed(_LIMIT) for _ in range(n)], np.float64) / CALIBRATION_STEPS

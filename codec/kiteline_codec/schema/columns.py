@@ -1,21 +1,17 @@
 """Arrays of a record as columns of integers, and landmark ids as a table of keyframes. See SPEC.md, "Rows"."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_codec.coding import quantise
 from kiteline_codec.coding.packing import Reader, WireError, Writer
 from kiteline_codec.coding.packing_kernels import first_outside
 from kiteline_codec.schema.record import MAX_KEYFRAME_ID
+from kiteline_core.arrays import I64
 from kiteline_core.ids import KEYPOINT_BITS, MAX_KEYPOINTS
-
-I64 = NDArray[np.int64]
 
 _LEAST = np.zeros(2, np.int64)  # of places in a table, and keypoints
 

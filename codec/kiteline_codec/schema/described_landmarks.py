@@ -1,24 +1,17 @@
 """Landmarks with descriptors: what new landmarks and landmarks of the map cache have in common."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_codec.coding.packing import Reader, WireError, Writer
 from kiteline_codec.schema.columns import Columns
 from kiteline_codec.schema.record import MAX_PARTS, Key, Record
+from kiteline_core.arrays import F32, I64, U8, U16
 from kiteline_core.ids import KeyframeId
 from kiteline_core.imaging import descriptors
 from kiteline_core.imaging.descriptors import DESCRIPTOR_BYTES, NARROW_BYTES
-
-F32 = NDArray[np.float32]
-I64 = NDArray[np.int64]
-U8 = NDArray[np.uint8]
-U16 = NDArray[np.uint16]
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,5 @@
 """Records to keys and codes, and back. A code holds everything of a record but its key."""
 
-from __future__ import annotations
-
 from collections import deque
 
 from kiteline_codec.coding.packing import Reader, WireError, Writer

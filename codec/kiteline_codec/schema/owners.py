@@ -1,7 +1,5 @@
 """Whose values are whose, and the memory that they claim where they are used: what an endpoint checks at its door."""
 
-from __future__ import annotations
-
 from kiteline_codec.coding.packing import WireError
 from kiteline_codec.schema import messages
 from kiteline_codec.schema.agent.inertial_steps import InertialSteps

@@ -1,21 +1,17 @@
 """Poses, directions, scales and standard deviations in codes."""
 
-from __future__ import annotations
-
-import numpy as np
-from numpy.typing import NDArray
-
 from kiteline_codec.coding import quantise
 from kiteline_codec.coding.packing import Reader, WireError, Writer
+from kiteline_core.arrays import F64
 
 
-def write_pose(out: Writer, pose: NDArray[np.float64]) -> None:
+def write_pose(out: Writer, pose: F64) -> None:
     """Append a rigid motion (4,4). Raises ValueError."""
     for code in quantise.pose_codes(pose):
         out.signed(code)
 
 
-def read_pose(source: Reader) -> NDArray[np.float64]:
+def read_pose(source: Reader) -> F64:
     """A rigid motion (4,4). Raises WireError."""
     translation = [source.signed(quantise.TRANSLATION_CODES - 1) for _ in range(3)]
     rotation = [source.signed(quantise.ROTATION_STEPS) for _ in range(3)]
@@ -25,13 +21,13 @@ def read_pose(source: Reader) -> NDArray[np.float64]:
         raise WireError(str(e)) from None
 
 
-def write_coarse_pose(out: Writer, pose: NDArray[np.float64]) -> None:
+def write_coarse_pose(out: Writer, pose: F64) -> None:
     """Append a rigid motion (4,4) in the steps of scans. Raises ValueError."""
     for code in quantise.coarse_pose_codes(pose):
         out.signed(code)
 
 
-def read_coarse_pose(source: Reader) -> NDArray[np.float64]:
+def read_coarse_pose(source: Reader) -> F64:
     """A rigid motion (4,4) in the steps of scans. Raises WireError."""
     translation = [source.signed(quantise.COARSE_TRANSLATION_CODES - 1) for _ in range(3)]
     rotation = [source.signed(quantise.COARSE_ROTATION_STEPS) for _ in range(3)]
@@ -41,7 +37,7 @@ def read_coarse_pose(source: Reader) -> NDArray[np.float64]:
         raise WireError(str(e)) from None
 
 
-def write_direction(out: Writer, direction: NDArray[np.float64]) -> None:
+def write_direction(out: Writer, direction: F64) -> None:
     """Append a unit vector (3,). Raises ValueError."""
     half, a, b = quantise.direction_codes(direction)
     out.u8(half)
@@ -49,7 +45,7 @@ def write_direction(out: Writer, direction: NDArray[np.float64]) -> None:
     out.signed(b)
 
 
-def read_direction(source: Reader) -> NDArray[np.float64]:
+def read_direction(source: Reader) -> F64:
     """A unit vector (3,). Raises WireError."""
     half = source.u8()
     if half > 1:

@@ -5,8 +5,6 @@ a new landmark, which has a descriptor and is named by its index, or the observa
 Pixels are those of the rectified left camera. Inverse depth is along the optical axis (z), in 1/m; 0 means unknown.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from enum import Enum, IntEnum
 from typing import Any, ClassVar, NamedTuple, Protocol, Self, TypeVar

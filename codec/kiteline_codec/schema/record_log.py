@@ -1,7 +1,5 @@
 """Shared values in an agent's log, from which a base imports what no link carried."""
 
-from __future__ import annotations
-
 import struct
 
 from kiteline_codec.schema import Key, WireError

@@ -17,8 +17,6 @@ session: a new session of the peer. equal, different: digests were compared. voi
 versions up to that comparison are void. Digests differ only after a defect; the writer then sends everything again.
 """
 
-from __future__ import annotations
-
 from enum import Enum, auto
 
 

@@ -3,8 +3,6 @@
 A page holds all values of one id. It is written and read back as a whole. Pure: the spill file is handed in.
 """
 
-from __future__ import annotations
-
 import heapq
 import struct
 from collections import OrderedDict

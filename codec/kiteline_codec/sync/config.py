@@ -1,7 +1,5 @@
 """How an endpoint uses its link, the order in which values leave, and its statistics."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 

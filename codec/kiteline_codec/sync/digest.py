@@ -4,8 +4,6 @@ Each (key, version, code) is hashed with BLAKE2b; the digest is the sum of the h
 order (M. Bellare, D. Micciancio, "A new paradigm for collision-free hashing", 1997). It detects defects, not attacks.
 """
 
-from __future__ import annotations
-
 from hashlib import blake2b
 
 from kiteline_codec.coding.packing import Writer

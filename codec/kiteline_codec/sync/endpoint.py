@@ -5,8 +5,6 @@ packet is filled, when it may be sent, with the values of highest priority that 
 No message is queued. Packets are described in SPEC.md, states in `agreement`.
 """
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable, Mapping
 

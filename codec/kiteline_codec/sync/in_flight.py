@@ -1,7 +1,5 @@
 """Packets in flight: what each carried, which are acknowledged, which count as lost."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

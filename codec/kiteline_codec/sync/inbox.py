@@ -4,8 +4,6 @@ With a limit, values of keyframes that were not used for long are archived until
 packed.
 """
 
-from __future__ import annotations
-
 import heapq
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ With a limit, keyframes that were not used for long are archived until they are 
 them, old sections of low priority are dropped instead.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 from kiteline_codec.coding.packing import Writer

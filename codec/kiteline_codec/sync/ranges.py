@@ -1,7 +1,5 @@
 """Sets of byte positions as sorted, disjoint, half-open ranges. Immutable; most values have one range or none."""
 
-from __future__ import annotations
-
 Ranges = tuple[tuple[int, int], ...]
 
 NONE: Ranges = ()

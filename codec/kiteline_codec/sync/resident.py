@@ -1,7 +1,5 @@
 """Which values of keyframes are in memory, by last use, and roughly how many bytes they take."""
 
-from __future__ import annotations
-
 from collections import OrderedDict
 
 from kiteline_codec.schema import KEYFRAME_KINDS, Key

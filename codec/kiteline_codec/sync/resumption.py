@@ -4,8 +4,6 @@ After a restart of either side, each lists short checksums of what it holds of t
 then sends a checksum in place of such a code. See SPEC.md, "Session resumption".
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from struct import pack
 from zlib import crc32

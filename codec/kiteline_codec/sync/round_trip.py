@@ -1,7 +1,5 @@
 """The round-trip time of packets, and the time-outs that follow from it."""
 
-from __future__ import annotations
-
 from kiteline_codec.sync.config import SyncConfig
 
 _MAX_DOUBLINGS = 6  # of the time-out while nothing is acknowledged

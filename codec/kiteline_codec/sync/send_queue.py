@@ -1,7 +1,5 @@
 """One own value with what the peer has of it, and the order in which values are sent."""
 
-from __future__ import annotations
-
 import heapq
 from collections import deque
 from collections.abc import Callable

@@ -4,8 +4,6 @@ Source: S. Cheshire, M. Baker, "Consistent overhead byte stuffing", 1999. A fram
 little endian) and a zero byte. After garbage a reader is synchronised again at the next zero.
 """
 
-from __future__ import annotations
-
 from zlib import crc32
 
 from cobs import cobs

@@ -1,7 +1,5 @@
 """What the codec must know about a link."""
 
-from __future__ import annotations
-
 from typing import Protocol
 
 

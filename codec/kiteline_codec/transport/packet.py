@@ -1,7 +1,5 @@
 """One packet: a header of optional fields, then values. See SPEC.md, "Packets"."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from zlib import crc32
 

@@ -4,8 +4,6 @@ An end that must refuse packets tells the other so in a notice of ten bytes (SPE
 and change nothing but what users read.
 """
 
-from __future__ import annotations
-
 from enum import IntEnum
 from zlib import crc32
 

@@ -1,7 +1,5 @@
 """Which of the last numbered packets have been received."""
 
-from __future__ import annotations
-
 
 class SequenceWindow:
     """The highest number received, and which of the `size` numbers below it."""

@@ -5,8 +5,6 @@ in s; `nonce`; `tag`, BLAKE2b of verb and all of these under the key. Each is ta
 other start of the base. A question with another `start` is refused with an error that names the right one.
 """
 
-from __future__ import annotations
-
 import hmac
 import json
 from collections.abc import Callable

@@ -3,8 +3,6 @@
 Optical frames: x right, y down, z forward. Pixel (0, 0) is the centre of the first pixel.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
@@ -13,11 +11,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from kiteline_core.arrays import F32, F64, I16, U8, U16
 from kiteline_core.errors import KitelineError
 from kiteline_core.geometry import se3
-
-U8 = NDArray[np.uint8]
-F64 = NDArray[np.float64]
 
 GRID_STEP = 4  # px between the points of a rectification grid: interpolation errors are below 0.01 px
 VIRTUAL_BASELINE_M = 0.1  # scale of coded inverse depths of cameras without a right image
@@ -117,15 +113,15 @@ class Rectifier:
         self._size, self._left = (left.width, left.height), left
         self._shown_left: Callable[[F64], F64] | None = None  # see correct_left
         self.readout_s = left.readout_s
-        self._maps: list[tuple[NDArray[np.int16], NDArray[np.uint16]] | None] = [None, None]
+        self._maps: list[tuple[I16, U16] | None] = [None, None]
         self.raw_sides: tuple[RawSide, ...] = ()  # left and right, of a pair that is remapped
         self.right_rows: Callable[[F64], F64] | None = None  # see set_right_rows
-        self._depth_map: NDArray[np.int16] | None = None
-        self._halves: list[tuple[NDArray[np.int16], NDArray[np.uint16]] | None] = [None, None]
-        self._told_right_grid: NDArray[np.float32] | None = None  # that of the calibration, once rows were set
+        self._depth_map: I16 | None = None
+        self._halves: list[tuple[I16, U16] | None] = [None, None]
+        self._told_right_grid: F32 | None = None  # that of the calibration, once rows were set
         self.blank = np.zeros((left.height, left.width), np.uint8)
-        self.left_grid: NDArray[np.float32] | None = None  # see _grid; None if the image needs no rectification
-        self.right_grid: NDArray[np.float32] | None = None
+        self.left_grid: F32 | None = None  # see _grid; None if the image needs no rectification
+        self.right_grid: F32 | None = None
         if rig.right is None:
             if left.lens is not Lens.NONE:
                 alone = RawSide(left, np.eye(3), left.matrix())
@@ -181,7 +177,7 @@ class Rectifier:
         columns, rows = ((side + GRID_STEP - 1) // GRID_STEP + 1 for side in self._size)
         before = self._shown_left
 
-        def raw_of(x: F64, y: F64) -> NDArray[np.float32]:
+        def raw_of(x: F64, y: F64) -> F32:
             at = shown(np.stack([x.ravel(), y.ravel()], axis=1))
             at = at if before is None else before(at)
             return self._raw_left(at).reshape(*x.shape, 2).astype(np.float32)
@@ -266,7 +262,7 @@ class Rectifier:
         """Rectify a right image (h, w) uint8. Raises CalibrationError for a wrong size."""
         return self.rectify(1, image)
 
-    def depth(self, depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
+    def depth(self, depth_m: F32) -> F32:
         """Rectify depth (h, w) to the left camera, by nearest neighbour, so that edges are not blended."""
         if depth_m.shape != (self._size[1], self._size[0]):
             raise CalibrationError(
@@ -289,7 +285,7 @@ class Rectifier:
                 f"image is {image.shape[1]}x{image.shape[0]} px, calibration says {self._size[0]}x{self._size[1]}"
             )
 
-    def _full_maps(self, side: int) -> tuple[NDArray[np.int16], NDArray[np.uint16]] | None:
+    def _full_maps(self, side: int) -> tuple[I16, U16] | None:
         """Maps of a full image. Those of the right image are kept only once `rectify` needs them."""
         if self._maps[side] is None and side == 1 and self.raw_sides:
             return _fixed_maps(self.raw_sides[1])
@@ -319,22 +315,20 @@ def undistortion_maps(
     return np.asarray(x), np.asarray(y)
 
 
-def _fixed_maps(raw: RawSide) -> tuple[NDArray[np.int16], NDArray[np.uint16]]:
+def _fixed_maps(raw: RawSide) -> tuple[I16, U16]:
     size = (raw.lens.width, raw.lens.height)
     xy, rest = undistortion_maps(raw.lens, raw.rotation, raw.matrix, size, cv2.CV_16SC2)
     return xy.astype(np.int16, copy=False), rest.astype(np.uint16, copy=False)
 
 
-def _grid(raw: RawSide) -> NDArray[np.float32]:
+def _grid(raw: RawSide) -> F32:
     """Raw pixels (gh, gw, 2) float32 of every GRID_STEP-th rectified pixel, the far border included."""
     size = (raw.lens.width + GRID_STEP, raw.lens.height + GRID_STEP)
     x, y = undistortion_maps(raw.lens, raw.rotation, raw.matrix, size, cv2.CV_32FC1)
     return np.ascontiguousarray(np.stack([x, y], axis=-1)[::GRID_STEP, ::GRID_STEP], np.float32)
 
 
-def _level_maps(
-    grid: NDArray[np.float32], size: tuple[int, int], level: int
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _level_maps(grid: F32, size: tuple[int, int], level: int) -> tuple[F32, F32]:
     """Raw pixels of a pyramid's level, x and y, by a grid. size: of level 0, (w, h)."""
     step = 1 << level
     width, height = (-(-side // step) for side in size)

@@ -4,12 +4,9 @@ The first terms of a homography, c0 + c1 x + c2 y + c3 x^2 + c4 x y in normalise
 and practice of projective rectification").
 """
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
-F64 = NDArray[np.float64]
+from kiteline_core.arrays import F64
 
 TERMS = 5
 

@@ -1,13 +1,11 @@
 """Velocity and angular rate at the end of a row of poses."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np
 
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
-from kiteline_core.geometry.se3 import F64
 
 _QUADRATIC_S = 0.09  # s; over a shorter span noise outweighs what the acceleration explains
 

@@ -7,15 +7,13 @@ What is called many times a frame computes with Python's floats: on so few numbe
 of the arithmetic. The results are the same on every machine, as no library's order of summation enters.
 """
 
-from __future__ import annotations
-
 import math
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-F64 = NDArray[np.float64]
+from kiteline_core.arrays import F64
+
 _Number = TypeVar("_Number", float, F64)
 
 _SMALL_RAD = 1e-7  # below this angle the series is exact to double precision

@@ -4,14 +4,10 @@ The upper left part is a scale times a rotation; the scale converts lengths of b
 similarity of scale 1, with results bit-identical to `se3`.
 """
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
-
-F64 = NDArray[np.float64]
 
 _ONE = 1e-9  # a scale closer to 1 is 1, given the accuracy of orthonormal rotations
 

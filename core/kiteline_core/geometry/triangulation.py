@@ -1,12 +1,8 @@
 """Triangulation of points from rays of cameras with known poses."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
-F64 = NDArray[np.float64]
-Bool = NDArray[np.bool_]
+from kiteline_core.arrays import F64, Bool
 
 
 def rays(pixels: F64, camera: F64, T_m_k: F64) -> tuple[F64, F64]:

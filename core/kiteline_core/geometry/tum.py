@@ -3,11 +3,7 @@
 Stamps are written from integer nanoseconds, so that no digit of a stamp depends on floating point.
 """
 
-from __future__ import annotations
-
-import numpy as np
-from numpy.typing import NDArray
-
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
 
 _NS_PER_S = 1_000_000_000
@@ -19,7 +15,7 @@ def stamp(t_ns: int) -> str:
     return f"{'-' if t_ns < 0 else ''}{whole}.{rest:09d}"
 
 
-def line(t_ns: int, T_a_b: NDArray[np.float64]) -> str:
+def line(t_ns: int, T_a_b: F64) -> str:
     """One line, newline included, of a pose (4,4)."""
     w, x, y, z = se3.quaternion_numbers(T_a_b[:3, :3])
     p = T_a_b[:3, 3].tolist()

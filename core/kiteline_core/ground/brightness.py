@@ -1,21 +1,16 @@
-"""Brightness of a stereo pair: eyes differ in gain, and lenses darken to the corners, so a point has two greys.
+"""Brightness of a stereo pair: cameras differ in gain, and lenses darken to the corners, so a point has two greys.
 
 Semi-global matching compares greys. On plain ground it moves a disparity until the greys agree, and where lenses
 darken that is somewhere else: a low camera's floor got points up to 3 m below it. Both numbers are learned from pairs
 that were matched, and the next pair is matched without them.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-U8 = NDArray[np.uint8]
+from kiteline_core.arrays import F32, F64, U8
 
 _EVERY = 4  # pixels of which one is compared
 _DARK, _BRIGHT = 15, 240  # greys between which an image is neither noise nor saturated
@@ -23,14 +18,14 @@ _UNSATURATED, _TOP = 0.995, 250.0  # share of pixels that stay below this grey: 
 _LEAST = 200  # pixels that tell
 _ROUNDS = 4  # of reweighting
 _LEAST_SIGMA = 0.01  # of a grey's logarithm: noise of images
-_KEPT = 0.8  # of what is known, when another pair is added: exposures of eyes drift apart
+_KEPT = 0.8  # of what is known, when another pair is added: exposures of cameras drift apart
 _STIFFNESS = 1e-5  # for each pixel: what holds the power at 0 where disparities are too small to tell it
 _MOST_POWER, _MOST_GAIN = 6.0, 0.7  # cos^4 is that of a simple lens; the logarithm of 2
 
 
 @dataclass(frozen=True, slots=True)
 class Brightness:
-    """Differences in brightness of a pair's eyes.
+    """Differences in brightness of a pair's cameras.
 
     gain: natural logarithm of left over right. power: of the cosine of the angle to the optical axis, by which both
     images darken. sums: a00, a01, a11, b0, b1 of the normal equations of gain and power.
@@ -51,7 +46,7 @@ class Brightness:
         right = cv2.multiply(pair[1], brighter, scale=float(np.exp(self.gain)), dtype=cv2.CV_8U)
         return np.asarray(left, np.uint8), np.asarray(right, np.uint8)
 
-    def learned(self, pair: tuple[U8, U8], disparity: F32, falloff: F32) -> Brightness:
+    def learned(self, pair: tuple[U8, U8], disparity: F32, falloff: F32) -> "Brightness":
         """What is known with another pair (h,w) as it was taken, and its disparities (h,w) in px, 0 unknown."""
         found, left, right = disparity[::_EVERY, ::_EVERY], pair[0][::_EVERY, ::_EVERY], pair[1][::_EVERY]
         rows, columns = np.nonzero(found > 0.0)
@@ -72,7 +67,7 @@ class Brightness:
         ratio = np.log(a[seen] / b[seen])
         return self._with(ratio, np.asarray(darker, np.float64))
 
-    def _with(self, ratio: F64, darker: F64) -> Brightness:
+    def _with(self, ratio: F64, darker: F64) -> "Brightness":
         """Add observed (n,) logarithms of left over right, robustly."""
         x, total = np.array([np.median(ratio - self.power * darker), self.power]), np.zeros(5)
         for _ in range(_ROUNDS):

@@ -1,7 +1,5 @@
 """Kernels that collect the labelled pixels of columns to a column scan: where free ground begins and ends."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from kiteline_core.ground.level_kernels import BIN_PX

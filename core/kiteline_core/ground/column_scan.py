@@ -1,14 +1,11 @@
 """What one keyframe saw of ground and obstacles, by columns of azimuth in the levelled camera frame."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-F64 = NDArray[np.float64]
+from kiteline_core.arrays import F64, U8
 
 MAX_COLUMNS = 128
 _LEAST_FORWARD = 0.05  # horizontal part of a viewing direction, below which the image's up says what is ahead
@@ -35,7 +32,7 @@ class ColumnScan:
     free_from_m: F64
     free_m: F64
     obstacle_m: F64
-    bands: NDArray[np.uint8]
+    bands: U8
     clear_m: F64
     camera_height_m: float
 

@@ -1,7 +1,5 @@
 """Thresholds of ground segmentation."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 

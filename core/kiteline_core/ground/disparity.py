@@ -1,21 +1,15 @@
 """Measures the disparity image of a rectified stereo pair, stripe by stripe, so that no frame pays for all of it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F32, F64, I16, I64, U8
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ground import level_kernels
 from kiteline_core.ground.brightness import Brightness, falloff
 from kiteline_core.ground.config import GroundConfig
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-U8 = NDArray[np.uint8]
 
 _ENOUGH_BF = 60.0  # px m of a half-size image: 0.4 m of error at 10 m; with more, half of the columns do
 _PAD_PX = 32  # px that the images are continued to the left: far surfaces are measured there as well
@@ -42,7 +36,7 @@ class DisparityCamera:
     columns: int  # of the half-size image in one of these
 
     @staticmethod
-    def of(camera: RectifiedCamera) -> DisparityCamera:
+    def of(camera: RectifiedCamera) -> "DisparityCamera":
         """That of a full-size rectified camera."""
         columns = 2 if camera.stereo and 0.5 * camera.bf > _ENOUGH_BF else 1
         scale, shift = 0.5 / columns, 0.25 * (columns - 1)
@@ -63,7 +57,7 @@ class DisparityCamera:
         out = np.zeros((self.height, self.width), np.float32)
         return np.divide(np.float32(self.bf), depth, out=out, where=depth > 0.0)
 
-    def at(self, uv: F64) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def at(self, uv: F64) -> tuple[I64, I64]:
         """Rows and columns (n,) of pixels (n,2) of the full image."""
         scale, shift = 0.5 / self.columns, 0.25 * (self.columns - 1)
         column = np.clip(np.rint(scale * uv[:, 0] - shift), 0, self.width - 1).astype(np.int64)
@@ -127,7 +121,7 @@ class DisparityStripes:
         return disparity
 
     def learn_brightness(self, disparity: F32) -> None:
-        """Learn how bright the eyes are from the last pair and its disparities (h,w), with 0 for what is masked."""
+        """Learn how bright the cameras are from the last pair and its disparities (h,w), with 0 for what is masked."""
         assert self._taken is not None
         self.brightness = self.brightness.learned(self._taken, disparity, self._falloff)
 
@@ -152,7 +146,7 @@ def _padded(image: U8) -> U8:
     return np.asarray(cv2.copyMakeBorder(image, 0, 0, _PAD_PX, 0, cv2.BORDER_REPLICATE), np.uint8)
 
 
-def unlocked(raw: NDArray[np.int16], first: int = 0) -> F32:
+def unlocked(raw: I16, first: int = 0) -> F32:
     """Disparities (h,w) in px of OpenCV's, in 1/16 px, from a column on; 0 where unknown.
 
     OpenCV's parabolas draw them to whole pixels. Its costs are nearly those of absolute differences, |t - s| at steps s

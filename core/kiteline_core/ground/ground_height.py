@@ -1,19 +1,16 @@
 """Knows how high the ground lies, by the scans of a flight, and which of these scans may be believed."""
 
-from __future__ import annotations
-
 from collections import deque
 from dataclasses import dataclass, replace
 from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64
 from kiteline_core.ground.column_scan import ColumnScan, level_rotation
 from kiteline_core.ground.config import GroundConfig
 from kiteline_core.ground.segmentation import ExpectedGround
 
-F64 = NDArray[np.float64]
 Tag = TypeVar("Tag")
 
 _HELD = 16  # scans that wait until the height is known

@@ -1,7 +1,5 @@
 """Runs the kernels of ground segmentation once, on level ground that ends at a wall."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from kiteline_core.geometry.cameras import RectifiedCamera

@@ -1,14 +1,10 @@
 """The code of a pair of images of which another machine makes a scan: one JPEG image, the right one below the left."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import U8
 from kiteline_core.ground.disparity import DisparityCamera
-
-U8 = NDArray[np.uint8]
 
 _START, _SCAN = 0xD8, 0xDA  # markers
 _FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # those that tell the size of an image

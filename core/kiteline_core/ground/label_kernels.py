@@ -1,7 +1,5 @@
 """Kernels that label pixels by their height above the ground, and find the surfaces that columns see."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from kiteline_core.ground.level_kernels import BIN_PX

@@ -1,13 +1,11 @@
 """Kernels that correct disparities, turn them into points of the levelled camera frame, and count these by column."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from kiteline_core.jit import helper, njit
 
 BIN_PX = 0.25  # px of levelled disparity to a bin
-_MATCHED = 0.2  # of an image column's pixels below the horizon that have a disparity: else both eyes did not see it
+_MATCHED = 0.2  # of an image column's pixels below the horizon that have a disparity: else one camera did not see it
 NO_COLUMN = -1
 _HALF_PX = 4  # px to each side of a pixel in its row that are compared
 _NEARER_PX = 1.5  # px by which another disparity is larger, at least: less is the error of a slanted surface
@@ -93,7 +91,7 @@ def _below(rotation, x, y):  # type: ignore[no-untyped-def]
 
 @helper
 def _matched_columns(disparity, rotation, camera):  # type: ignore[no-untyped-def]
-    """First and last image column that both eyes saw; none if the first is not below the last."""
+    """First and last image column that both cameras saw; none if the first is not below the last."""
     h, w = disparity.shape
     first, last = w, -1
     for u in range(w):
@@ -114,7 +112,7 @@ def level_points(disparity, rotation, camera, bf, offset, far_px, slopes, x_out,
     disparity: (h,w) px, <= 0 unknown. rotation: (3,3) camera to levelled frame. camera: fx, fy, cx, cy in px. bf: px m.
     offset: (5,) error of disparities over normalised image coordinates. far_px: least disparity; smaller ones
     are taken as far. slopes: (n+1,) y/x of the borders of columns, increasing; column n-1 is the last. known_out: (n,2)
-    of a column's pixels below the horizon that both eyes saw: how many have a disparity, and how many there are;
+    of a column's pixels below the horizon that both cameras saw: how many have a disparity, and how many there are;
     zero before.
     """
     h, w = disparity.shape

@@ -1,7 +1,5 @@
 """Kernels that find the ground in the v-disparity: a first path by dynamic programming, then a B-spline."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from kiteline_core.ground.level_kernels import BIN_PX

@@ -7,24 +7,18 @@ The method is that of "Segfloor" (u-disparity, v-disparity, B-spline), in the le
 Beyond it, what a column of azimuth sees is one disparity for each surface, refined by all of its pixels at once.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F32, F64, I64, U8, Bool
 from kiteline_core.geometry import disparity_offset
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ground import column_kernels, label_kernels, level_kernels, profile_kernels
 from kiteline_core.ground.column_scan import ColumnScan, level_rotation
 from kiteline_core.ground.config import GroundConfig
 from kiteline_core.ground.disparity import DisparityCamera
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-U8 = NDArray[np.uint8]
 
 _HEIGHT_STEP_M = 0.05  # of the v-disparity
 _DEPTH_STEP_M = 0.05  # of the pixels' depth below the camera
@@ -222,7 +216,7 @@ class GroundSegmenter:
         )
         return bool(on_curve > _BETTER * on_level)
 
-    def _pixels_near(self, height_m: F64) -> NDArray[np.int64]:
+    def _pixels_near(self, height_m: F64) -> I64:
         """Pixels (bins,) of the v-disparity near a height (bins,) of the camera."""
         found = np.empty(self._bins, np.int64)
         profile_kernels.count_near(self._heights, height_m, _HEIGHT_STEP_M, self.sigma_px, found)
@@ -370,7 +364,7 @@ def _near_height(n: F64, d: F64, slope: F64) -> float:
     return float(heights[by_height[int(np.searchsorted(counts, 0.5 * counts[-1]))]])
 
 
-def _beyond_fall(slope: F64, seen: NDArray[np.bool_], bf: float, steepest: float) -> int:
+def _beyond_fall(slope: F64, seen: Bool, bf: float, steepest: float) -> int:
     """Number of bins, the farthest, that lie beyond ground that falls steeply; 0 if none does.
 
     slope: (bins+1,) -z/x at the borders of bins. seen: (bins,). steepest: m a m.

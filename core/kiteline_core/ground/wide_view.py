@@ -4,25 +4,19 @@ Rectification keeps the middle of each side and cuts off what lens and extrinsic
 wide image. Ground right before the vehicle, and what stands beside it, is seen there.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F32, F64, I16, U8, U16, Bool
 from kiteline_core.geometry.cameras import RawSide, RectifiedCamera, Rectifier, undistortion_maps
 from kiteline_core.ground.config import GroundConfig
 from kiteline_core.ground.disparity import DisparityCamera
 
-Bool = NDArray[np.bool_]
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-U8 = NDArray[np.uint8]
-Fixed = tuple[NDArray[np.int16], NDArray[np.uint16]]  # OpenCV's fastest maps
+Fixed = tuple[I16, U16]  # OpenCV's fastest maps
 
-_ROWS_SEEN = 1  # of a disparity image above and below a pixel: ground in the rest of a block is alike in both eyes
+_ROWS_SEEN = 1  # of a disparity image above and below a pixel: ground in the rest of a block is alike in both images
 _STEP_PX = 8  # of the full image: whole pixels of any disparity image
 
 
@@ -36,7 +30,7 @@ class WideView:
         self._rectifier = rectifier
         self._reach = config.block_px // 2 + 1  # px of a matched block beyond its middle, and of what was interpolated
         self.camera, self._corner = rectifier.camera, np.zeros(2)
-        self._maps: list[Fixed] = []  # of both eyes' half-size images; empty: those of the rectified images
+        self._maps: list[Fixed] = []  # of both cameras' half-size images; empty: those of the rectified images
         self._left_seen: Bool | None = None  # (h,w) of a disparity image: there is a raw pixel
         self._right_seen = np.zeros((0, 1), np.bool_)  # (h,1+w) the same, and a first column beyond the view
         self._rows = rectifier.right_rows  # those of the right image in its map

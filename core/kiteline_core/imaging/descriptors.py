@@ -7,19 +7,16 @@ corners of an image is the true one in 58.7 / 83.0 / 94.1 % of cases; with all 2
 random ones 55.3 / 80.5 / 93.4 %.
 """
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
-U8 = NDArray[np.uint8]
+from kiteline_core.arrays import I64, U8, Bool
 
 _SELECTED = 0x43B29FCB63DD72E201DC8E461C26F9820714B970A6242A9F85399EC9566DD7F5
 DESCRIPTOR_BYTES = 32
 NARROW_BYTES = 16
 MASK: U8 = np.frombuffer(_SELECTED.to_bytes(DESCRIPTOR_BYTES, "little"), np.uint8)  # bit i: byte i // 8, bit i % 8
 _OUTSIDE: U8 = ~MASK
-BITS: NDArray[np.int64] = np.flatnonzero(np.unpackbits(MASK, bitorder="little"))  # (128,)
+BITS: I64 = np.flatnonzero(np.unpackbits(MASK, bitorder="little"))  # (128,)
 
 
 def narrowed(descriptors: U8) -> U8:
@@ -27,7 +24,7 @@ def narrowed(descriptors: U8) -> U8:
     return np.asarray(descriptors & MASK, np.uint8)
 
 
-def is_narrow(descriptors: U8) -> NDArray[np.bool_]:
+def is_narrow(descriptors: U8) -> Bool:
     """Mask (n,) of narrow descriptors (n,32): no other bit is set, which does not happen in a wide one."""
     return np.asarray(~(descriptors & _OUTSIDE).any(axis=1))
 

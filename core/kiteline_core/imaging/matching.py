@@ -1,18 +1,11 @@
 """Matching of binary descriptors between two views: brute force, or guided by predicted pixels."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64, I32, U8, U64
 from kiteline_core.imaging import matching_kernels as kernels
-
-F64 = NDArray[np.float64]
-I32 = NDArray[np.int32]
-U8 = NDArray[np.uint8]
-U64 = NDArray[np.uint64]
 
 _CELL_PX = 32  # of the guided search; it changes its speed alone
 _TURN_BINS = 16  # of the histogram of rotations between the two views; 22.5 degrees each

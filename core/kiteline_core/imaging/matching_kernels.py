@@ -1,16 +1,9 @@
 """Kernels that match 256-bit descriptors by their Hamming distance."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64, I32, U8, U64
 from kiteline_core.jit import helper, njit
-
-F64 = NDArray[np.float64]
-I32 = NDArray[np.int32]
-U8 = NDArray[np.uint8]
-U64 = NDArray[np.uint64]
 
 _M1 = np.uint64(0x5555555555555555)
 _M2 = np.uint64(0x3333333333333333)

@@ -4,20 +4,13 @@ Source: B. Triggs et al., "Bundle adjustment, a modern synthesis", 2000, section
 with an outlier test between them are those of ORB-SLAM2 and of "DS-PTAM: a distributed stereo PTAM".
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64, I32, U8, Bool
 from kiteline_core.optimisation import bundle_border_kernels as border_kernels
 from kiteline_core.optimisation import bundle_kernels as kernels
-
-F64 = NDArray[np.float64]
-I32 = NDArray[np.int32]
-U8 = NDArray[np.uint8]
-Bool = NDArray[np.bool_]
 
 CHI2_2, CHI2_3 = (
     5.991,

@@ -4,8 +4,6 @@ Arrays as in `bundle_kernels`. group (m,) int32: whose offset an observation's d
 offset is terms @ c[group], to be taken off what was measured. c: (g,t), numbered row by row behind the free cameras.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from kiteline_core.jit import njit

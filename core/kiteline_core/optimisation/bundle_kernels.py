@@ -7,8 +7,6 @@ index of each camera among the free ones, increasing, -1 for a fixed camera. A c
 d = [translation, rotation].
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from kiteline_core.jit import njit

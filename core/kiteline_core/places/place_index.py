@@ -6,8 +6,6 @@ of visual elements", 2009 (features of one word count by the likeness of their s
 vocabulary is trained once; consistency of successive candidates is left to the caller.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
@@ -15,15 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from kiteline_core.arrays import F32, F64, I32, I64, U8, U64
 from kiteline_core.imaging.matching import words
 from kiteline_core.places import place_kernels as kernels
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-I32 = NDArray[np.int32]
-I64 = NDArray[np.int64]
-U8 = NDArray[np.uint8]
-U64 = NDArray[np.uint64]
 
 _MAGIC = b"KLW1"
 _HEADER = struct.Struct("<4sBB")

@@ -1,17 +1,8 @@
 """Kernels of the place index: visual words of descriptors, postings, and scores of places."""
 
-from __future__ import annotations
-
-import numpy as np
-from numpy.typing import NDArray
-
+from kiteline_core.arrays import F32, F64, I32, U64
 from kiteline_core.imaging.matching_kernels import count_bits, hamming
 from kiteline_core.jit import njit
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-I32 = NDArray[np.int32]
-U64 = NDArray[np.uint64]
 
 
 @njit

@@ -1,18 +1,13 @@
 """Camera pose from matches between points and pixels: P3P in RANSAC, then robust optimisation."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64, U8, U64, Bool
 from kiteline_core.geometry import se3
 from kiteline_core.pose import pnp_kernels as kernels
 from kiteline_core.pose.pose_kernels import optimise_pose
-
-Bools = NDArray[np.bool_]
-F64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,12 +26,12 @@ class PoseFit:
     """T_c_m: (4,4). inlier: (n,). inliers: their number."""
 
     T_c_m: F64
-    inlier: Bools
+    inlier: Bool
     inliers: int
 
 
 def solve_pnp(
-    points: F64, depth_ray: F64, observed: F64, octave: NDArray[np.uint8], camera: F64, seed: int,
+    points: F64, depth_ray: F64, observed: F64, octave: U8, camera: F64, seed: int,
     config: RansacConfig | None = None,
 ) -> PoseFit | None:  # fmt: skip
     """Camera pose by P3P in RANSAC, then robust optimisation; None without enough inliers.
@@ -64,7 +59,7 @@ def solve_pnp(
     return PoseFit(se3.orthonormalise(T), inlier, int(inliers))
 
 
-def generator_state(seed: int) -> NDArray[np.uint64]:
+def generator_state(seed: int) -> U64:
     """State (1,) of the generator in ransac_kernels: SplitMix64's finaliser, so that close seeds differ."""
     x = (seed + 0x9E3779B97F4A7C15) & 0xFFFFFFFFFFFFFFFF
     x = ((x ^ (x >> 30)) * 0xBF58476D1CE4E5B9) & 0xFFFFFFFFFFFFFFFF

@@ -1,16 +1,10 @@
 """Kernels of P3P in a RANSAC seeded by the caller."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64, U64, Bool
 from kiteline_core.jit import helper, njit
 from kiteline_core.pose.ransac_kernels import draws_needed, reprojection_cost, three
-
-Bools = NDArray[np.bool_]
-F64 = NDArray[np.float64]
-U64 = NDArray[np.uint64]
 
 
 @njit
@@ -186,7 +180,7 @@ def p3p(ray: F64, point: F64, T: F64) -> int:
 
 
 @njit
-def _mark_inliers(T: F64, point: F64, uv: F64, limit_px: F64, camera: F64, inlier: Bools) -> int:
+def _mark_inliers(T: F64, point: F64, uv: F64, limit_px: F64, camera: F64, inlier: Bool) -> int:
     count = 0
     for i in range(point.shape[0]):
         one = reprojection_cost(T, point[i : i + 1], uv[i : i + 1], limit_px[i : i + 1], camera, 2.0)
@@ -198,7 +192,7 @@ def _mark_inliers(T: F64, point: F64, uv: F64, limit_px: F64, camera: F64, inlie
 @njit
 def p3p_ransac(
     point: F64, uv: F64, limit_px: F64, camera: F64, most_draws: int, confidence: float, state: U64, T_c_m: F64,
-    inlier: Bools,
+    inlier: Bool,
 ) -> int:  # fmt: skip
     """The pose of least cost over random triples. point: (n,3) m, n >= 3. uv: (n,2) px. limit_px: (n,) of an inlier.
 

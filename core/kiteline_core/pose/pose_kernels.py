@@ -1,7 +1,5 @@
 """Motion-only optimisation: the camera pose from known points, robust, with the points' own uncertainty."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from kiteline_core.jit import njit

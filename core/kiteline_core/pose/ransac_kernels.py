@@ -1,15 +1,9 @@
 """Kernels shared by all RANSACs: seeded draws, their number, and the cost of a pose."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64, I64, U64
 from kiteline_core.jit import helper, njit
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-U64 = NDArray[np.uint64]
 
 
 @helper

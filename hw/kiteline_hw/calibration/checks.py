@@ -1,15 +1,11 @@
 """Checks of calibration values that all readers share. All raise SourceError; `where` names the file and entry."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraModel, Lens
 from kiteline_hw.ports import SourceError
-
-F64 = NDArray[np.float64]
 
 LONGEST_READOUT_S = 0.2  # no video camera is slower
 _FAR_FROM_MIDDLE = 0.25  # of a side: centres of lenses and of cropped images lie nearer to the middle

@@ -1,15 +1,14 @@
 """EuRoC's sensor.yaml of a camera or an IMU, each with its place T_BS in a frame that all share."""
 
-from __future__ import annotations
-
 import numpy as np
 
+from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraModel, Lens
 from kiteline_hw.calibration.checks import checked_camera, checked_readout, checked_rigid, parse_lens
 from kiteline_hw.calibration.kalibr import IMU_KEYS, imu_numbers
-from kiteline_hw.calibration.nodes import F64, Node
+from kiteline_hw.calibration.nodes import Node
 from kiteline_hw.calibration.told import FilePart, ToldCalibration
 
 _IMU_KEYS = IMU_KEYS | {"rate_hz": "rate_hz"}

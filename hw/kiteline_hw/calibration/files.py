@@ -1,7 +1,5 @@
 """Reads calibration files, whichever tool wrote them, and writes them in the form of any."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

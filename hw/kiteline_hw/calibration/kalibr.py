@@ -1,16 +1,15 @@
 """Kalibr's files: the camera chain, and the IMU before or after the calibration."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np
 
+from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraModel, Lens
 from kiteline_hw.calibration.checks import checked_camera, checked_readout, checked_rigid, parse_lens
-from kiteline_hw.calibration.nodes import F64, Node
+from kiteline_hw.calibration.nodes import Node
 from kiteline_hw.calibration.told import FilePart, ToldCalibration
 from kiteline_hw.ports import SourceError
 

@@ -1,7 +1,5 @@
 """Entries of a YAML file that know where they are, so that each error names file, key and what was expected."""
 
-from __future__ import annotations
-
 import re
 import reprlib
 from collections.abc import Sequence
@@ -10,12 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64
 from kiteline_core.errors import INPUT_FAULTS
 from kiteline_hw.ports import SourceError
-
-F64 = NDArray[np.float64]
 
 _MOST_BYTES = 1 << 16  # calibration files are a few kB
 _MOST_NESTED = 16  # brackets in brackets: calibrations have two; a YAML reader takes time by the square of them
@@ -43,7 +39,7 @@ class Node:
         """The keys of a table; none of anything else."""
         return frozenset(str(k) for k in self.value) if isinstance(self.value, dict) else frozenset()
 
-    def get(self, key: str) -> Node:
+    def get(self, key: str) -> "Node":
         """The entry of a table under a key; its value is None if there is none."""
         if self.value is not None and not isinstance(self.value, dict):
             raise self.error("a table of keys and values")

@@ -1,13 +1,12 @@
 """OpenCV's FileStorage (camera_matrix; M1, D1, M2, D2, R, T of a pair) and ROS' camera_info files, which look alike."""
 
-from __future__ import annotations
-
 import numpy as np
 
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraModel, Lens, Rectifier
 from kiteline_hw.calibration.checks import checked_camera, checked_rigid, parse_lens
-from kiteline_hw.calibration.nodes import F64, Node
+from kiteline_hw.calibration.nodes import Node
 from kiteline_hw.calibration.told import FilePart, ToldCalibration
 
 _FISHEYE_KEYS = ("fisheye_model", "fisheye")

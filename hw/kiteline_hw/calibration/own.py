@@ -1,15 +1,14 @@
 """kiteline's own calibration file: all of a rig in one YAML, exact to the last bit."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import fields
 
+from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry.cameras import CameraModel
 from kiteline_hw.calibration.checks import checked_camera, checked_readout, checked_rigid, parse_lens
 from kiteline_hw.calibration.kalibr import imu_numbers
-from kiteline_hw.calibration.nodes import F64, Node
+from kiteline_hw.calibration.nodes import Node
 from kiteline_hw.calibration.told import FilePart, ToldCalibration
 
 HEAD = "kiteline_calibration"

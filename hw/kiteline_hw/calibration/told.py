@@ -1,20 +1,16 @@
 """Content of calibration files, in one form whichever tool wrote them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraModel, CameraRig
 from kiteline_hw.calibration.checks import checked_baseline
 from kiteline_hw.ports import SourceError
-
-F64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,5 @@
 """What every kind of camera gives: captures with a stamp, and errors that say whether waiting mends them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Protocol
 

@@ -1,7 +1,5 @@
 """Watches one camera: reports each outage once, with its end; counts gaps in the driver's numbering. No clock."""
 
-from __future__ import annotations
-
 STALL_NS = 500_000_000  # ns without a usable image that are an outage: ten frames at 20 Hz
 RESTART_NS = 2_000_000_000  # ns without any image after which the device is closed and opened again
 

@@ -1,7 +1,5 @@
 """Options of a live camera, written behind its devices: `v4l2:/dev/video0?fps=20&calibration=camera.yaml`."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -42,28 +40,28 @@ class LiveOptions:
 def parse(scheme: str, argument: str) -> tuple[str, LiveOptions]:
     """Devices and options of an argument. Raises SourceError."""
     devices, _, query = argument.partition("?")
-    known = {field.name: field.type for field in fields(LiveOptions)}
+    known: dict[str, Any] = {field.name: field.type for field in fields(LiveOptions)}
     options = LiveOptions()
     for item in filter(None, query.split("&")):
         key, _, text = item.partition("=")
         if key not in known:
             raise SourceError(f"{scheme}: unknown option {key!r}: expected one of {', '.join(known)}")
         try:
-            changed: dict[str, Any] = {key: _value(str(known[key]), text)}
+            changed: dict[str, Any] = {key: _value(known[key], text)}
             options = replace(options, **changed)
         except ValueError as error:
-            raise SourceError(f"{scheme}: option {key}={text!r}: expected a {known[key]}") from error
+            raise SourceError(f"{scheme}: option {key}={text!r}: expected a {known[key].__name__}") from error
     if not 1.0 <= options.fps <= 1000.0:
         raise SourceError(f"{scheme}: fps={options.fps:g}: expected 1 to 1000 images a second")
     return devices, options
 
 
-def _value(kind: str, text: str) -> Any:
-    if kind == "bool":
+def _value(kind: type, text: str) -> Any:
+    if kind is bool:
         if text.lower() not in ("", "1", "true", "0", "false"):
             raise ValueError(text)
         return text.lower() not in ("0", "false")
-    return float(text) if kind == "float" else text
+    return float(text) if kind is float else text
 
 
 def read_rig(scheme: str, options: LiveOptions, *, stereo: bool, told: ToldCalibration | None = None) -> CameraRig:

@@ -1,14 +1,12 @@
 """Pairs the images of two live cameras by their stamps, and measures how far apart they are. No clock."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from statistics import median
 
+from kiteline_core.arrays import U8
 from kiteline_core.frame import EncodedImage
-from kiteline_hw.sensors.images import U8
 
 _SKEWS = 100  # pairs over which the skew is told
 _FIRST_SKEWS = 20  # pairs after which it is told first
@@ -17,7 +15,7 @@ _UNPAIRED = 20  # left images in succession without a right one, while right one
 
 
 @dataclass(frozen=True, slots=True)
-class Eye:
+class LiveImage:
     """One decoded image. encoded: the bytes that it was decoded from, or None."""
 
     t_ns: int
@@ -25,7 +23,7 @@ class Eye:
     encoded: EncodedImage | None
 
 
-Pair = tuple[Eye, Eye | None]
+Pair = tuple[LiveImage, LiveImage | None]
 
 
 class LivePairs:
@@ -38,7 +36,10 @@ class LivePairs:
     def __init__(self, tolerance_ns: int, tell: Callable[[str], None]) -> None:
         self._tolerance_ns = tolerance_ns
         self._tell = tell
-        self._waiting: tuple[deque[tuple[Eye, int]], deque[tuple[Eye, int]]] = (deque(maxlen=4), deque(maxlen=4))
+        self._waiting: tuple[deque[tuple[LiveImage, int]], deque[tuple[LiveImage, int]]] = (
+            deque(maxlen=4),
+            deque(maxlen=4),
+        )
         self._skews: deque[int] = deque(maxlen=_SKEWS)
         self._pairs = 0
         self._apart: deque[int] = deque(maxlen=_UNPAIRED)  # of left images that found no partner
@@ -53,9 +54,9 @@ class LivePairs:
         middle = round(median(self._skews))
         return middle, max(abs(skew - middle) for skew in self._skews)
 
-    def add(self, side: int, eye: Eye, now_ns: int) -> list[Pair]:
+    def add(self, side: int, image: LiveImage, now_ns: int) -> list[Pair]:
         """Add an image of the left (0) or right (1) camera; what is complete now, in order of time."""
-        self._waiting[side].append((eye, now_ns))
+        self._waiting[side].append((image, now_ns))
         return self._match()
 
     def expire(self, now_ns: int, patience_ns: int) -> list[Pair]:
@@ -81,9 +82,9 @@ class LivePairs:
                 right.popleft()
         return out
 
-    def _single(self, eye: Eye) -> Pair:
+    def _single(self, image: LiveImage) -> Pair:
         self.alone += 1
-        return eye, None
+        return image, None
 
     def _measure(self, skew_ns: int) -> None:
         self._apart.clear()

@@ -1,7 +1,5 @@
 """A LiveSource over one or two cameras: each is read, decoded and opened again by a thread of its own."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import deque
@@ -9,14 +7,14 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from kiteline_core.arrays import U8
 from kiteline_core.frame import EncodedImage, Frame, ImuCalibration, Trajectory
 from kiteline_core.geometry.cameras import CameraRig
 from kiteline_hw.cameras.camera import Camera, CameraError, Capture
 from kiteline_hw.cameras.camera_watch import CameraWatch
-from kiteline_hw.cameras.live_pairs import Eye, LivePairs, Pair
+from kiteline_hw.cameras.live_pairs import LiveImage, LivePairs, Pair
 from kiteline_hw.ports import SourceReport
 from kiteline_hw.sensors.frames import PAIR_TOLERANCE_NS
-from kiteline_hw.sensors.images import U8
 from kiteline_hw.sensors.raw_pixels import BadImage
 from kiteline_hw.sensors.sensor_bits import SensorBits
 from kiteline_hw.system.clock import MonotonicClock
@@ -192,7 +190,7 @@ class CameraSource:
         now_ns = self._clock.now_ns()
         begin_ns = time.thread_time_ns()
         pixels, encoded = self._grey.decode(capture.image)
-        eyes = self._views(side, pixels, encoded, self._stamp(side, capture.t_ns, now_ns))
+        images = self._views(side, pixels, encoded, self._stamp(side, capture.t_ns, now_ns))
         spent_ns = time.thread_time_ns() - begin_ns
         watch = self._watches[side]
         with self._lock:
@@ -203,22 +201,22 @@ class CameraSource:
             for _ in range(min(1000, watch.missing - missing)):
                 self.report.skip("image lost by camera or driver", f"{watch.missing} before {capture.sequence}")
             if len(self._cameras) == 1:
-                self._give([(eyes[0], eyes[1] if len(eyes) > 1 else None)])
+                self._give([(images[0], images[1] if len(images) > 1 else None)])
             else:
-                self._give(self._pairs.add(side, eyes[0], now_ns))
+                self._give(self._pairs.add(side, images[0], now_ns))
                 self._give(self._pairs.expire(now_ns, self._patience_ns))
 
-    def _views(self, side: int, pixels: U8, encoded: EncodedImage | None, t_ns: int) -> list[Eye]:
+    def _views(self, side: int, pixels: U8, encoded: EncodedImage | None, t_ns: int) -> list[LiveImage]:
         """The views that an image holds. Raises BadImage if it has another size than the calibration."""
         model = self.rig.left if side == 0 or self.rig.right is None else self.rig.right
         width = 2 * model.width if self._side_by_side else model.width
         if pixels.shape != (model.height, width):
             raise BadImage(f"{pixels.shape[1]}x{pixels.shape[0]} px where the calibration says {width}x{model.height}")
         if not self._side_by_side:
-            return [Eye(t_ns, pixels, encoded)]
+            return [LiveImage(t_ns, pixels, encoded)]
         halves = (pixels[:, : model.width], pixels[:, model.width :])
         kept = halves if self.rig.right is not None else halves[:1]
-        return [Eye(t_ns, np.ascontiguousarray(half), None) for half in kept]
+        return [LiveImage(t_ns, np.ascontiguousarray(half), None) for half in kept]
 
     def _stamp(self, side: int, t_ns: int | None, now_ns: int) -> int:
         """The stamp of an image; its arrival where the device has no stamp on our clock."""

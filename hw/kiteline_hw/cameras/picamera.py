@@ -1,7 +1,5 @@
 """`picamera:N[,N]`: cameras on a Raspberry Pi's ribbon cables, through Picamera2 of the system (libcamera)."""
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 import time

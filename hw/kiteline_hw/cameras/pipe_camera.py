@@ -1,7 +1,5 @@
 """A camera behind another program that writes grey PGM images to its standard output, such as ffmpeg."""
 
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import os

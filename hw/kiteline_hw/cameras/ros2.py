@@ -3,8 +3,6 @@
 `?imu=GYRO,ACCEL` joins two topics that hold a half each.
 """
 
-from __future__ import annotations
-
 import queue
 import threading
 import time

@@ -1,7 +1,5 @@
 """One ROS 2 node with its thread: topics in, messages to callbacks. Everything that touches rclpy."""
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 import threading

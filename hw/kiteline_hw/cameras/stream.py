@@ -1,7 +1,5 @@
 """`stream:URL[,URL]`: network cameras and whatever else ffmpeg opens (RTSP, UDP, TCP, HTTP)."""
 
-from __future__ import annotations
-
 import shlex
 
 from kiteline_hw.calibration.told import ToldCalibration

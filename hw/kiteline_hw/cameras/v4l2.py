@@ -1,7 +1,5 @@
 """`v4l2:DEV[,DEV]`: one camera, two, or one whose images hold both views side by side (`?side_by_side=1`)."""
 
-from __future__ import annotations
-
 from kiteline_hw.calibration.told import ToldCalibration
 from kiteline_hw.cameras import live_options
 from kiteline_hw.cameras.camera import CameraError

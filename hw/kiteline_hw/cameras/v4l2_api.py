@@ -3,8 +3,6 @@
 64-bit machines only. Source: the kernel's documentation, "Video for Linux API".
 """
 
-from __future__ import annotations
-
 import ctypes
 import fcntl
 import mmap

@@ -1,7 +1,5 @@
 """A V4L2 device: size, pixel format, rate, exposure and gain; images with the driver's stamps and sequence numbers."""
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import errno

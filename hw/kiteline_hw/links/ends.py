@@ -1,7 +1,5 @@
 """What the ends of all links share: the options they are opened with, and the hub of a link to a single agent."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 

@@ -4,8 +4,6 @@ It imports nothing heavy, because `kiteline --help` prints it. The module of a r
 `open_agent_end(address, options) -> ByteLink` and `open_base_end(address, options) -> LinkHub`.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 # Addresses of a flight controller: of `mavlink:` links and of `--mavlink`.

@@ -1,7 +1,5 @@
 """The link of an agent or a base that works alone."""
 
-from __future__ import annotations
-
 from kiteline_hw.links.ends import LinkOptions, OneLinkHub
 from kiteline_hw.ports import LinkHub
 

@@ -1,7 +1,5 @@
 """Opens the links that users name: SCHEME:ADDRESS of the table in kinds.py."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from importlib import import_module
 from typing import Literal, overload

@@ -1,7 +1,5 @@
 """The bounded queues of a link, between a step loop that never waits and a device thread that may."""
 
-from __future__ import annotations
-
 import threading
 from collections import deque
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """A link, or a hub of links, whose packets are sealed, or watched where they are not; the functions are handed in."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from typing import Protocol
 

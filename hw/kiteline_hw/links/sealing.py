@@ -4,8 +4,6 @@ Sealed by default is every link that others can reach: IP networks, routers, rad
 the base's and its agents' common file of keys is used where there is one.
 """
 
-from __future__ import annotations
-
 import ipaddress
 from dataclasses import dataclass
 from typing import Literal

@@ -1,7 +1,5 @@
 """Packets over a serial port or a transparent radio; the framing is handed in (ports.Framer)."""
 
-from __future__ import annotations
-
 from kiteline_hw.links.ends import LinkOptions, OneLinkHub
 from kiteline_hw.links.queued_link import LinkCounters, QueuedLink
 from kiteline_hw.ports import Framer, LinkError, LinkHub

@@ -1,7 +1,5 @@
 """What a base lets clients do over Zenoh, and the tokens by which two agents with one number are found."""
 
-from __future__ import annotations
-
 import time
 from typing import Any
 

@@ -5,8 +5,6 @@ A Zenoh put may block on a frozen peer, so packets go through a bounded outbox t
 rather than waited for.
 """
 
-from __future__ import annotations
-
 import contextlib
 import secrets
 import threading

@@ -4,8 +4,6 @@ Key: kiteline/1/GROUP/SERVICE/VERB. The request is the payload, or else the sele
 error reply is a text.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import queue

@@ -5,8 +5,6 @@ callbacks are `direct`, and every session opened here is closed at the latest wh
 waits for that: a thread that is inside Zenoh while Python ends makes the process abort.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

@@ -1,7 +1,5 @@
 """The agent's end of a lock-step flight, which outlives the base."""
 
-from __future__ import annotations
-
 from kiteline_hw.lockstep.messages import Down, Up
 from kiteline_hw.lockstep.zenoh_lockstep import LockstepClient
 from kiteline_hw.ports import LinkError

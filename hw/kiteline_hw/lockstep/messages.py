@@ -1,7 +1,5 @@
 """The messages of a lock-step flight: one from each side per tick."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -43,7 +41,7 @@ class Up:
         return _UP.pack(next_ns, flags, len(self.packets)) + _join(self.packets)
 
     @classmethod
-    def decode(cls, message: bytes) -> Up:
+    def decode(cls, message: bytes) -> "Up":
         """Decode a message. Raises LinkError on any other bytes."""
         next_ns, flags, packets = _split(_UP, message)
         return cls(None if next_ns == _NO_FRAME_NS else next_ns, bool(flags & 1), bool(flags & 2), packets)
@@ -62,7 +60,7 @@ class Down:
         return _DOWN.pack(self.now_ns, self.phase, len(self.packets)) + _join(self.packets)
 
     @classmethod
-    def decode(cls, message: bytes) -> Down:
+    def decode(cls, message: bytes) -> "Down":
         """Decode a message. Raises LinkError on any other bytes."""
         now_ns, phase, packets = _split(_DOWN, message)
         try:

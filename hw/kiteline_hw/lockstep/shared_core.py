@@ -1,7 +1,5 @@
 """Modelled CPU time of processes that share the cores of one computer, as a fair scheduler deals it out."""
 
-from __future__ import annotations
-
 from collections import deque
 
 _DONE_NS = 1e-3  # ns of work below which a task counts as done: rounding
@@ -21,7 +19,7 @@ class SharedCore:
         self._processes: list[CoreProcess] = []
         self._now_ns = 0.0
 
-    def process(self) -> CoreProcess:
+    def process(self) -> "CoreProcess":
         """A new process on this computer."""
         self._processes.append(CoreProcess(self))
         return self._processes[-1]
@@ -41,7 +39,7 @@ class SharedCore:
             self._now_ns += least_ns / rate
         self._now_ns = max(self._now_ns, now_ns)
 
-    def free_ns(self, process: CoreProcess) -> int:
+    def free_ns(self, process: "CoreProcess") -> int:
         """When a process will have done its work if no more is added to any."""
         left = [p.work_ns for p in self._processes]
         own, at_ns = self._processes.index(process), self._now_ns

@@ -5,8 +5,6 @@ repeats one that nobody may have received yet, and a repeated one gets the same 
 at once when the other's process ends.
 """
 
-from __future__ import annotations
-
 import queue
 import struct
 import threading
@@ -25,16 +23,13 @@ _RETRY_S = 0.05  # s between two looks for a base that is not there yet
 _REPEAT_S = (0.1, 2.0)  # s after which a message is repeated: before the first answer, and later
 _HEADER = struct.Struct("<IB")  # number of the message, and of an answer its kind
 _ANSWER, _REFUSAL = 0, 1
-
-
-def _prefix(group: str) -> str:
-    return f"kiteline/1/{group}/lockstep"
+_PREFIX = "kiteline/1/default/lockstep"
 
 
 class LockstepClient(Closing):
     """The agent's side. Raises LinkError if no base appears in time."""
 
-    def __init__(self, endpoint: str, agent: int, *, group: str = "default", connect_timeout_s: float = 20.0) -> None:
+    def __init__(self, endpoint: str, agent: int, *, connect_timeout_s: float = 20.0) -> None:
         self._endpoint = endpoint
         self._agent = agent
         self._number = 0
@@ -43,7 +38,7 @@ class LockstepClient(Closing):
         self._events: queue.SimpleQueue[tuple[str, int, bytes]] = queue.SimpleQueue()
         self._session = open_session(endpoint, "client", lease_ms=_LEASE_MS, connect_timeout_s=connect_timeout_s)
         try:
-            prefix = _prefix(group)
+            prefix = _PREFIX
             session_id = self._session.zid()
             down, up = f"{prefix}/down/{agent}/{session_id}", f"{prefix}/up/{agent}/{session_id}"
             self._subscriber = self._session.declare_subscriber(down, direct(self._on_answer))
@@ -130,7 +125,7 @@ class _Message:
 class LockstepServer(Closing):
     """The base's side. Raises LinkError if it cannot listen."""
 
-    def __init__(self, endpoint: str, *, group: str = "default") -> None:
+    def __init__(self, endpoint: str) -> None:
         self._endpoint = endpoint
         self._changed = threading.Condition()
         self._alive: dict[int, set[str]] = {}
@@ -142,7 +137,7 @@ class LockstepServer(Closing):
         self.callback_errors = 0
         self._session = open_session(endpoint, "base", lease_ms=_LEASE_MS)
         try:
-            prefix = self._prefix = _prefix(group)
+            prefix = _PREFIX
             liveliness = self._session.liveliness()
             self._watch = liveliness.declare_subscriber(f"{prefix}/agent/*/*", direct(self._on_agent), history=True)
             self._subscriber = self._session.declare_subscriber(f"{prefix}/up/*/*", direct(self._on_message))
@@ -199,7 +194,7 @@ class LockstepServer(Closing):
         with self._sending:
             kept = self._publishers.get(agent)
             if kept is None or kept[0] != session:
-                key = f"{self._prefix}/down/{agent}/{session}"
+                key = f"{_PREFIX}/down/{agent}/{session}"
                 kept = self._publishers[agent] = session, _publisher(self._session, key)
             kept[1].put(message)
 

@@ -4,8 +4,6 @@ Both processes map the same memory, cut into slots of one image each. A request 
 slot and the length of the PNG in it. The process ends when its input does.
 """
 
-from __future__ import annotations
-
 import contextlib
 import mmap
 import os
@@ -14,13 +12,13 @@ import signal
 import struct
 import subprocess
 import sys
-from collections.abc import Callable
 from concurrent.futures import Future
 
 import numpy as np
 
+from kiteline_core.arrays import U8
 from kiteline_core.frame import EncodedImage
-from kiteline_hw.sensors.images import U8, encode_image, store_image
+from kiteline_hw.sensors.images import encode_image, store_image
 
 _REQUEST, _ANSWER = struct.Struct("<III"), struct.Struct("<II")
 END_S = 2.0  # s in which the process ends once its input has
@@ -28,17 +26,11 @@ _HEADROOM = 4096  # bytes by which a stored PNG exceeds its pixels and rows
 
 
 class EncoderProcess:
-    """A queue of images at another process. Not for several threads.
+    """A queue of images at another process. Not for several threads. What a process that ended left is stored plain."""
 
-    fallback: encodes what the process left behind when it ended before its time.
-    """
-
-    def __init__(
-        self, shape: tuple[int, int], slots: int, fallback: Callable[[U8], EncodedImage] = store_image
-    ) -> None:
+    def __init__(self, shape: tuple[int, int], slots: int) -> None:
         """shape: height and width of the largest image. Raises OSError where no process can be started."""
         h, w = shape
-        self._fallback = fallback
         self._slot_bytes = 2 * (h * (w + 2) + _HEADROOM)
         memory = os.memfd_create("kiteline-images", os.MFD_CLOEXEC)
         try:
@@ -110,7 +102,7 @@ class EncoderProcess:
         sent, self._sent = self._sent, {}
         for slot, (done, (h, w)) in sent.items():
             begin = slot * self._slot_bytes
-            done.set_result(self._fallback(np.frombuffer(self._memory, np.uint8, h * w, begin).reshape(h, w).copy()))
+            done.set_result(store_image(np.frombuffer(self._memory, np.uint8, h * w, begin).reshape(h, w).copy()))
 
     def close(self) -> None:
         """End the process; what it still has is encoded here."""

@@ -4,17 +4,16 @@ OpenCV encodes without Python's lock, so that tracking goes on meanwhile. Nothin
 the caller waits, or stores the image uncompressed.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 
+from kiteline_core.arrays import U8
 from kiteline_core.frame import EncodedImage, Frame
 from kiteline_hw.logs.encoder_process import EncoderProcess
-from kiteline_hw.sensors.images import U8, encode_depth, encode_image, store_image
+from kiteline_hw.sensors.images import encode_depth, encode_image, store_image
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,5 @@
 """Limits what the logs of all starts take on disk: the oldest go first, also those of the flight under way."""
 
-from __future__ import annotations
-
 import os
 import threading
 from pathlib import Path

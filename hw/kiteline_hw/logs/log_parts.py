@@ -1,7 +1,5 @@
 """A log and the parts that it goes on in, NAME_1.mcap, NAME_2.mcap…, read as one."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator
 from pathlib import Path
 

@@ -4,8 +4,6 @@ A cut file yields all messages before the cut, also those of the chunk that was 
 noted. Memory holds one chunk, or the chunks that overlap in time if messages are read in order. Format: mcap.dev/spec.
 """
 
-from __future__ import annotations
-
 import heapq
 import os
 import struct

@@ -27,8 +27,6 @@ Read::
 `open_source("mcap:agent0/log.mcap")` yields the same Frames, ImuBatches and OdometryBatches.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from concurrent.futures import Future
@@ -36,8 +34,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64, I8
 from kiteline_core.frame import EncodedImage, Frame, ImuBatch, ImuCalibration, OdometryBatch, Trajectory
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraModel, CameraRig
@@ -50,8 +48,6 @@ from kiteline_hw.logs.rig_json import LENS_NAMES, rig_to_json
 from kiteline_hw.logs.whole_file import WholeFile
 from kiteline_hw.ports import SourceError
 from kiteline_hw.system.closing import Closing
-
-F64 = NDArray[np.float64]
 
 __all__ = [
     "DEPTH", "GROUND_TRUTH", "IMU", "LEFT", "ODOMETER", "RIG", "RIGHT", "LogMessage", "LogReader", "LogWriter",
@@ -185,7 +181,7 @@ class LogWriter(Closing):
         self._add(topic, t_ns, message)
 
     def grid(
-        self, topic: str, t_ns: int, frame_id: str, cells: NDArray[np.int8], cell_m: float,
+        self, topic: str, t_ns: int, frame_id: str, cells: I8, cell_m: float,
         corner_m: tuple[float, float],
     ) -> None:  # fmt: skip
         """Occupancy (rows, columns) int8, 0..100 percent, -1 unknown; row 0 is the lowest y, corner_m lower left."""

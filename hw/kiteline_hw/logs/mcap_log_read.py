@@ -1,7 +1,5 @@
 """Reading logs back: messages in the order in which they were written, decoded by what their topic holds."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -10,8 +8,8 @@ from typing import Any
 
 import numpy as np
 from google.protobuf.message import DecodeError
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64
 from kiteline_core.errors import INPUT_FAULTS
 from kiteline_core.frame import EncodedImage, Frame, ImuBatch, OdometryBatch
 from kiteline_core.geometry import se3
@@ -21,8 +19,6 @@ from kiteline_hw.ports import SourceError
 from kiteline_hw.sensors.images import decode_depth, decode_grey
 from kiteline_hw.sensors.raw_pixels import BadImage
 from kiteline_hw.system.closing import Closing
-
-F64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,5 @@
 """Completes a log whose writer was killed: adds the index and the end that a finished file has."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from mcap.writer import CompressionType, Writer

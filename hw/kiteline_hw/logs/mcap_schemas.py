@@ -7,8 +7,6 @@ t_ns[], double velocity[], rate[], velocity_cov[], rate_cov[]}: a batch of odome
 protobuf, so that viewers that do not know them can still open the log.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 from foxglove_schemas_protobuf import (

@@ -4,8 +4,6 @@ A message is packed once, its data are not copied, and a chunk is written as the
 that is written once a file is left to the package's records. Format: mcap.dev/spec.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Mapping
 from typing import Protocol

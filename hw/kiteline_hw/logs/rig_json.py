@@ -1,15 +1,13 @@
 """A camera rig and its IMU as JSON, exact to the last bit: the content of a log's topic /rig."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, fields
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64
 from kiteline_core.errors import INPUT_FAULTS
 from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry.cameras import CameraModel, CameraRig, Lens
@@ -59,7 +57,7 @@ def rig_from_json(value: Mapping[str, Any]) -> tuple[CameraRig, ImuCalibration |
         raise SourceError(f"unusable rig in the log ({error!r})") from error
 
 
-def _rigid(rows: Any, name: str) -> NDArray[np.float64]:
+def _rigid(rows: Any, name: str) -> F64:
     """A pose (4,4), as written to the last bit. Raises SourceError, TypeError or ValueError."""
     pose = np.array(rows, np.float64).reshape(4, 4)
     checked_rigid(pose, f"{_WHERE}: {name}")

@@ -1,7 +1,5 @@
 """Temporary storage on disk: an unlinked file, which vanishes with this process."""
 
-from __future__ import annotations
-
 import os
 import tempfile
 from pathlib import Path

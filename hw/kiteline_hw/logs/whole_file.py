@@ -1,7 +1,5 @@
 """Files that a full or failing disk does not leave half written: pieces are appended whole or not at all."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 from pathlib import Path

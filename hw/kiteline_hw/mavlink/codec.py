@@ -1,7 +1,5 @@
 """Encodes and parses MAVLink 2 frames over pymavlink's generated parser."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from pymavlink.dialects.v20 import common

@@ -1,21 +1,15 @@
 """Opens the connection to a flight controller from the user's options."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from kiteline_core.arrays import F64
 from kiteline_core.geometry.cameras import CameraRig
-from kiteline_core.geometry.se3 import F64
 from kiteline_hw.mavlink.controller_imu import ControllerImu
-from kiteline_hw.mavlink.controller_odometry import (
-    ControllerOdometry,
-    ControllerOdometryConfig,
-    parse_odometry_option,
-)
+from kiteline_hw.mavlink.controller_odometry import ControllerOdometry, ControllerOdometryConfig, parse_odometry_option
 from kiteline_hw.mavlink.controller_session import SessionConfig
 from kiteline_hw.mavlink.coordinate_frames import mounting
 from kiteline_hw.mavlink.messages import GlobalOrigin

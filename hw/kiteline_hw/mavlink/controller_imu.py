@@ -4,12 +4,10 @@ MAVLink uses f = MAV_FRAME_BODY_FRD (x forward, y right, z down): an upright veh
 z. HIGHRES_IMU is requested, and if it does not come also the coarser RAW_IMU and SCALED_IMU.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
+from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuBatch
-from kiteline_core.geometry.se3 import F64
 from kiteline_hw.mavlink.controller_odometry import StampClock
 from kiteline_hw.mavlink.messages import HIGHRES_IMU, RAW_IMU, SCALED_IMU, Heartbeat, MessageInterval, VehicleImu
 from kiteline_hw.ports import SourceReport

@@ -5,8 +5,6 @@ orientation (`coordinate_frames.mounting`). The estimate of a controller that fu
 is odometry only if it rests on other sensors (optical flow, GNSS, wheels), which the user has to know.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from kiteline_core import odometry
+from kiteline_core.arrays import F64
 from kiteline_core.frame import OdometryBatch
 from kiteline_core.geometry import se3
-from kiteline_core.geometry.se3 import F64
 from kiteline_hw.mavlink.messages import (
     Attitude,
     Heartbeat,

@@ -4,8 +4,6 @@ Poses are sent in the continuous odometry frame, turned once (`start_frame`). Ma
 controller would see jumps. One system is served: the configured one, else that of the first autopilot found.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -13,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuBatch, OdometryBatch
 from kiteline_core.geometry.end_rates import end_rates
-from kiteline_core.geometry.se3 import F64
 from kiteline_hw.mavlink.codec import MavlinkCodec
 from kiteline_hw.mavlink.controller_imu import ControllerImu
 from kiteline_hw.mavlink.controller_odometry import ControllerOdometry

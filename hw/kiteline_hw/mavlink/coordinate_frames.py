@@ -4,15 +4,13 @@ kiteline: o is continuous and right-handed with z up; b is the body frame of the
 vehicle. MAVLink: l = MAV_FRAME_LOCAL_FRD, x as in o, z down; f = MAV_FRAME_BODY_FRD, x forward, y right, z down.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 
 import numpy as np
 
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
-from kiteline_core.geometry.se3 import F64
 
 # Rotates vectors from o to l: x stays, left becomes right, up becomes down.
 R_L_O: F64 = np.diag([1.0, -1.0, -1.0])

@@ -3,8 +3,6 @@
 Message ids, checksums and wire layouts come from pymavlink's generated dialect `common`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Self

@@ -1,7 +1,5 @@
 """The last pose sent, in a file: an agent that is restarted in flight goes on from it."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

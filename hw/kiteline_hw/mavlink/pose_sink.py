@@ -1,14 +1,12 @@
 """Sends poses to a flight controller over UDP, TCP or a serial port, and carries a tunnel on the same line."""
 
-from __future__ import annotations
-
 import threading
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuBatch, OdometryBatch
-from kiteline_core.geometry.se3 import F64
 from kiteline_hw.mavlink.codec import MavlinkCodec
 from kiteline_hw.mavlink.controller_imu import ControllerImu
 from kiteline_hw.mavlink.controller_odometry import ControllerOdometry

@@ -1,7 +1,5 @@
 """Frames of HIGHRES_IMU, recognised and parsed without pymavlink: two hundred come a second. Pure."""
 
-from __future__ import annotations
-
 import binascii
 import struct
 

@@ -7,16 +7,14 @@ controller believes itself to be, else where the last pose was sent: a controlle
 would swing to any other heading.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
-from kiteline_core.geometry.se3 import F64
 from kiteline_hw.mavlink.messages import Attitude, Heartbeat, LocalPosition, MessageInterval
 from kiteline_hw.ports import PoseSample
 

@@ -1,7 +1,5 @@
 """Runs a survey of a flight controller over a real connection."""
 
-from __future__ import annotations
-
 import threading
 import time
 from pathlib import Path
@@ -13,9 +11,10 @@ from kiteline_hw.mavlink.transport.signing import Signing, StampFile, read_key
 from kiteline_hw.mavlink.transport.url import parse_mavlink_url
 from kiteline_hw.mavlink.watch.findings import Finding
 from kiteline_hw.mavlink.watch.presence import LinkState
-from kiteline_hw.mavlink.watch.survey import ControllerSurvey, SurveyConfig
+from kiteline_hw.mavlink.watch.survey import ControllerSurvey
 from kiteline_hw.ports import Clock
 
+_LIMIT_S = 60.0  # s that a survey takes at most
 _TICK_S = 0.02  # s between two looks at what to send
 _COMPONENT = 191  # MAV_COMP_ID_ONBOARD_COMPUTER; not the agent's, as stamps of signatures are counted for each
 _FLUSH_S = 0.2  # s for the last messages on a serial port
@@ -24,8 +23,8 @@ _FLUSH_S = 0.2  # s for the last messages on a serial port
 class _Surveyor:
     """Connects the survey's messages with a connection's bytes."""
 
-    def __init__(self, url: str, clock: Clock, signing: Signing | None, config: SurveyConfig | None) -> None:
-        self.survey = ControllerSurvey(url, config)
+    def __init__(self, url: str, clock: Clock, signing: Signing | None) -> None:
+        self.survey = ControllerSurvey(url)
         self._clock = clock
         self._codec = MavlinkCodec(component=_COMPONENT, signing=signing)
         self._lock = threading.Lock()
@@ -71,9 +70,7 @@ class _Surveyor:
             self._send(self.survey.stop())
 
 
-def survey_controller(
-    url: str, clock: Clock, key: str = "", limit_s: float = 60.0, config: SurveyConfig | None = None
-) -> list[Finding]:
+def survey_controller(url: str, clock: Clock, key: str = "") -> list[Finding]:
     """Ask the flight controller at a URL; takes seconds. Raises LinkError for a URL or key that cannot be used.
 
     key: a file with the key of MAVLink's signatures; "": messages are not signed.
@@ -82,10 +79,10 @@ def survey_controller(
     if key:
         path = Path(key)
         signing = Signing(read_key(path), StampFile(path.with_name(f"{path.name}.doctor_stamp")))
-    surveyor = _Surveyor(url, clock, signing, config)
+    surveyor = _Surveyor(url, clock, signing)
     surveyor.connection.start()
     try:
-        surveyor.done.wait(limit_s)
+        surveyor.done.wait(_LIMIT_S)
         surveyor.stop()
         time.sleep(_FLUSH_S)
     finally:

@@ -1,7 +1,5 @@
 """Turns encoded images and inertial samples into Frames and ImuBatches: pairs them by time, decodes, checks sizes."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
@@ -10,6 +8,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from kiteline_core.arrays import I64
 from kiteline_core.frame import EncodedImage, Frame, ImuBatch
 from kiteline_core.geometry.cameras import CameraModel, CameraRig
 from kiteline_hw.calibration.checks import doubts
@@ -39,11 +38,11 @@ class EncodedFrame:
     depth: ImageRef | None = None
 
 
-def pair_tolerance_ns(stamps_ns: NDArray[np.int64], most_ns: int = PAIR_TOLERANCE_NS) -> int:
+def pair_tolerance_ns(stamps_ns: I64) -> int:
     """Largest time difference of a pair: half the frame period at most, so that an image never fits two frames."""
     if len(stamps_ns) < 2:
-        return most_ns
-    return min(most_ns, int(np.median(np.diff(stamps_ns))) // 2)
+        return PAIR_TOLERANCE_NS
+    return min(PAIR_TOLERANCE_NS, int(np.median(np.diff(stamps_ns))) // 2)
 
 
 class SkewNote:

@@ -3,8 +3,6 @@
 PNG (RFC 2083), JPEG (ITU T.81, frame headers SOF), BMP, netpbm, TIFF 6.0 (tags 256 and 257) and WebP (RFC 9649).
 """
 
-from __future__ import annotations
-
 import struct
 
 from kiteline_core.errors import INPUT_FAULTS

@@ -4,8 +4,6 @@ Grey images are (h, w) uint8. A depth image is 16-bit PNG whose format carries i
 stored value divided by 5000 is metres, 0 unknown.
 """
 
-from __future__ import annotations
-
 import struct
 import zlib
 from dataclasses import dataclass
@@ -15,12 +13,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from kiteline_core.arrays import F32, U8, U16
 from kiteline_core.frame import EncodedImage
 from kiteline_hw.sensors.image_size import size_of
 from kiteline_hw.sensors.raw_pixels import BadImage, RawPixels
-
-U8 = NDArray[np.uint8]
-F32 = NDArray[np.float32]
 
 DEPTH_FORMAT = "png/1000"  # millimetres: what our logs write if a source has no encoded depth
 
@@ -82,7 +78,7 @@ def decode_grey(ref: ImageRef) -> tuple[U8, EncodedImage | None]:
     return np.asarray(pixels, np.uint8), image
 
 
-def decode_words(image: EncodedImage) -> NDArray[np.uint16] | None:
+def decode_words(image: EncodedImage) -> U16 | None:
     """Grey values (h, w) of an image of 16 bits; None for one of 8, which is not decoded. Raises BadImage."""
     kind = detect_format(image.data)
     if kind not in _FORMATS_OF_16 or (kind == "png" and image.data[24:25] != _PNG_16):

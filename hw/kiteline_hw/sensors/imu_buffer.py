@@ -1,17 +1,12 @@
 """Buffers inertial samples until the next frame; drops and counts non-finite and out-of-order ones."""
 
-from __future__ import annotations
-
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64, I64, Bool
 from kiteline_core.frame import ImuBatch
 from kiteline_hw.ports import SourceReport
-
-I64 = NDArray[np.int64]
-F64 = NDArray[np.float64]
 
 _LEAP_NS = 1_000_000_000  # ns; no IMU pauses that long and then goes back in time
 
@@ -82,7 +77,7 @@ class ImuStream:
         return ImuBatch(times, rows[:, :3].copy(), rows[:, 3:].copy())
 
 
-def _usable(t_ns: I64, gyro: F64, accel: F64, last_ns: int, report: SourceReport) -> NDArray[np.bool_]:
+def _usable(t_ns: I64, gyro: F64, accel: F64, last_ns: int, report: SourceReport) -> Bool:
     """Mask (n,) of finite samples whose stamps increase, also over `last_ns`; counts the others in the report."""
     if np.isfinite(gyro).all() and np.isfinite(accel).all() and len(t_ns) and t_ns[0] > last_ns:
         if (t_ns[1:] > t_ns[:-1]).all():

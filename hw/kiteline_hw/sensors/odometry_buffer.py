@@ -1,17 +1,13 @@
 """Buffers an odometer's velocities until the next frame; drops and counts non-finite and out-of-order ones."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_core import odometry
+from kiteline_core.arrays import F64, I64
 from kiteline_core.frame import UNMEASURED, Frame, ImuBatch, OdometryBatch
 from kiteline_hw.ports import SourceReport
-
-F64 = NDArray[np.float64]
 
 VELOCITY_SIGMA_M_S = 0.1  # m/s; of a device that reports no variance
 RATE_SIGMA_RAD_S = 0.05  # rad/s; likewise
@@ -52,7 +48,7 @@ class OdometerStream:
         self._last_ns = int(batch.t_ns[keep][-1])
         return odometry.chosen(batch, keep)
 
-    def _note(self, reason: str, t_ns: NDArray[np.int64]) -> None:
+    def _note(self, reason: str, t_ns: I64) -> None:
         if self._report is not None:
             for t in t_ns:
                 self._report.skip(reason, f"at {t} ns")

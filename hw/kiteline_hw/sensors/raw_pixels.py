@@ -1,7 +1,5 @@
 """Uncompressed images of ROS and Foxglove messages, and their conversion to grey values or metres."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,8 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-U8 = NDArray[np.uint8]
-F32 = NDArray[np.float32]
+from kiteline_core.arrays import F32, U8, U16
 
 _TO_GREY = {
     "bgr8": (3, cv2.COLOR_BGR2GRAY),
@@ -39,7 +36,7 @@ class BadImage(Exception):
     """An image that cannot be used; the text says why. Raised only in this package: sources count it as skipped."""
 
 
-def grey_of_words(words: NDArray[np.uint16], bits: int) -> U8:
+def grey_of_words(words: U16, bits: int) -> U8:
     """Grey values (h, w) of 8 bits from the lowest `bits` of words of 16; brighter ones are clipped."""
     return np.asarray(np.minimum(words >> (bits - 8), 255), np.uint8)
 

@@ -2,8 +2,6 @@
 black.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import replace
@@ -11,8 +9,9 @@ from itertools import islice
 
 import numpy as np
 
+from kiteline_core.arrays import U8
 from kiteline_core.frame import EncodedImage
-from kiteline_hw.sensors.images import U8, ImageRef, decode_grey, decode_words, read_encoded
+from kiteline_hw.sensors.images import ImageRef, decode_grey, decode_words, read_encoded
 from kiteline_hw.sensors.raw_pixels import SENSOR_BITS, BadImage, RawPixels, grey_of_words
 
 _LOOKED_AT = 60  # images: two or three seconds, in which an automatic exposure settles
@@ -22,7 +21,7 @@ _MOST_BITS = 16
 class SensorBits:
     """Decodes grey images, and scales those of 16 bits by the fewest bits that hold the brightest pixel so far.
 
-    After 60 such images the bits stay; both eyes of a pair share them.
+    After 60 such images the bits stay; both cameras of a pair share them.
     """
 
     def __init__(self, bits: int | None = None) -> None:

@@ -3,15 +3,13 @@
 RealSense's driver publishes both apart unless it is told otherwise, at 200 to 400 Hz and at 63 to 250 Hz.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64
 from kiteline_hw.ports import SourceReport
 
 GAP_NS = 50_000_000  # ns between two accelerations above which none is interpolated: slower than any such sensor
@@ -25,9 +23,7 @@ class ImuJoiner:
     waits for the acceleration after it, by stamps.
     """
 
-    def __init__(
-        self, report: SourceReport, R_g_a: NDArray[np.float64] | None = None, wait_ns: int = 2 * GAP_NS
-    ) -> None:
+    def __init__(self, report: SourceReport, R_g_a: F64 | None = None, wait_ns: int = 2 * GAP_NS) -> None:
         self._report, self._wait_ns = report, wait_ns
         self._R_g_a = None if R_g_a is None or np.allclose(R_g_a, np.eye(3), atol=1e-9) else R_g_a
         self._rates: deque[tuple[int, Row]] = deque()

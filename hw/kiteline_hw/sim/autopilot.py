@@ -5,8 +5,6 @@ arrive and its parameters let it use them. Sources: ArduPilot's GCS_Common, GCS_
 mavlink_parameters and EKF2.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """The options of a simulated flight, and their parser."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields
 
 from kiteline_core.geometry.cameras import Lens

@@ -4,8 +4,6 @@ Sources: ArduPilot GCS_Common handle_odometry and AP_VisualOdom; PX4 mavlink_rec
 timesync. Real controllers drop messages silently; the model counts them by reason.
 """
 
-from __future__ import annotations
-
 import math
 import socket
 import threading
@@ -43,7 +41,7 @@ class VisionSample:
 class FlightController:
     """The model: bytes in, answers out, time handed in (its own clock). kind: whose rules apply."""
 
-    def __init__(self, kind: Literal["ardupilot", "px4"], *, system: int = 1, quality_min: int = 0) -> None:
+    def __init__(self, kind: Literal["ardupilot", "px4"], *, system: int = 1) -> None:
         self.kind = kind
         self.system = system
         self.codec = MavlinkCodec(system, 1)
@@ -52,7 +50,6 @@ class FlightController:
         self.heartbeats: Counter[tuple[int, int]] = Counter()
         self.resets = 0
         self.clock_offset_ns: int | None = None  # companion's clock less ours
-        self._quality_min = quality_min
         self._next_heartbeat_ns = 0
         self._next_timesync_ns = 0
 
@@ -119,7 +116,7 @@ class FlightController:
         """Why ArduPilot drops the message, or None."""
         if m.frame_id != 20 or m.child_frame_id != 12:
             return f"frames {m.frame_id} and {m.child_frame_id} are not LOCAL_FRD and BODY_FRD"
-        if m.quality < self._quality_min:
+        if m.quality < 0:  # VISO_QUAL_MIN
             return "quality below VISO_QUAL_MIN"
         if not all(map(math.isfinite, (*m.position_m, *m.q, *m.velocity_m_s))):
             return "a filter poisoned by NaN"  # ArduPilot itself would not notice
@@ -137,7 +134,7 @@ class FlightController:
             return "position is not finite"
         if abs(math.hypot(*m.q) - 1.0) > 1e-3:
             return "quaternion is not of unit length"
-        if m.quality < self._quality_min:
+        if m.quality < 0:  # VISO_QUAL_MIN
             return "quality below EKF2_EV_QMIN"
         return None
 
@@ -165,12 +162,12 @@ def _rotate(q: tuple[float, float, float, float], v: Vector) -> Vector:
 class UdpFlightController(Closing):
     """The model behind a UDP socket on this machine, with a thread. clock_offset_ns: its clock less CLOCK_MONOTONIC."""
 
-    def __init__(self, model: FlightController, *, port: int = 0, clock_offset_ns: int = 0) -> None:
+    def __init__(self, model: FlightController, *, clock_offset_ns: int = 0) -> None:
         self.model = model
         self.lock = threading.Lock()
         self._offset_ns = clock_offset_ns
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._socket.bind(("127.0.0.1", port))
+        self._socket.bind(("127.0.0.1", 0))
         self._socket.settimeout(0.02)
         self.port: int = self._socket.getsockname()[1]
         self._peer: tuple[str, int] | None = None

@@ -1,7 +1,5 @@
 """`sim:SCENE[?key=value&…]`: a flight through a simulated world, rendered while it is read."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -10,9 +8,9 @@ from functools import cached_property
 from pathlib import Path as FilePath
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_core import odometry
+from kiteline_core.arrays import F64, U8
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration, OdometryBatch, Trajectory
 from kiteline_core.geometry.cameras import CameraRig, Lens
 from kiteline_hw.ports import FrameSource, SourceError, SourceReport
@@ -33,12 +31,10 @@ from kiteline_hw.sim.world.surfaces import with_difficult_surfaces
 from kiteline_hw.sim.world.world import World
 from kiteline_hw.sources.overrides import SourceView
 
-F64 = NDArray[np.float64]
-
 START_NS = 1_000_000_000  # stamp of flight time zero
 
 
-def open_sim(scene: str, workers: int = 1, **options: object) -> SimSource:
+def open_sim(scene: str, workers: int = 1, **options: object) -> "SimSource":
     """A simulated flight. scene: with options, as in `hall?seed=3&seconds=20&trajectory=F&mono=1`.
 
     options: fields of SimConfig. workers > 1 renders ahead in threads, with identical frames. Raises SourceError.
@@ -147,7 +143,7 @@ class SimSource:
         noise = (c.read_noise, c.shot_noise)
         t_s = float(self._exposed_ns[k] - START_NS) * 1e-9
         shutter = Shutter(c.exposure_s, c.readout_s, c.flicker, LAMP_HZ * t_s % 1.0)
-        images: list[NDArray[np.uint8]] = []
+        images: list[U8] = []
         for side, camera in enumerate(cameras if self._has_partner[k] else cameras[:1]):
             gain = float(self._gains[k]) * (1.0, 0.97)[side]
             key = ((c.flight_seed << 36) + (2 * k + side) * 0xD1342543DE82) & ((1 << 63) - 1)

@@ -1,7 +1,5 @@
 """The camera of a flat camera.yaml, and the read-out that several forms tell."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from kiteline_core.geometry.cameras import CameraModel, Lens

@@ -4,8 +4,6 @@ TUM-VI's folders have the same layout without a sensor.yaml: their calibration i
 mav0 or in dso.
 """
 
-from __future__ import annotations
-
 import contextlib
 import heapq
 from collections.abc import Callable, Iterator

@@ -5,8 +5,6 @@ k1 k2 p1 p2 k3, for a pair baseline_m, and rate_hz (default 10) if the file name
 digits is a stamp in ns, one with a decimal point a stamp in seconds.
 """
 
-from __future__ import annotations
-
 import glob
 from collections.abc import Iterator
 from pathlib import Path

@@ -4,8 +4,6 @@ It imports nothing heavy, because `kiteline --help` prints it. The module of a r
 `open_source(argument, mono, imu) -> FrameSource`.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 

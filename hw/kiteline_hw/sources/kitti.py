@@ -5,8 +5,6 @@ K [I | t]; the baseline is the difference of the two t along x. The components o
 the colour cameras) are ignored: the images were rectified so that their rows agree. Raw drives: see kitti_raw.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -4,8 +4,6 @@ The calibration is that of the day, one folder above the drive, or beside the im
 too few for an IMU.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path

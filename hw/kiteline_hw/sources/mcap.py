@@ -1,7 +1,5 @@
 """Recordings of messages as sources: ROS 2 bags, Foxglove recordings, kiteline logs (which yield identical frames)."""
 
-from __future__ import annotations
-
 import heapq
 import json
 from collections import deque
@@ -68,7 +66,7 @@ STANDARD_GRAVITY = 9.80665  # m/s^2
 _MAX_DYNAMIC_TRANSFORMS = 2000  # messages of moving transforms that are read besides the static ones
 
 
-def open_source(path_name: str, mono: bool, imu: bool, told: ToldCalibration | None = None) -> McapSource:
+def open_source(path_name: str, mono: bool, imu: bool, told: ToldCalibration | None = None) -> "McapSource":
     """Open a recording, or the bag in a folder. told: in place of a bag's calibration. Raises SourceError."""
     return McapSource(open_bag(Path(path_name)), mono, imu, told)
 

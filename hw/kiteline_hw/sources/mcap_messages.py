@@ -1,7 +1,5 @@
 """Decodes messages of ROS 2 (CDR) and Foxglove (protobuf, JSON) and converts them to our types."""
 
-from __future__ import annotations
-
 import base64
 import json
 import struct

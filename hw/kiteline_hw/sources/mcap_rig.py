@@ -5,8 +5,6 @@ recognise rectified images ("image_rect"). The extrinsics come from static trans
 of a rectified pair. The body frame is that of the IMU, else the root of the transforms.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 

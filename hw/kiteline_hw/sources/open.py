@@ -1,7 +1,5 @@
 """Opens the source that a SOURCE argument names, or that a plain path holds."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path

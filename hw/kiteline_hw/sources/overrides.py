@@ -1,17 +1,15 @@
 """Views of a source: with the right image, depth or IMU left out, with another IMU, or with another calibration."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 
 from kiteline_core import odometry
+from kiteline_core.arrays import F64
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration, OdometryBatch, Trajectory
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraModel
-from kiteline_core.geometry.se3 import F64
 from kiteline_hw.calibration.told import ToldCalibration
 from kiteline_hw.ports import FrameSource, LiveSource, SourceError, is_live
 

@@ -1,7 +1,5 @@
 """A FrameSource over files on disk: what the readers of data set folders return."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Text files of data sets: tables, the flat YAML of sensors, times in seconds, TUM trajectories."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from decimal import Decimal, InvalidOperation

@@ -1,7 +1,5 @@
 """TUM RGB-D folders: rgb.txt and depth.txt list stamped images; depth is aligned with the colour image; no body."""
 
-from __future__ import annotations
-
 import heapq
 import re
 from collections.abc import Iterator

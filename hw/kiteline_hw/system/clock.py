@@ -1,7 +1,5 @@
 """The clock of the live programs."""
 
-from __future__ import annotations
-
 import time
 
 

@@ -1,7 +1,5 @@
 """Lets a `with` block close what it opened."""
 
-from __future__ import annotations
-
 from typing import Self
 
 

@@ -1,9 +1,9 @@
 """Load, memory and temperature of this computer, from /proc and /sys."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
+
+_PROC = Path("/proc")
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,17 +18,16 @@ class Computer:
 
 
 class ComputerReader:
-    """Reads the state of this computer. proc, sys: where to look."""
+    """Reads the state of this computer."""
 
-    def __init__(self, proc: Path = Path("/proc"), sys: Path = Path("/sys")) -> None:
-        self._proc, self._sys = proc, sys
+    def __init__(self) -> None:
         self._before: dict[str, tuple[int, int]] = {}  # idle and all ticks by core
 
     def read(self) -> Computer:
         """The state now. What cannot be read is unknown."""
         total, free = self._memory_kib("MemTotal"), self._memory_kib("MemAvailable")
         used = None if total is None or free is None else (total - free) // 1024
-        uptime = self._text(self._proc / "uptime").split()
+        uptime = self._text(_PROC / "uptime").split()
         return Computer(
             round(float(uptime[0]) * 1000) if uptime else 0,
             self._load(),
@@ -39,7 +38,7 @@ class ComputerReader:
 
     def _load(self) -> tuple[int, ...]:
         out = []
-        for line in self._text(self._proc / "stat").splitlines():
+        for line in self._text(_PROC / "stat").splitlines():
             name, *ticks = line.split()
             if not (name.startswith("cpu") and name != "cpu") or len(ticks) < 5:
                 continue
@@ -50,13 +49,13 @@ class ComputerReader:
         return tuple(out)
 
     def _memory_kib(self, key: str) -> int | None:
-        for line in self._text(self._proc / "meminfo").splitlines():
+        for line in self._text(_PROC / "meminfo").splitlines():
             if line.startswith(f"{key}:"):
                 return int(line.split()[1])
         return None
 
     def _hottest(self) -> int | None:
-        texts = [self._text(path).strip() for path in self._sys.glob("class/thermal/thermal_zone*/temp")]
+        texts = [self._text(path).strip() for path in Path("/sys").glob("class/thermal/thermal_zone*/temp")]
         degrees = [int(text) // 1000 for text in texts if text.lstrip("-").isdecimal()]
         return max(degrees, default=None)
 

@@ -1,7 +1,5 @@
 """CPU time of this process, and a limit on processes by the kernel (cgroup v1 or v2)."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 import os

@@ -3,8 +3,6 @@
 The compiler keeps 200 MiB that its process never returns, so it must not run in the process that flies.
 """
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import hashlib

@@ -5,8 +5,6 @@ with the types of their arguments. Several processes share the listed kernels ou
 numba's cache; then `warm` loads them from there, and compiles what is missing. `--list MODULE...` writes the lists.
 """
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import fcntl

@@ -4,8 +4,6 @@ The key of an agent seals its packets; that of `maps` gives the right to change 
 letters and digits (Crockford's base 32), for a person to type on the agent; keys are made of it by scrypt (RFC 7914).
 """
 
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import hashlib

@@ -1,7 +1,5 @@
 """Work of minutes in a service of systemd: it is not taken for a hang, and a request to stop ends it at once."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal

@@ -1,7 +1,5 @@
 """Resident memory of this process, and ways to return unused memory to the system."""
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import gc

@@ -1,7 +1,5 @@
 """What a process has to tell its user about files and devices: each trouble once."""
 
-from __future__ import annotations
-
 
 class Notices:
     """Lines for the user, from any thread; one of each subject."""

@@ -1,7 +1,5 @@
 """Signals, systemd, the pipe to the parent process, and the folder for what survives a restart."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

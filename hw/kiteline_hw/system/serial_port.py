@@ -1,7 +1,5 @@
 """A serial port in a thread of its own: exclusive, never blocking, reopened with back-off after a hang-up."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import os

@@ -5,8 +5,6 @@ waits for the disk before its number is used: a cut leaves the other slot. A fil
 cloned card to another machine, begins at numbers drawn at random; so does a start whose number cannot be kept.
 """
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import fcntl

@@ -1,7 +1,5 @@
 """The visual vocabulary that ships with kiteline."""
 
-from __future__ import annotations
-
 from importlib.resources import files
 
 from kiteline_core.places.place_index import Vocabulary, unpack

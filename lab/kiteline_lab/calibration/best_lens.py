@@ -1,18 +1,14 @@
 """Calibrates with the lens that was asked for, or with the one that fits better."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64
 from kiteline_core.geometry.cameras import Lens
 from kiteline_lab.calibration.solve import Calibrated, CalibrationFailed, calibrate
 from kiteline_lab.calibration.views import View
-
-F64 = NDArray[np.float64]
 
 
 def best_lens(

@@ -1,19 +1,14 @@
 """Calibration boards: chessboards, and ChArUco boards, which may be seen in part; drawing and detection."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 from functools import cached_property
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64, I64, U8
 from kiteline_core.errors import KitelineError
-
-U8 = NDArray[np.uint8]
-F64 = NDArray[np.float64]
 
 FORMS = (
     "charuco:COLUMNSxROWS:SQUARE_M[:MARKER_M[:DICTIONARY]] or chessboard:COLUMNSxROWS:SQUARE_M (squares, not corners)"
@@ -32,7 +27,7 @@ class BoardError(KitelineError):
 class Corners:
     """Corners of a board in an image. ids: (n,) which; px: (n, 2) where."""
 
-    ids: NDArray[np.int64]
+    ids: I64
     px: F64
 
 

@@ -1,7 +1,5 @@
 """`kiteline calibrate camera|board|imu|export`: cameras by a board, IMUs by a motion; boards and conversions."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys
@@ -12,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from kiteline_core.arrays import U8
 from kiteline_core.errors import KitelineError
 from kiteline_core.frame import Frame, ImuBatch, OdometryBatch
 from kiteline_hw.calibration.files import FORMS, read_calibration
@@ -21,7 +20,7 @@ from kiteline_hw.sources.kinds import source_forms
 from kiteline_hw.sources.open import open_source
 from kiteline_lab.calibration import boards, imu
 from kiteline_lab.calibration.best_lens import best_lens
-from kiteline_lab.calibration.boards import U8, Board, parse_board
+from kiteline_lab.calibration.boards import Board, parse_board
 from kiteline_lab.calibration.picture import residual_picture
 from kiteline_lab.calibration.solve import Calibrated
 from kiteline_lab.calibration.verdict import Finding, judge, overall

@@ -1,7 +1,5 @@
 """`kiteline calibrate imu`: the IMU against the camera by a guided motion, into the rig file."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

@@ -4,17 +4,13 @@ Rotations of the images against the gyro tell its scales and axes, the camera's 
 about an axis tell the column of that axis. Gravity along an axis tells that column of the accelerometer.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.inertial.calibration.known_imu import KnownImuConfig
+from kiteline_core.arrays import F64
 from kiteline_lab.calibration.verdict import Finding
-
-F64 = NDArray[np.float64]
 
 _TURNS = ("nod it: turn it up and down", "pan it: turn it left and right", "roll it: tilt it from side to side")
 _RESTS = (

@@ -1,14 +1,10 @@
 """Projection by a vector of intrinsics (fx, fy, cx, cy, coefficients of the lens); its derivatives by differences."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64
 from kiteline_core.geometry.cameras import Lens
-
-F64 = NDArray[np.float64]
 
 _NEWTON_STEPS = 12
 

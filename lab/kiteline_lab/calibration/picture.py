@@ -1,16 +1,12 @@
 """The residual picture: where corners were seen, and by how much the calibration misses them."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import U8
 from kiteline_lab.calibration.solve import Calibrated, Residuals
 from kiteline_lab.calibration.verdict import GOOD_RMS_PX
 from kiteline_lab.calibration.views import GRID, Coverage
-
-U8 = NDArray[np.uint8]
 
 _LONG = 20.0  # px of a drawn line for a residual of GOOD_RMS_PX, at a width of 640
 _FEW = 10  # corners of a cell that is drawn full

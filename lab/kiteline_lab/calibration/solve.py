@@ -4,23 +4,19 @@ Levenberg-Marquardt with Huber weights. The poses are eliminated (Schur compleme
 each camera and the place of the right one. One solver for both lenses, and for points beyond 90°.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64, I64, Bool
 from kiteline_core.errors import KitelineError
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraModel, Lens
 from kiteline_lab.calibration.lenses import derivatives, project, rays
 from kiteline_lab.calibration.views import View
-
-F64 = NDArray[np.float64]
 
 FEWEST_VIEWS = 4
 _FOCALS = (0.25, 0.33, 0.42, 0.55, 0.7, 0.9, 1.2, 1.6, 2.2)  # of the image's width, tried as a start
@@ -46,7 +42,7 @@ class Residuals:
 
     px: F64
     error_px: F64
-    view: NDArray[np.int64]
+    view: I64
 
     @property
     def rms_px(self) -> float:
@@ -232,7 +228,7 @@ def _find_again(points_m: F64, views: Sequence[View], state: _State, lens: Lens,
 class _Seen:
     """All corners of one camera. view: (n,) of which view, in ascending order."""
 
-    view: NDArray[np.int64]
+    view: I64
     points: F64
     px: F64
 
@@ -316,9 +312,7 @@ def _refine(points_m: F64, views: Sequence[View], state: _State, lens: Lens, *, 
 _Block = tuple[F64, F64, F64]  # pose by pose (6,6), shared by pose (m,6), gradient (6,)
 
 
-def _normal(
-    seen: Sequence[_Seen], state: _State, lens: Lens, starts: NDArray[np.int64], width: int
-) -> tuple[F64, F64, list[_Block]]:
+def _normal(seen: Sequence[_Seen], state: _State, lens: Lens, starts: I64, width: int) -> tuple[F64, F64, list[_Block]]:
     H, g = np.zeros((width, width)), np.zeros(width)
     count = len(state.poses)
     Hpp, Hap, gp = np.tile(1e-12 * np.eye(6), (count, 1, 1)), np.zeros((count, width, 6)), np.zeros((count, 6))
@@ -360,7 +354,7 @@ def _reduced(H: F64, g: F64, blocks: list[_Block], damping: float) -> tuple[F64,
     return S, b
 
 
-def _step(H: F64, g: F64, blocks: list[_Block], damping: float, free: NDArray[np.bool_]) -> tuple[F64, list[F64]]:
+def _step(H: F64, g: F64, blocks: list[_Block], damping: float, free: Bool) -> tuple[F64, list[F64]]:
     S, b = _reduced(H, g, blocks, damping)
     step = np.zeros(len(b))
     step[free] = np.linalg.lstsq(S[np.ix_(free, free)], b[free], rcond=None)[0]

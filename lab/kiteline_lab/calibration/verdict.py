@@ -1,7 +1,5 @@
 """What a calibration is worth: each finding with a level and, where it is not good, what to do about it."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

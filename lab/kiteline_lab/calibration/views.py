@@ -1,17 +1,12 @@
 """Collects views of the board: which are new, which parts of the image they cover, and what is wanted next."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64, I64, U8
 from kiteline_lab.calibration.boards import Board, Corners, same_order
-
-F64 = NDArray[np.float64]
-U8 = NDArray[np.uint8]
 
 GRID = (8, 6)  # cells of an image, columns and rows
 _PER_CELL = 3  # corners that make a cell covered
@@ -39,7 +34,7 @@ class Coverage:
     """Corners seen in each cell of a camera's image."""
 
     size: tuple[int, int]  # width, height in px
-    counts: NDArray[np.int64] = field(default_factory=lambda: np.zeros(GRID[::-1], np.int64))
+    counts: I64 = field(default_factory=lambda: np.zeros(GRID[::-1], np.int64))
 
     def add(self, corners: Corners) -> None:
         """Count the corners of a view."""

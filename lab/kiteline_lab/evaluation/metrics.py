@@ -4,19 +4,14 @@ ATE and RPE after J. Sturm et al., "A benchmark for the evaluation of RGB-D SLAM
 S. Umeyama (PAMI 1991); t_rel and r_rel after A. Geiger et al., the KITTI odometry benchmark (CVPR 2012).
 """
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass
 from enum import Enum
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64, I64
 from kiteline_core.frame import Trajectory
 from kiteline_core.geometry import se3
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 MAX_DIFFERENCE_NS = 10_000_000  # largest difference in time of two poses that are compared (as in evo and TUM's tools)
 MAX_BRIDGE_NS = 50_000_000  # ground truth at 20 Hz or more is interpolated; the error on a drone is below 1 mm
@@ -202,13 +197,13 @@ def relative_errors(matched: Matched, i: I64, j: I64) -> tuple[F64, F64]:
     return np.asarray(np.linalg.norm(error[:, :3, 3], axis=1)), _angles(error[:, :3, :3])
 
 
-def kitti_drift(matched: Matched, lengths_m: tuple[float, ...] = KITTI_LENGTHS_M) -> KittiDrift | None:
-    """Drift over segments of the given lengths; None if the path is shorter than the shortest of them."""
+def kitti_drift(matched: Matched) -> KittiDrift | None:
+    """Drift over segments of KITTI's lengths; None if the path is shorter than the shortest of them."""
     path = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(matched.truth[:, :3, 3], axis=0), axis=1))])
     step_ns = float(np.median(np.diff(matched.t_ns)))
     stride = max(1, round(KITTI_STEP_S * 1e9 / step_ns))
     translation, rotation = [], []
-    for length in lengths_m:
+    for length in KITTI_LENGTHS_M:
         start = np.arange(0, len(path), stride)
         end = np.searchsorted(path, path[start] + length, side="right")
         start, end = start[end < len(path)], end[end < len(path)]

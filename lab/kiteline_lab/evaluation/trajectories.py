@@ -1,20 +1,15 @@
 """Read trajectories: TUM files, KITTI poses, EuRoC's data.csv, or the ground truth of a recording."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64
 from kiteline_core.errors import KitelineError
 from kiteline_core.frame import Trajectory
 from kiteline_core.geometry import se3
 from kiteline_hw.sources.kinds import is_source
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 KITTI_PERIOD_NS = 100_000_000  # 10 Hz: for KITTI poses without a times.txt
 QUATERNION_TOLERANCE = 0.02  # a length further from 1 than this is a wrong column

@@ -1,7 +1,5 @@
 """Child processes of one flight: started, read line by line, and ended with it."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

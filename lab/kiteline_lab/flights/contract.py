@@ -1,7 +1,5 @@
 """Check that a flight's folder and report.json keep their contract."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Sequence

@@ -1,18 +1,15 @@
 """Numbers of report.json, and its table on the terminal."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import tum
 
-F64 = NDArray[np.float64]
 Report = dict[str, Any]
 
 
@@ -22,13 +19,13 @@ def write_tum(path: Path, poses: Iterable[tuple[int, F64]]) -> None:
     path.write_text("".join(tum.line(t_ns, pose) for t_ns, pose in poses))
 
 
-def statistic(values: Sequence[float], digits: int = 3) -> dict[str, float]:
+def statistic(values: Sequence[float]) -> dict[str, float]:
     """mean, p50 and p95 of values; zeros where there are none."""
     if not len(values):
         return {"mean": 0.0, "p50": 0.0, "p95": 0.0}
     a = np.asarray(values, np.float64)
     p50, p95 = np.percentile(a, [50, 95])
-    return {"mean": round(float(a.mean()), digits), "p50": round(float(p50), digits), "p95": round(float(p95), digits)}
+    return {"mean": round(float(a.mean()), 3), "p50": round(float(p50), 3), "p95": round(float(p95), 3)}
 
 
 def write_report(path: Path, report: Report) -> None:

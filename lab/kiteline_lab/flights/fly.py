@@ -1,7 +1,5 @@
 """`kiteline fly`: agents and a base fly as processes of this machine, or in this one, and leave a folder of results."""
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import sys

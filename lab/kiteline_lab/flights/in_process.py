@@ -1,7 +1,5 @@
 """Fly a plan in lock-step in this process."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Mapping
 from pathlib import Path

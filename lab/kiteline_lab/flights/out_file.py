@@ -1,7 +1,5 @@
 """Files that are either complete or absent: written under another name and renamed at the end."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager

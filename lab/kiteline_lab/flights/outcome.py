@@ -1,15 +1,12 @@
 """What the processes of a flight left: raw reports, the base's keyframe poses, notes for the user."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-F64 = NDArray[np.float64]
+from kiteline_core.arrays import F64
 
 
 @dataclass(slots=True)

@@ -1,7 +1,5 @@
 """The plan of a flight: opened sources, flight time 0, and the options of each process."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path

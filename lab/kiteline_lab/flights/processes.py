@@ -1,7 +1,5 @@
 """Fly a plan as child processes: one for each agent and one for the base, over a link."""
 
-from __future__ import annotations
-
 import contextlib
 import socket
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Progress of a long task: a bar on a terminal, else a plain line every few seconds."""
 
-from __future__ import annotations
-
 import sys
 import time
 from typing import TextIO
@@ -26,7 +24,7 @@ class Progress:
         self._note = ""
         self._width = 0
 
-    def __enter__(self) -> Progress:
+    def __enter__(self) -> "Progress":
         return self
 
     def __exit__(self, kind: object, *_: object) -> None:

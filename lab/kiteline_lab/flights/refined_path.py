@@ -1,16 +1,10 @@
 """The refined path of an agent: its frames, placed by the base's keyframes."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 
-import numpy as np
-from numpy.typing import NDArray
-
 from kiteline_agent.step import Estimate
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3, sim3
-
-F64 = NDArray[np.float64]
 
 
 def refined_path(frames: Sequence[Estimate], T_w_k: Mapping[int, F64], T_b_c: F64) -> list[tuple[int, F64]]:

@@ -1,16 +1,14 @@
 """Results of a flight: refined trajectories, accuracy against the truth, plot, report.json."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.runtime.flight_log import ESTIMATE, estimate_from_json
 from kiteline_agent.runtime.frame_counts import FrameCounts, live_pose
 from kiteline_agent.step import Estimate
+from kiteline_core.arrays import F64
 from kiteline_core.frame import Trajectory
 from kiteline_core.geometry.cameras import Rectifier
 from kiteline_hw.logs.mcap_log import LogReader
@@ -22,8 +20,6 @@ from kiteline_lab.flights.outcome import FlightOutcome
 from kiteline_lab.flights.plan import FlightPlan
 from kiteline_lab.flights.refined_path import refined_path
 from kiteline_lab.plots.plot import Line, can_plot, plot_trajectories
-
-F64 = NDArray[np.float64]
 
 
 def write_results(out: Path, plan: FlightPlan, outcome: FlightOutcome) -> Report:

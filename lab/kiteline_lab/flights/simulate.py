@@ -1,7 +1,5 @@
 """`kiteline sim SCENE --trajectory F --out F.mcap`: record a flight through a simulated world, with its truth."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

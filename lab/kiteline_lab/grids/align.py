@@ -1,14 +1,10 @@
 """Fit one occupancy grid to another by rotation and translation."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64
 from kiteline_lab.grids.files import OCCUPIED, GridFile, GridFileError, planar
-
-F64 = NDArray[np.float64]
 
 _FAR_M = 0.4  # m; an obstacle farther from those of the truth counts no more: it may be one that was never seen
 _POINTS = 3000  # obstacle cells that are compared

@@ -1,15 +1,13 @@
 """`kiteline grid eval EST.yaml TRUE.yaml`: precision and recall of an occupancy grid, and a picture of both."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64
 from kiteline_lab.evaluation.metrics import MAX_DIFFERENCE_NS, truth_at
 from kiteline_lab.evaluation.trajectories import TrajectoryError, read_pair
 from kiteline_lab.grids.align import aligned, share_near
@@ -20,7 +18,7 @@ from kiteline_lab.grids.prm import GridEvalConfig, score
 _NEAR_M, _LEAST_NEAR = 0.3, 0.7  # of obstacles of grids in one frame: all in room_flight, half of them if turned
 
 
-def between_paths(estimate: str, truth: str) -> NDArray[np.float64]:
+def between_paths(estimate: str, truth: str) -> F64:
     """(3,3) planar motion that maps the positions of a trajectory onto the true ones. Raises TrajectoryError."""
     est, true = read_pair(estimate, truth)
     i, poses = truth_at(est.t_ns, true, MAX_DIFFERENCE_NS)

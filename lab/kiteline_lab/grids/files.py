@@ -1,18 +1,14 @@
 """Read occupancy grids in the format of ROS's map_server: a YAML file and the PGM image that it names."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64, I8
 from kiteline_core.errors import KitelineError
-
-F64 = NDArray[np.float64]
 
 FREE, OCCUPIED, UNKNOWN = 0, 100, -1
 
@@ -29,7 +25,7 @@ class GridFile:
 
     cell_m: float
     origin: tuple[float, float, float]
-    state: NDArray[np.int8]
+    state: I8
 
     @property
     def T_map_cell(self) -> F64:

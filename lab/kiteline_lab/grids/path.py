@@ -1,7 +1,5 @@
 """`kiteline grid path GRID.yaml FROM TO --radius R`: the shortest way on which a vehicle touches nothing."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import re
@@ -11,17 +9,13 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64, Bool
 from kiteline_core.errors import KitelineError
 from kiteline_lab.grids.files import FREE, OCCUPIED, UNKNOWN, GridFile, read_grid
 from kiteline_lab.grids.path_kernels import search
 from kiteline_lab.grids.picture import draw_path
 from kiteline_lab.grids.prm_kernels import roads_free
-
-F64 = NDArray[np.float64]
-Bool = NDArray[np.bool_]
-
 
 _FARTHEST_M = 1e9  # beyond, numbers of cells would not be exact
 

@@ -1,20 +1,14 @@
 """Pictures of occupancy grids: estimate, truth and difference side by side; a path."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64, I8, U8
 from kiteline_lab.grids.files import FREE, OCCUPIED, UNKNOWN, GridFile, GridFileError
 from kiteline_lab.grids.prm import GridEvalConfig, Roads, draw_roads
-
-F64 = NDArray[np.float64]
-I8 = NDArray[np.int8]
-U8 = NDArray[np.uint8]
 
 _SHADES = {FREE: (255, 255, 255), OCCUPIED: (0, 0, 0), UNKNOWN: (190, 190, 190)}  # BGR, as all colours here
 _RED, _ORANGE, _BLUE, _LIGHT_BLUE, _GREEN = (40, 40, 215), (60, 165, 245), (190, 90, 20), (235, 190, 130), (60, 140, 30)

@@ -6,21 +6,14 @@ Precision is the share of the estimate's roads that are free in the truth, recal
 are free in the estimate; means over draws. Seeded: two grids always give the same numbers.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64, I64, U8, Bool
 from kiteline_lab.grids.files import FREE, GridFile
 from kiteline_lab.grids.prm_kernels import roads_free, spaced_places
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-Bool = NDArray[np.bool_]
-U8 = NDArray[np.uint8]
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,12 +89,10 @@ def score(
     )  # fmt: skip
 
 
-def draw_roads(
-    mine: GridFile, other: GridFile, T_other_mine: F64, config: GridEvalConfig, draw: int = 0, stream: int = 0
-) -> Roads:
-    """One of the road maps that `score` draws: on the estimate (stream 0) or on the truth (1)."""
+def draw_roads(mine: GridFile, other: GridFile, T_other_mine: F64, config: GridEvalConfig, stream: int = 0) -> Roads:
+    """The first of the road maps that `score` draws: on the estimate (stream 0) or on the truth (1)."""
     A = np.asarray(np.linalg.inv(other.T_map_cell) @ T_other_mine @ mine.T_map_cell)
-    nodes, pairs, kept = _roads(free_cells(mine, config), free_cells(other, config), A, config, draw, stream)
+    nodes, pairs, kept = _roads(free_cells(mine, config), free_cells(other, config), A, config, 0, stream)
     return Roads(mine.points(nodes), pairs, kept)
 
 

@@ -1,15 +1,9 @@
 """Kernels of road maps on a grid: places at a distance, straight roads. Arrays in, caller's arrays out."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64, I64, Bool
 from kiteline_core.jit import njit
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-Bool = NDArray[np.bool_]
 
 
 @njit

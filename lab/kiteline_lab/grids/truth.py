@@ -1,7 +1,5 @@
 """`kiteline grid truth SOURCE --out F.yaml`: the true occupancy of a recorded or simulated flight."""
 
-from __future__ import annotations
-
 import argparse
 from itertools import pairwise
 from pathlib import Path

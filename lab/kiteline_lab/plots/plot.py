@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64
 from kiteline_core.frame import Trajectory
 from kiteline_lab.evaluation.metrics import TrajectoryAlignment, match, position_errors, truth_at
 
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-F64 = NDArray[np.float64]
 
 COLOURS = ("#1f6fb2", "#d1495b", "#2a9d5c", "#8e5ea2", "#e08e20", "#3bb0bf")  # distinct for colour-blind readers too
 TRUTH_COLOUR = "#9a9a9a"

@@ -3,8 +3,6 @@
 `make refs LOGS=new` simulates and flies the kept flights anew first; `make refs NAMES="rgbd ekf"` takes only some.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 from functools import partial

@@ -1,17 +1,13 @@
 """Says in words what a replay computes differently from the kept text."""
 
-from __future__ import annotations
-
 import math
 import re
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64
 from kiteline_lab.references.observation import Half, Observation, rounded, unit_of
-
-F64 = NDArray[np.float64]
 
 _COLUMNS = {
     "tracking": ("inliers",), "pose": ("x", "y", "z", "turn_x", "turn_y", "turn_z"),

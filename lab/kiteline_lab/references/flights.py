@@ -1,7 +1,5 @@
 """The flights whose logs are kept, and how their logs are made."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import math
@@ -15,10 +13,10 @@ from typing import Any
 import cv2
 import numpy as np
 from mcap.writer import CompressionType, Writer
-from numpy.typing import NDArray
 
 from kiteline_agent.runtime import flight_log as agent_log
 from kiteline_basestation.runtime import flight_log as base_log
+from kiteline_core.arrays import F32, U8
 from kiteline_core.frame import EncodedImage, Frame, ImuBatch, OdometryBatch, joined
 from kiteline_core.geometry import se3, tum
 from kiteline_hw.logs.mcap_file import McapFile
@@ -27,8 +25,6 @@ from kiteline_hw.sim.source import open_sim
 from kiteline_hw.sources.open import open_source
 from kiteline_lab.flights.in_process import fly_in_process
 from kiteline_lab.flights.plan import Options, plan
-
-F64 = NDArray[np.float64]
 
 FOLDER = Path("tests/references/kept")
 IMAGES = "images.mcap"  # of most kept flights
@@ -187,19 +183,19 @@ def _write_images(path: Path) -> None:
                 number += 1
 
 
-def _simulated_depths(options: Mapping[str, Any], workers: int) -> dict[int, NDArray[np.float32]]:
+def _simulated_depths(options: Mapping[str, Any], workers: int) -> dict[int, F32]:
     """Depth images of the first frames, by stamp."""
     part = {**options, "seconds": DEPTH_FRAMES / _RATE_HZ, "depth": True, "imu": False}
     frames = [item for item in open_sim("room", workers, **part) if isinstance(item, Frame)]
     return {frame.t_ns: frame.depth_m for frame in frames if frame.depth_m is not None}
 
 
-def _webp(image: NDArray[np.uint8]) -> EncodedImage:
+def _webp(image: U8) -> EncodedImage:
     _, data = cv2.imencode(".webp", image, [cv2.IMWRITE_WEBP_QUALITY, _QUALITY])
     return EncodedImage(data.tobytes(), "webp")
 
 
-def _coarse_depth(depth_m: NDArray[np.float32]) -> EncodedImage:
+def _coarse_depth(depth_m: F32) -> EncodedImage:
     steps = np.round(depth_m * _DEPTH_STEPS).astype(np.uint16)
     _, data = cv2.imencode(".png", steps, [cv2.IMWRITE_PNG_COMPRESSION, 9])
     return EncodedImage(data.tobytes(), f"png/{_DEPTH_STEPS:g}")

@@ -1,7 +1,5 @@
 """Steps of a kept log: its inputs, with the images that all kept logs share."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 

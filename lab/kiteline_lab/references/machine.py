@@ -1,7 +1,5 @@
 """What numbers depend on beside the code: library versions, and the CPU kernels that libraries choose."""
 
-from __future__ import annotations
-
 import ctypes
 import importlib
 import platform

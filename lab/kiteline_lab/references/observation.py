@@ -1,7 +1,5 @@
 """What a replay computed, in the form in which it is kept: facts, and a row for each frame or step."""
 
-from __future__ import annotations
-
 import hashlib
 import math
 from collections.abc import Iterable, Sequence

@@ -1,13 +1,10 @@
 """Replays kept logs, and notes what each stage computes."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.runtime.frame_counts import FrameCounts, live_pose
 from kiteline_agent.step import Estimate, StepOutput
@@ -16,6 +13,7 @@ from kiteline_basestation.jobs import Job
 from kiteline_basestation.runtime import flight_log as base_log
 from kiteline_basestation.runtime.base_runtime import load_vocabulary
 from kiteline_basestation.station import Station, StationOutput
+from kiteline_core.arrays import F64
 from kiteline_core.frame import Trajectory
 from kiteline_core.geometry import se3
 from kiteline_core.ids import AgentId
@@ -30,8 +28,6 @@ from kiteline_lab.references.flights import KeptFlight, agent_log_of, base_log_o
 from kiteline_lab.references.machine import machine
 from kiteline_lab.references.observation import Half, Observation, Row, add_digests, digest
 from kiteline_lab.replay.logged_steps import Step, agent_input, agent_of_log, check_replayable, steps
-
-F64 = NDArray[np.float64]
 
 _POSE = ("x_m", "y_m", "z_m", "turn_x_rad", "turn_y_rad", "turn_z_rad", "live_x_m", "live_y_m", "live_z_m")
 _AGENT_COLUMNS = (*_POSE, "inliers", "quality", "up_bytes")

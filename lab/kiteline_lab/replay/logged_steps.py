@@ -1,7 +1,5 @@
 """The steps of a log, and the agent or base that ran them."""
 
-from __future__ import annotations
-
 import json
 import tempfile
 from collections.abc import Iterator, Mapping

@@ -1,7 +1,5 @@
 """`kiteline replay LOG`: run an agent or a base again from its log, and compare its outputs with the logged ones."""
 
-from __future__ import annotations
-
 import argparse
 import json
 from collections.abc import Callable

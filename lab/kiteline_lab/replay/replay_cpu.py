@@ -1,7 +1,5 @@
 """Fly the frames of an agent's log anew under a CPU limit: the kernel's where it is allowed, else a modelled core."""
 
-from __future__ import annotations
-
 import contextlib
 import tempfile
 from dataclasses import asdict

@@ -1,7 +1,5 @@
 """`kiteline config`: print, explain and check the options of agent and base."""
 
-from __future__ import annotations
-
 import argparse
 import difflib
 import re

@@ -1,7 +1,5 @@
 """`kiteline convert SOURCE OUT.mcap`: write any source as a log, without coding its images again."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """`kiteline doctor`: check whether this machine can run kiteline, and say how to mend what is missing."""
 
-from __future__ import annotations
-
 import argparse
 import glob
 import importlib
@@ -41,15 +39,8 @@ PLAIN = {  # distribution: module, for what the drone needs
     "cobs": "cobs",
     "cryptography": "cryptography",
 }
-EXTRAS = {
-    "base": {"gtsam": "gtsam", "websockets": "websockets"},
-    "lab": {"matplotlib": "matplotlib"},
-}
-WARMING = (
-    "kiteline_codec.warm",
-    "kiteline_agent.runtime.warm",
-    "kiteline_basestation.runtime.warm",
-)
+EXTRAS = {"base": {"gtsam": "gtsam", "websockets": "websockets"}, "lab": {"matplotlib": "matplotlib"}}
+WARMING = ("kiteline_codec.warm", "kiteline_agent.runtime.warm", "kiteline_basestation.runtime.warm")
 MIN_MEMORY_MIB = 400  # an agent takes 250 MiB; compiling its kernels takes half as much again
 OLDEST_CLOCK_S = 1_735_689_600  # 2025-01-01: without a network, a Raspberry Pi starts in the past
 SERIAL_PORTS = ("/dev/serial0", "/dev/ttyAMA*", "/dev/ttyACM*", "/dev/ttyUSB*", "/dev/ttyS0", "/dev/ttyTHS*")

@@ -1,7 +1,5 @@
 """`kiteline eval EST GT`: compare a trajectory with ground truth."""
 
-from __future__ import annotations
-
 import argparse
 import importlib
 import json

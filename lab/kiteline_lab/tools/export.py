@@ -1,7 +1,5 @@
 """`kiteline export STORE --format tum|ply|pgm|g2o --out F`: write a base's map in the formats of other tools."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import re
@@ -10,7 +8,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.mapper import Mapper
@@ -22,12 +19,11 @@ from kiteline_basestation.store.restore import restore
 from kiteline_basestation.store.store import read
 from kiteline_codec.channel import CodedChannel
 from kiteline_codec.sync.config import SyncConfig
+from kiteline_core.arrays import I64
 from kiteline_core.errors import KitelineError
 from kiteline_core.geometry import sim3
 from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, agent_of_keyframe
 from kiteline_lab.flights.out_file import write_whole
-
-I64 = NDArray[np.int64]
 
 FORMATS = ("tum", "ply", "pgm", "g2o")
 _PLAIN_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.+-]*")  # of a picture, as it stands in YAML

@@ -1,7 +1,5 @@
 """`kiteline keys`: pair agents with a base; make and show the keys that seal packets between them."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

@@ -3,8 +3,6 @@
 Messages, schemas, channels and metadata are copied unchanged; attachments are dropped.
 """
 
-from __future__ import annotations
-
 import argparse
 import heapq
 import json

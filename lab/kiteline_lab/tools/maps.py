@@ -3,8 +3,6 @@
 `check|repair|backup` work on the folder of a store.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import secrets

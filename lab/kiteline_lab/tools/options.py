@@ -1,7 +1,5 @@
 """Every option of agent and base, with its unit and reason, read from the config dataclasses and their comments."""
 
-from __future__ import annotations
-
 import ast
 import inspect
 import io

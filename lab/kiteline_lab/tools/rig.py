@@ -4,8 +4,6 @@ The cameras are the rectified ones of the calibration that was told. Errors of d
 right camera that is turned, and whose focal length and centre differ.
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import json
@@ -15,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.imaging import row_alignment
 from kiteline_agent.inertial.calibration.known_imu import KnownImuConfig
@@ -23,14 +20,13 @@ from kiteline_agent.known_rig import KnownRigConfig, known_rig
 from kiteline_agent.runtime import rig_file
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.mapper import Mapper
+from kiteline_core.arrays import F64
 from kiteline_core.errors import KitelineError
 from kiteline_core.geometry import disparity_offset, se3
 from kiteline_core.geometry.cameras import CameraModel, CameraRig, RectifiedCamera
 from kiteline_core.ids import AgentId
 from kiteline_lab.flights.out_file import write_whole
 from kiteline_lab.tools.export import load
-
-F64 = NDArray[np.float64]
 
 FORMATS = ("kalibr", "euroc", "kiteline")
 _LIKELY = np.array([1.0, 1.0, 0.5, 1e-3, 1e-3, 1e-3])  # px, px, px, rad: what mounts and lenses change by
@@ -83,7 +79,7 @@ class KnownCameras:
         self.imu = KnownImuConfig()  # of a rig file
 
     @classmethod
-    def of_base(cls, mapper: Mapper) -> KnownCameras:
+    def of_base(cls, mapper: Mapper) -> "KnownCameras":
         """Of a base."""
         out = cls()
         out.cameras.update(mapper.map.cameras)
@@ -96,7 +92,7 @@ class KnownCameras:
         return out
 
     @classmethod
-    def of_file(cls, known: KnownRigConfig) -> KnownCameras:
+    def of_file(cls, known: KnownRigConfig) -> "KnownCameras":
         """Of a rig file, as agent 0; empty if it says nothing."""
         out, agent = cls(), AgentId(0)
         camera = known.rectified()

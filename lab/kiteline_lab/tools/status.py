@@ -1,7 +1,5 @@
 """`kiteline status`: what a running base does, in a few lines."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 import time

@@ -5,17 +5,15 @@ The vocabulary that ships with kiteline is trained on its own simulated scenes (
     python -m kiteline_lab.tools.train_vocabulary --out core/kiteline_core/places/words.bin
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.imaging import features
+from kiteline_core.arrays import I64, U8, U64
 from kiteline_core.frame import Frame
 from kiteline_core.geometry.cameras import Rectifier
 from kiteline_core.imaging.matching import words
@@ -24,10 +22,6 @@ from kiteline_hw.ports import FrameSource, SourceError
 from kiteline_hw.sim.source import SimSource
 from kiteline_hw.sources.open import open_source
 from kiteline_lab.tools import train_vocabulary_kernels as kernels
-
-U8 = NDArray[np.uint8]
-I64 = NDArray[np.int64]
-U64 = NDArray[np.uint64]
 
 SCENES = ("room", "hall", "street", "corridor")
 DEFAULT_SOURCES = tuple(f"sim:{scene}?seed={seed}&mono=1" for seed in range(101, 105) for scene in SCENES)

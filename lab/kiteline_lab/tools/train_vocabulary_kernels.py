@@ -1,16 +1,10 @@
 """Kernels of k-majority clustering of binary descriptors."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import I32, I64, U64
 from kiteline_core.imaging.matching_kernels import hamming
 from kiteline_core.jit import njit
-
-I32 = NDArray[np.int32]
-I64 = NDArray[np.int64]
-U64 = NDArray[np.uint64]
 
 
 @njit

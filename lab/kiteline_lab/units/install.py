@@ -1,7 +1,5 @@
 """`kiteline install-units` and `kiteline uninstall-units`: agent and base as services of systemd."""
 
-from __future__ import annotations
-
 import argparse
 import os
 import shutil

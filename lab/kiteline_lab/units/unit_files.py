@@ -1,7 +1,5 @@
 """The files of a service, as they are installed: where each goes, and what it holds. Reads the files that ship."""
 
-from __future__ import annotations
-
 import hashlib
 import importlib.metadata
 import os

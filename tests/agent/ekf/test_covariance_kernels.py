@@ -1,13 +1,9 @@
 """Kernels of the filter's covariance against plain numpy."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.ekf import covariance_kernels as kernels
-
-F64 = NDArray[np.float64]
+from kiteline_core.arrays import F64, I64
 
 
 def _covariance(n: int, seed: int = 0) -> tuple[F64, F64]:
@@ -22,7 +18,7 @@ def _whole(P: F64) -> F64:
     return np.asarray(np.tril(P) + np.tril(P, -1).T)
 
 
-def _sightings(n: int, m: int, seed: int = 1) -> tuple[NDArray[np.int64], F64, F64]:
+def _sightings(n: int, m: int, seed: int = 1) -> tuple[I64, F64, F64]:
     """First rows of m landmarks after a pose, their Jacobians (m,2,3), and the dense one (2m,n)."""
     rng = np.random.default_rng(seed)
     index = 7 + 3 * np.arange(m)

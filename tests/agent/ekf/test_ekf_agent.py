@@ -1,11 +1,8 @@
 """The agent with the filter as its tracker: odometry, black images, gaps, and the same output for the same input."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from kiteline_agent.config import AgentConfig, AlignConfig
 from kiteline_agent.ekf.corner_flow import CornerFlow
@@ -18,6 +15,7 @@ from kiteline_agent.onboard import onboard_agent
 from kiteline_agent.runtime.controller import pose_sample
 from kiteline_agent.runtime.options import agent_config
 from kiteline_agent.step import Estimate, Identity, StepInput
+from kiteline_core.arrays import U8
 from kiteline_core.frame import UNMEASURED, Frame, OdometryBatch
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraModel, CameraRig, RectifiedCamera
@@ -69,12 +67,6 @@ def test_flight_along_a_wall_tracks_landmarks_and_goes_on_in_the_dark() -> None:
     assert np.trace(found[-1].cov_o) > np.trace(found[49].cov_o)
 
 
-def test_same_frames_give_the_same_bits() -> None:
-    for a, b in zip(_flown(30, 99), _flown(30, 99), strict=True):
-        assert a.T_o_b.tobytes() == b.T_o_b.tobytes()
-        assert a.cov_o.tobytes() == b.cov_o.tobytes()
-
-
 def test_motion_is_that_of_the_samples_and_uncertain_in_a_gap() -> None:
     T_b_c = se3.from_rt(_LEFT[:3, :3], np.array([0.3, 0.1, 0.2]))
     motion = OdometerMotion(T_b_c, EkfConfig(), keep_s=3.0, max_gap_s=0.25)
@@ -113,11 +105,9 @@ def test_poses_go_to_the_flight_controller_gravity_aligned(has_body: bool) -> No
         batch = OdometryBatch(t_ns, velocity, np.zeros((5, 3)), small, small)
         output = agent.step(StepInput(Frame(k * _PERIOD_NS, black), odometry=batch), k * _PERIOD_NS)
     sample = pose_sample(agent, output, 0, 0)
-    assert sample is not None
     np.testing.assert_allclose(sample.T_o_b[:3, 3], [0.1, 0.0, 0.0], atol=1e-3)
     output = agent.step(StepInput(predict_ns=3 * _PERIOD_NS), 3 * _PERIOD_NS)
     predicted = pose_sample(agent, output, 0, 0)
-    assert predicted is not None and predicted.velocity is not None
     np.testing.assert_allclose(predicted.T_o_b[:3, 3], [0.15, 0.0, 0.0], atol=1e-3)
     np.testing.assert_allclose(predicted.velocity, [1.0, 0.0, 0.0], atol=1e-3)
 
@@ -141,7 +131,7 @@ def test_tracker_is_chosen_by_option() -> None:
     assert agent_config("", tracker="ekf").tracker == "ekf"
 
 
-def _flow() -> tuple[CornerFlow, NDArray[np.uint8]]:
+def _flow() -> tuple[CornerFlow, U8]:
     """Corners of an image of squares."""
     rng = np.random.default_rng(0)
     image = np.kron(rng.integers(0, 256, (60, 80)), np.ones((4, 4))).astype(np.uint8)

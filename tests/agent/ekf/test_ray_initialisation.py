@@ -1,11 +1,8 @@
 """Delayed initialisation: points by rays, their covariance, and what is refused."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.ekf.filter_state import FilterState
 from kiteline_agent.ekf.ray_initialisation import (
@@ -22,9 +19,8 @@ from kiteline_agent.ekf.ray_kernels import position_by_rays
 from kiteline_agent.ekf.ray_update import update_by_rays
 from kiteline_agent.ekf_config import EkfConfig
 from kiteline_bench.papers import simulated_vehicle as vehicle
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
-
-F64 = NDArray[np.float64]
 
 _POINT = np.array([5.0, 2.0, 1.0])
 _SIGMA = 0.7 / 400.0

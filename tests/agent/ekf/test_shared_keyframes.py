@@ -1,7 +1,5 @@
 """The filter's keyframes: what the base receives of them, and what its corrections move."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -92,7 +90,6 @@ def test_base_receives_a_metric_submap_whose_observations_name_what_it_holds() -
         T_m_k[header.keyframe] = T_m_k.get(header.parent, np.eye(4)) @ header.T_p_k
     live = [r for r in received if isinstance(r, LivePose)]
     last = estimates[-1]
-    assert last is not None
     np.testing.assert_allclose((T_m_k[live[-1].keyframe] @ live[-1].T_k_c)[:3, 3], last.T_o_b[:3, 3], atol=1e-3)
 
 
@@ -102,7 +99,6 @@ def test_a_submap_without_ids_for_keyframes_is_continued_in_another_one(monkeypa
     monkeypatch.setattr(reference, "FULL_AT", 2)
     estimates, received = _flown(60, config)
     for a, b in zip(usual, estimates, strict=True):
-        assert a is not None and b is not None
         np.testing.assert_array_equal(a.T_o_b, b.T_o_b)
     headers = {r.keyframe: r for r in received if isinstance(r, KeyframeHeader)}
     ties = [r for r in received if isinstance(r, SubmapTie)]

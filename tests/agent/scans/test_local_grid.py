@@ -1,7 +1,5 @@
 """Distances around the vehicle from its own scans and from tiles of the base's grid, in a room that is known."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
@@ -81,7 +79,7 @@ TURN = se3.exp(np.array([4.0, -2.0, 0.3, 0.0, 0.0, 0.5]))
 )  # fmt: skip
 def test_walls_of_a_room_lie_ahead_right_behind_and_left(x: float, y: float, quarter: int, tilt: float) -> None:
     distances = around(room(), vehicle(x, y, quarter * np.pi / 2, tilt))
-    assert distances is not None and distances.shape == (SECTORS,)
+    assert distances.shape == (SECTORS,)
     walls = [EAST - x, y - SOUTH, x - WEST, NORTH - y]  # clockwise from x of w
     for k in range(4):
         assert distances[k * SECTORS // 4] == pytest.approx(walls[(k - quarter) % 4] + CELL_M, abs=1.6 * CELL_M)
@@ -93,10 +91,8 @@ def test_own_scans_show_walls_wherever_the_odometry_frame_lies() -> None:
     for k in range(12):
         grid.add(scan_at(0.1 * k, 0.0, 0.5 * k, noise_m=0.03, seed=k), EXACT)
     found = grid.around(TURN @ vehicle(0.5, 0.2, np.pi / 2), None, {}, BANDS_M)
-    assert found is not None
     for k, wall in enumerate([NORTH - 0.2, EAST - 0.5, 0.2 - SOUTH, 0.5 - WEST]):
         assert found.distance_m[k * SECTORS // 4] == pytest.approx(wall, abs=0.1)
-    assert found.nearest is not None
     assert found.nearest[0] == pytest.approx(0.2 - SOUTH, abs=0.1) and abs(found.nearest[1]) > 2.8
     assert "nearest obstacle: 1." in found.line
 
@@ -106,15 +102,13 @@ def test_what_was_not_seen_is_unknown_and_own_scans_count_before_tiles() -> None
     grid.add(scan_at(0.0, 0.0, 0.0), EXACT)
     T_w_f = vehicle(0.0, 0.0, 0.0)
     alone = grid.around(TURN @ T_w_f, None, {}, BANDS_M)
-    assert alone is not None
     assert np.isfinite(alone.distance_m[[0, 3, -3]]).all() and np.isnan(alone.distance_m[18:54]).all()
     nearer = {at: GridTile(*at, 0, CELL_M, np.full((64, 64), 7, np.int8)) for at in ((0, 0), (0, -1))}
     both = grid.around(TURN @ T_w_f, T_w_f, nearer, BANDS_M)
-    assert both is not None
     assert both.distance_m[0] == pytest.approx(EAST, abs=0.1)  # seen clear since
     assert both.distance_m[18] < 0.5  # told by the base: not seen from here
     with_room = grid.around(TURN @ T_w_f, T_w_f, room(), BANDS_M)
-    assert with_room is not None and np.isfinite(with_room.distance_m).all()
+    assert np.isfinite(with_room.distance_m).all()
 
 
 def test_obstacles_far_above_or_below_do_not_count() -> None:
@@ -124,10 +118,10 @@ def test_obstacles_far_above_or_below_do_not_count() -> None:
         if followed:
             grid.follow(scan_at(0.0, 0.0, 0.0, z=2.5).T_o_c)
         higher = grid.around(TURN @ vehicle(0.0, 0.0, 0.0, z=2.5), None, {}, BANDS_M)
-        assert higher is not None and np.isnan(higher.distance_m).all()
+        assert np.isnan(higher.distance_m).all()
     low = room(mask=1)  # walls that reach 0.5 m above the ground
     over = grid.around(TURN @ vehicle(0.0, 0.0, 0.0, z=1.5), vehicle(0.0, 0.0, 0.0, z=1.5), low, BANDS_M)
-    assert over is not None and np.isnan(over.distance_m[SECTORS // 2])
+    assert np.isnan(over.distance_m[SECTORS // 2])
 
 
 def test_a_vehicle_that_flies_on_takes_its_scans_along() -> None:
@@ -142,7 +136,7 @@ def test_a_vehicle_that_flies_on_takes_its_scans_along() -> None:
     for _ in range(60):  # frames, in which some scans each are drawn again
         grid.follow(far[0].T_o_c)
     back = grid.around(TURN @ vehicle(1.0, 0.0, 0.0), None, {}, BANDS_M)
-    assert back is not None and back.distance_m[0] == pytest.approx(2.0, abs=0.1)
+    assert back.distance_m[0] == pytest.approx(2.0, abs=0.1)
 
 
 def test_the_grid_and_its_tiles_take_less_than_four_mib() -> None:
@@ -168,7 +162,7 @@ def test_own_scans_that_disagree_are_not_decided_by_the_base() -> None:
     grid._canvas.cells[i - 3 : i + 4, j - 3 : j + 4] = 0
     told = {at: GridTile(*at, 0, CELL_M, np.full((64, 64), 7, np.int8)) for at in ((0, 0), (0, -1))}
     found = grid.around(TURN @ T_w_f, T_w_f, told, BANDS_M)
-    assert found is not None and found.distance_m[0] > 2.5
+    assert found.distance_m[0] > 2.5
 
 
 def test_tiles_tell_nothing_of_what_lies_above_their_bands() -> None:
@@ -176,7 +170,6 @@ def test_tiles_tell_nothing_of_what_lies_above_their_bands() -> None:
     grid.add(scan_at(0.0, 0.0, 0.0, z=3.0), EXACT)
     free = {(c, r): GridTile(c, r, 0, CELL_M, np.zeros((64, 64), np.int8)) for c in range(-5, 5) for r in range(-5, 5)}
     found = grid.around(TURN @ T, T, free, BANDS_M)
-    assert found is not None
     assert np.isnan(found.distance_m[SECTORS // 2]) and np.isfinite(found.distance_m[0])
 
 
@@ -198,7 +191,6 @@ def test_a_vertical_that_is_known_late_levels_earlier_scans() -> None:
     for _ in range(10):
         grid.follow(scan_at(2.4, 0.0, 0.0).T_o_c)
     found, expected = (g.around(T, None, {}, BANDS_M) for g in (grid, level))
-    assert found is not None and expected is not None
     assert np.isnan(found.distance_m).mean() < np.isnan(expected.distance_m).mean() + 0.05
     both = np.isfinite(found.distance_m) & np.isfinite(expected.distance_m)
     assert np.abs(found.distance_m - expected.distance_m)[both].max() < 0.15
@@ -211,7 +203,7 @@ def test_what_was_clear_at_another_height_is_not_free_here() -> None:
     for z, told in ((1.0, True), (1.0 - 0.9 * config.slab_m, True), (0.7, False)):
         grid.follow(scan_at(0.0, 0.0, 0.0, z=z).T_o_c)
         found = grid.around(TURN @ vehicle(0.0, 0.0, 0.0, z=z), None, {}, BANDS_M)
-        assert found is not None and bool(np.isfinite(found.distance_m[0])) == told
+        assert bool(np.isfinite(found.distance_m[0])) == told
 
 
 @given(
@@ -249,33 +241,32 @@ def test_scans_are_drawn_anew_once_the_rig_is_found_to_be_worn_and_only_near_one
     doubtful = RangeError(BF, 0.2, np.zeros(TERMS), np.diag([0.5, 0, 0, 0, 0]))
     grid.add(scan, doubtful)
     before = grid.around(T, None, {}, BANDS_M)
-    assert before is not None and np.isnan(before.distance_m[0]), "3 m away: unknown rather than wrong"
+    assert np.isnan(before.distance_m[0]), "3 m away: unknown rather than wrong"
     grid.add(scan, RangeError(BF, 0.05, worn, np.zeros((TERMS, TERMS))))
     after = grid.around(T, None, {}, BANDS_M)
-    assert after is not None and after.distance_m[0] == pytest.approx(EAST, abs=0.08)
+    assert after.distance_m[0] == pytest.approx(EAST, abs=0.08)
     w = vehicle(0.0, 0.0, 0.0)
     with_tiles = grid.around(T, w, room(), BANDS_M)
-    assert with_tiles is not None and np.isnan(with_tiles.distance_m[36]), "tiles were drawn by what was wrong"
+    assert np.isnan(with_tiles.distance_m[36]), "tiles were drawn by what was wrong"
     for _ in range(LocalGridConfig().scans):
         grid.add(scan, RangeError(BF, 0.05, worn, np.zeros((TERMS, TERMS))))
     later = grid.around(T, w, room(), BANDS_M)
-    assert later is not None and np.isfinite(later.distance_m).all()
+    assert np.isfinite(later.distance_m).all()
     near = LocalGrid(LocalGridConfig())
     near.add(scan_at(EAST - 1.5, 0.0, 0.0), doubtful)
     seen = near.around(TURN @ vehicle(EAST - 1.5, 0.0, 0.0), None, {}, BANDS_M)
-    assert seen is not None and seen.distance_m[0] == pytest.approx(1.5, abs=0.1), "near ones never vanish"
+    assert seen.distance_m[0] == pytest.approx(1.5, abs=0.1), "near ones never vanish"
 
 
 def test_what_is_not_known_is_not_free() -> None:
     distances = around(room(known_until_m=1.0), vehicle(0.0, 0.0, 0.0))
-    assert distances is not None
     assert np.isnan(distances[SECTORS // 2]) and distances[0] == pytest.approx(EAST + CELL_M, abs=0.15)
     free = {(c, r): GridTile(c, r, 0, CELL_M, np.zeros((64, 64), np.int8)) for c in range(-5, 5) for r in range(-5, 5)}
     far = around(free, vehicle(0.0, 0.0, 0.7))
     assert far is not None and np.isinf(far).all()
     free[0, 0].cells[5, 20] = 4  # one cell, 2.1 m away
     near = around(free, vehicle(0.0, 0.0, np.arctan2(5.5, 20.5)))
-    assert near is not None and near[0] == pytest.approx(2.12, abs=0.1) and near.min() <= near[0] < REACH_M
+    assert near[0] == pytest.approx(2.12, abs=0.1) and near.min() <= near[0] < REACH_M
 
 
 def test_without_a_grid_or_a_heading_nothing_is_told() -> None:
@@ -289,7 +280,7 @@ def test_any_size_of_cells_costs_little(cell_m: float) -> None:
     """A tile is a record from the link."""
     tiles = {(0, 0): GridTile(0, 0, 0, cell_m, np.full((64, 64), 3, np.int8))}
     distances = around(tiles, vehicle(0.5, 0.5, 0.0))
-    assert distances is not None and distances.shape == (SECTORS,)
+    assert distances.shape == (SECTORS,)
 
 
 def test_asking_does_not_change_what_is_told_later() -> None:
@@ -318,7 +309,6 @@ def test_who_walks_into_a_view_that_stays_is_told_and_other_views_are_kept() -> 
         for _ in range(shown):
             grid.add(replace(seen, scan=person, repeats=True), EXACT)
         found = grid.around(TURN @ vehicle(0.0, 0.0, 0.0), None, {}, BANDS_M)
-        assert found is not None
         distances.append(found.distance_m)
     assert distances[0][0] == pytest.approx(EAST, abs=0.1)
     assert distances[1][0] == pytest.approx(1.2, abs=0.1) and distances[2][0] == pytest.approx(1.2, abs=0.1)
@@ -372,6 +362,5 @@ def test_a_tile_that_replaces_another_is_seen_at_once() -> None:
         cells = np.full((64, 64), state, np.int8)
         tiles = {(0, 0): GridTile(0, 0, 0, CELL_M, cells)}
         found = grid.around(T, T, tiles, BANDS_M)
-        assert found is not None
         assert bool(np.isfinite(found.distance_m).all()) == (state > 0)
         del tiles

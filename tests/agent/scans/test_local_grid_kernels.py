@@ -1,7 +1,5 @@
 """Kernels of the local grid against plain arithmetic."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Scans that wait for a link: newest first, few under way, bounded in an outage."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from kiteline_agent.exchange.no_base import NoBaseChannel

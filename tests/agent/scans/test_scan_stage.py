@@ -1,7 +1,5 @@
 """The agent's scans in flight: spread over frames, the same each time, shared last, dropped first."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -118,7 +116,6 @@ def test_scans_are_not_shared_while_the_height_of_the_ground_is_unknown(recordin
 def test_scans_above_a_table_are_taken_back_once_the_floor_is_seen(recording: Path) -> None:
     agent, channel, _, _ = flown(recording, eager())
     stage = agent._scans
-    assert stage is not None
     table = replace(channel.scans[0], keyframe=KeyframeId(10))
     channel.scans.clear()
     stage._take(Verdict([], [table]))
@@ -154,7 +151,6 @@ def test_a_view_that_stays_is_scanned_again_and_not_shared(recording: Path) -> N
     source = open_source(str(recording))
     channel = Heard(busy=False)
     agent = Agent(source.rig, None, AgentConfig(), Identity(AgentId(0), 0), channel)
-    assert agent._scans is not None
     agent._scans._ground.start_at(np.array([0.0, 0.0, -1.0]))
     first = next(item for item in source if isinstance(item, Frame))
     for k in range(100):  # 5 s
@@ -182,7 +178,6 @@ def test_an_older_keyframe_gets_no_second_scan_under_a_number(recording: Path, m
     """After a relocalisation frames hang on it, and its own scans would be replaced."""
     source, channel, config = open_source(str(recording)), Heard(), eager()
     agent = Agent(source.rig, None, config, Identity(AgentId(0), 0), channel)
-    assert agent._scans is not None
     agent._scans._ground.start_at(np.array([0.0, 0.0, -1.0]))
     reference, returned = agent._camera.reference, False
     for number, frame in enumerate((item for item in source if isinstance(item, Frame)), 1):
@@ -204,7 +199,6 @@ def test_what_was_seen_before_a_long_loss_is_forgotten(recording: Path) -> None:
     frames = [item for item in source if isinstance(item, Frame)]
     for dark_s, forgotten in ((0.1, False), (0.6, True)):
         agent = Agent(source.rig, None, eager(), Identity(AgentId(0), 0), Heard())
-        assert agent._scans is not None
         agent._scans._ground.start_at(np.array([0.0, 0.0, -1.0]))
         for frame in frames:
             agent.step(StepInput(frame, cpu_ns=3_000_000), frame.t_ns)

@@ -1,7 +1,5 @@
 """Images in place of scans: the base makes these, except while the link does not carry images."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -62,7 +60,6 @@ def by_base() -> AgentConfig:
 def agent_of(path: Path, config: AgentConfig, channel: RecordChannel) -> tuple[Agent, list[Frame]]:
     source = open_source(str(path))
     agent = Agent(source.rig, None, config, Identity(AgentId(0), 0), channel)
-    assert agent._scans is not None
     agent._scans._ground.start_at(BEGINNING)
     return agent, [item for item in source if isinstance(item, Frame)]
 

@@ -1,7 +1,5 @@
 """Each quantiser keeps its stated error bound, and a decoded value has the same code again."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import example, given

@@ -1,7 +1,5 @@
 """The congestion window of a link without a budget."""
 
-from __future__ import annotations
-
 from kiteline_codec.pacing.congestion_window import CongestionWindow
 
 MS = 1_000_000

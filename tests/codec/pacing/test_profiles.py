@@ -1,7 +1,5 @@
 """What a profile shares of a keyframe, and how the pace follows the link."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

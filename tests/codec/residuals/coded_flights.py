@@ -1,19 +1,9 @@
 """Keyframes of a flight, coded relative to each other."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
-from kiteline_codec.schema import (
-    CameraIntrinsics,
-    Key,
-    KeyframeHeader,
-    NewLandmarks,
-    Observations,
-    Record,
-    messages,
-)
+from kiteline_codec.schema import CameraIntrinsics, Key, KeyframeHeader, NewLandmarks, Observations, Record, messages
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, keyframe_id, submap_id
@@ -27,8 +17,8 @@ def flight(seed: int, keyframes: int = 6, landmarks: int = 60, narrow: bool = Fa
     """Keyframes of a sideways flight along a wall of landmarks, with noise; each observes earlier landmarks."""
     rng = np.random.default_rng(seed)
     records: list[Record] = [CameraIntrinsics(AgentId(3), CAMERA)]
-    poses: list[NDArray[np.float64]] = []
-    points: list[tuple[int, NDArray[np.float64]]] = []
+    poses: list[F64] = []
+    points: list[tuple[int, F64]] = []
     for k in range(keyframes):
         keyframe = keyframe_id(SUBMAP, k)
         T_m_k = se3.exp(np.concatenate([[0.2 * k, 0.02 * k, 0.05 * k], rng.normal(0, 0.02, 3)]))
@@ -67,7 +57,7 @@ def flight(seed: int, keyframes: int = 6, landmarks: int = 60, narrow: bool = Fa
     return records
 
 
-def project(T_m_k: NDArray[np.float64], x: NDArray[np.float64]) -> tuple[float, float, float]:
+def project(T_m_k: F64, x: F64) -> tuple[float, float, float]:
     p = T_m_k[:3, :3].T @ (x - T_m_k[:3, 3])
     if p[2] < 0.1:
         return -1.0, -1.0, 0.0

@@ -1,7 +1,5 @@
 """Residual codes: lossless, refused if the two sides hold other values, and short."""
 
-from __future__ import annotations
-
 import random
 import time
 from dataclasses import replace
@@ -81,7 +79,6 @@ def test_a_predicted_observation_takes_a_few_bits() -> None:
     last = replace(last, uv=(np.rint(last.uv / step) * step).astype(np.float32))
     key, code = messages.key(last), messages.encode(last)
     form = ResidualCoder().compress(key, code, values.get, values.get)
-    assert form is not None
     assert len(form) / len(last.index) < 3.0 < 5.5 < len(code) / len(last.index)
     nothing = ResidualCoder().compress(key, code, {}.get, {}.get)
     assert nothing is None or len(nothing) > 1.5 * len(form)
@@ -124,7 +121,6 @@ def test_refined_depths_are_predicted_from_measured_ones(batch: int) -> None:
     )  # fmt: skip
     key, code = messages.key(depths), messages.encode(depths)
     form = ResidualCoder().compress(key, code, values.get, values.get)
-    assert form is not None
     assert ResidualCoder().expand(key, form, values.get) == code
     assert len(form) < 0.85 * len(code)
     with pytest.raises(WireError, match="not held"):

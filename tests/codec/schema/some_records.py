@@ -1,12 +1,9 @@
 """Examples of all records."""
 
-from __future__ import annotations
-
 from dataclasses import fields
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_codec.schema import (
     CachedKeyframe,
@@ -35,6 +32,7 @@ from kiteline_codec.schema import (
     SubmapScale,
     SubmapTie,
 )
+from kiteline_core.arrays import I8
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ground.column_scan import ColumnScan
@@ -147,7 +145,7 @@ def some_records(seed: int, n: int) -> list[Record]:
     ]  # fmt: skip
 
 
-def some_cells(rng: np.random.Generator, patch: int) -> NDArray[np.int8]:
+def some_cells(rng: np.random.Generator, patch: int) -> I8:
     """Cells (64,64) of a tile in patches of equal ones."""
     small = rng.integers(-1, 8, (64 // patch + 1, 64 // patch + 1))
     return np.repeat(np.repeat(small, patch, 0), patch, 1)[:64, :64].astype(np.int8)

@@ -1,6 +1,4 @@
-"""Records: fixed bytes, round trips, damage, and what a keyframe costs."""
-
-from __future__ import annotations
+"""Records: fixed bytes, round trips, damage, what a keyframe costs, and records in a log."""
 
 import json
 import time
@@ -30,14 +28,10 @@ from kiteline_codec.schema import (
     WireError,
     messages,
 )
+from kiteline_codec.schema.record_log import read_record, write_record
 from kiteline_core.geometry import se3
 from kiteline_core.ground.column_scan import ColumnScan, level_rotation
-from kiteline_core.ids import (
-    KeyframeId,
-    SubmapId,
-    keyframe_id,
-    submap_id,
-)
+from kiteline_core.ids import AgentId, KeyframeId, SubmapId, keyframe_id, submap_id
 from tests.codec.schema.some_records import a_scan, assert_same, some_cells, some_records
 from tests.yardstick import slowness
 
@@ -320,3 +314,17 @@ def test_a_measured_record_is_coded_as_any_other() -> None:
         assert messages.length(record) == len(code)
         assert messages.encode(record) is messages.encode(record) == code
         assert messages.encode(replace(record)) == code
+
+
+keys = st.builds(Key, st.integers(0, 255), st.integers(0, 2**62), st.integers(0, 65535))
+
+
+@given(st.integers(0, 255).map(AgentId), keys, st.binary(max_size=40))
+def test_what_was_written_is_read(agent: AgentId, key: Key, code: bytes) -> None:
+    assert read_record(write_record(agent, key, code)) == (agent, key, code)
+
+
+@given(st.binary(max_size=11))
+def test_what_is_too_short_is_refused(noise: bytes) -> None:
+    with pytest.raises(WireError):
+        read_record(noise)

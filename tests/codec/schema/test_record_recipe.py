@@ -1,7 +1,5 @@
 """The recipe of CONTRIBUTING.md, "A record": one module and one line make a record that crosses a channel."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys
@@ -12,8 +10,6 @@ import kiteline_core
 
 MODULE = '''
 """The battery of an agent."""
-
-from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Self

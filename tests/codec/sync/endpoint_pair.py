@@ -1,7 +1,5 @@
 """Two endpoints and a simulated link between them, for tests."""
 
-from __future__ import annotations
-
 import random
 
 from kiteline_codec.schema import Key

@@ -1,7 +1,5 @@
 """A spill in memory that can be full or lose data."""
 
-from __future__ import annotations
-
 
 class Memory:
     """A Spill. Of what was put it loses every `forgets`-th; it takes no more than `room` bytes."""

@@ -4,8 +4,6 @@ That the machine would notice a defect is tested too: with each of a few defects
 drawn by `random`: hypothesis took three quarters of the time for itself. A failure names the run that repeats it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from random import Random
 from typing import Any

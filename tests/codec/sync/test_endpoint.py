@@ -1,7 +1,5 @@
 """Two endpoints over a bad link: what each property of the endpoint promises."""
 
-from __future__ import annotations
-
 import random
 from collections import deque
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Endpoints in bounded memory and time, whatever arrives."""
 
-from __future__ import annotations
-
 import time
 import zlib
 from dataclasses import replace
@@ -10,13 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kiteline_codec.schema import (
-    Key,
-    KeyframePose,
-    LivePose,
-    NewLandmarks,
-    WireError,
-)
+from kiteline_codec.schema import Key, KeyframePose, LivePose, NewLandmarks, WireError
 from kiteline_codec.sync.config import SyncConfig
 from kiteline_codec.sync.endpoint import Endpoint
 from kiteline_codec.transport.packet import parse

@@ -1,14 +1,8 @@
 """Endpoints that start again: what the other end keeps, and what it asks for."""
 
-from __future__ import annotations
-
 import zlib
 
-from kiteline_codec.schema import (
-    Key,
-    KeyframePose,
-    NewLandmarks,
-)
+from kiteline_codec.schema import Key, KeyframePose, NewLandmarks
 from kiteline_codec.sync.endpoint import Endpoint
 from tests.codec.sync.endpoint_pair import PLAIN, Pair, fill
 
@@ -93,7 +87,6 @@ def test_two_ends_with_one_number_do_not_overtake_each_other_for_ever() -> None:
 def test_another_protocol_version_is_refused_by_name() -> None:
     a, b = Endpoint(PLAIN, 1), Endpoint(PLAIN, 1)
     packet = a.poll(0)
-    assert packet is not None
     other = bytes([9]) + packet[1:-4]
     assert b.receive(other + zlib.crc32(other).to_bytes(4, "little"), 0) == []
     assert b.stats.reasons == (("the other side speaks protocol version 9, this one 7", 1),)

@@ -1,7 +1,5 @@
 """A peer with a sound key that means harm: memory stays bounded, and nothing but refusals comes of it."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Sequence
 from dataclasses import replace

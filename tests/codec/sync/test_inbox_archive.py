@@ -1,7 +1,5 @@
 """The base's values of keyframes over hours: beyond a limit they are archived, and none is lost."""
 
-from __future__ import annotations
-
 import random
 
 from kiteline_codec.schema import (
@@ -18,13 +16,7 @@ from tests.codec.sync.spill_memory import Memory
 
 TICK_NS = 50_000_000
 LIMIT = 100_000
-KINDS = (
-    KeyframePose.KIND,
-    RefinedLandmarks.KIND,
-    FusedLandmarks.KIND,
-    RemovedObservations.KIND,
-    CulledLandmarks.KIND,
-)
+KINDS = (KeyframePose.KIND, RefinedLandmarks.KIND, FusedLandmarks.KIND, RemovedObservations.KIND, CulledLandmarks.KIND)
 
 
 class Line:

@@ -1,7 +1,5 @@
 """What an endpoint holds, in memory and in its spill, does not grow with the time that it runs."""
 
-from __future__ import annotations
-
 import random
 from collections import Counter
 from pathlib import Path

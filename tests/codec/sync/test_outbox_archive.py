@@ -1,7 +1,5 @@
 """A long outage of the link: memory stays bounded, and archived values arrive when the link is back."""
 
-from __future__ import annotations
-
 import random
 
 import pytest

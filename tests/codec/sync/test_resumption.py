@@ -1,7 +1,5 @@
 """After a restart, codes that the other side still holds are sent as checksums."""
 
-from __future__ import annotations
-
 import contextlib
 
 import numpy as np

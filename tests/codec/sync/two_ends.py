@@ -1,7 +1,5 @@
 """Two endpoints and the link between them, with faults, and what may be done to them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from random import Random

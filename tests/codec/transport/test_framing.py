@@ -1,7 +1,5 @@
 """Packets on a byte stream: every split, noise and damage."""
 
-from __future__ import annotations
-
 from hypothesis import given
 from hypothesis import strategies as st
 

@@ -1,7 +1,5 @@
 """Seals: only what a key's holder wrote, once, goes through."""
 
-from __future__ import annotations
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -10,10 +8,7 @@ from kiteline_codec.transport import seal
 from kiteline_codec.transport.seal import Direction, Opener, Sealer, Suite, fingerprint, seal_bytes
 
 KEY, OTHER = bytes(range(32)), bytes(range(1, 33))
-GOLDEN = (
-    "03050100010203040506072ffcf28162b332eafff82dbe848abe93230b6d46",
-    "8305016b6974651c305abc036f3490",
-)
+GOLDEN = ("03050100010203040506072ffcf28162b332eafff82dbe848abe93230b6d46", "8305016b6974651c305abc036f3490")
 SUITES = pytest.mark.parametrize("suite", list(Suite))
 
 

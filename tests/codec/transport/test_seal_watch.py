@@ -1,7 +1,5 @@
 """Ends that do not understand each other say why, on both sides, after a few packets."""
 
-from __future__ import annotations
-
 import pytest
 
 from kiteline_codec.coding.packing import WireError
@@ -121,7 +119,6 @@ def test_notices_are_read_exactly() -> None:
 def test_a_key_can_be_changed_while_packets_arrive() -> None:
     base, agent = End(Direction.DOWN, OTHER), End(Direction.UP, OURS)
     assert exchange(agent, base)[0] == 0
-    assert base.opener is not None
     base.opener.set_key(AGENT, OURS)
     assert exchange(agent, base)[0] == 4
 
@@ -182,7 +179,7 @@ def test_questions_of_a_clock_that_was_ahead_are_forgotten_like_others(monkeypat
 def test_a_packet_of_a_line_names_its_agent(agent: int) -> None:
     base = SealWatch(Direction.DOWN, Opener({agent: OURS}, Direction.UP))
     opened, _ = base.take(None, Sealer(OURS, agent, 4, Direction.UP, Suite.TAGGED).seal(packet()))
-    assert opened is not None and opened[0] == agent
+    assert opened[0] == agent
     other = Sealer(OTHER, agent, 5, Direction.UP, Suite.TAGGED)
     for _ in range(4):
         base.take(None, other.seal(packet()))

@@ -1,19 +1,14 @@
 """Brightness of a pair: what gain and falloff are learned from matches, and that the next match is free of them."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F32, U8
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ground.brightness import Brightness, falloff
 from kiteline_core.ground.config import GroundConfig
 from kiteline_core.ground.disparity import DisparityCamera, DisparityStripes
-
-F32 = NDArray[np.float32]
-U8 = NDArray[np.uint8]
 
 CAMERA = DisparityCamera.of(RectifiedCamera(752, 480, 400.0, 400.0, 375.5, 239.5, 0.11, True, np.eye(4)))
 H, W = CAMERA.height, CAMERA.width

@@ -1,7 +1,5 @@
 """Ground that falls: pits, steps and edges are not free, and slopes that vehicles climb are."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The height of the ground over a flight: boxes and tables that look like a floor, ramps, and what is withdrawn."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

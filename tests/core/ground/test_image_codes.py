@@ -1,7 +1,5 @@
 """Coded images of scans: the same images but for what JPEG rounds, and no memory for what is no such code."""
 
-from __future__ import annotations
-
 import struct
 import time
 
@@ -10,8 +8,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import U8
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ground.disparity import DisparityCamera
 from kiteline_core.ground.image_codes import decode_pair, encode_pair
@@ -19,7 +17,7 @@ from kiteline_core.ground.image_codes import decode_pair, encode_pair
 CAMERA = DisparityCamera.of(RectifiedCamera(320, 240, 200.0, 200.0, 159.5, 119.5, 0.1, True, np.eye(4)))
 
 
-def pair() -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+def pair() -> tuple[U8, U8]:
     noise = np.random.default_rng(1).integers(0, 256, (2, CAMERA.height, CAMERA.width)).astype(np.uint8)
     left, right = (np.asarray(cv2.GaussianBlur(image, (0, 0), 2.0), np.uint8) for image in noise)
     return left, right

@@ -1,7 +1,5 @@
 """Kernels of ground segmentation against plain numpy."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from kiteline_core.ground import label_kernels, level_kernels, profile_kernels

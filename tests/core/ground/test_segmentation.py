@@ -1,7 +1,5 @@
 """Ground segmentation of ideal and spoilt disparity images: level and banked cameras, ramps, walls, plain floors."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

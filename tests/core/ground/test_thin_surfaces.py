@@ -1,16 +1,12 @@
 """Surfaces that are thinner than a matched block: they get their own disparity, not that of the wall behind."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import U8
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ground.config import GroundConfig
 from kiteline_core.ground.disparity import DisparityCamera, DisparityStripes
-
-U8 = NDArray[np.uint8]
 
 CAMERA = DisparityCamera.of(RectifiedCamera(752, 480, 400.0, 400.0, 375.5, 239.5, 0.11, True, np.eye(4)))
 H, W = CAMERA.height, CAMERA.width

@@ -1,14 +1,12 @@
 """The wider view of scans: it goes on where the rectified images end, and holds nothing that a lens did not see."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64, U8, Bool
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraModel, CameraRig, Lens, RawSide, Rectifier
 from kiteline_core.ground.config import GroundConfig
@@ -30,12 +28,12 @@ def rig(lens: CameraModel) -> CameraRig:
     return CameraRig(lens, lens, np.eye(4), T_C_R)
 
 
-def texture(seed: int) -> NDArray[np.uint8]:
+def texture(seed: int) -> U8:
     noise = np.random.default_rng(seed).integers(0, 256, (HEIGHT, WIDTH)).astype(np.uint8)
     return np.asarray(cv2.normalize(cv2.GaussianBlur(noise, (0, 0), 4.0), None, 0, 255, cv2.NORM_MINMAX), np.uint8)
 
 
-def raw_pixels(side: RawSide, uv: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def raw_pixels(side: RawSide, uv: F64) -> tuple[F64, F64]:
     """Raw pixels (n,2) of rectified ones (n,2), and the tangent (n,) of the angle to the raw optical axis."""
     xy = (uv - side.matrix[:2, 2]) / side.matrix[[0, 1], [0, 1]]
     rays = np.column_stack([xy, np.ones(len(xy))]) @ side.rotation  # by the transpose: from rectified to raw
@@ -46,7 +44,7 @@ def raw_pixels(side: RawSide, uv: NDArray[np.float64]) -> tuple[NDArray[np.float
     return raw, np.sqrt(r2)
 
 
-def kept(view: WideView, disparity_px: float) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+def kept(view: WideView, disparity_px: float) -> tuple[F64, F64, Bool]:
     """Where pixels of a disparity image lie in the rectified left and right image (n,2), and which are not masked."""
     small = DisparityCamera.of(view.camera)
     disparity = np.full((small.height, small.width), disparity_px, np.float32)

@@ -134,8 +134,7 @@ def test_a_kalibr_chain_with_its_imu(tmp_path: Path) -> None:
     c = told(tmp_path, camchain=CHAIN, imu=IMU)
     assert c.cameras[0].lens is Lens.EQUIDISTANT and c.cameras[0].fx == 190.97847715128717
     assert (c.cameras[1].width, c.cameras[1].cy) == (512, 254.91723064636983)
-    assert c.T_c_r is not None and c.T_c_r[0, 3] == pytest.approx(0.1)  # T_cn_cnm1 is the left camera in the right one
-    assert c.T_b_c is not None
+    assert c.T_c_r[0, 3] == pytest.approx(0.1)  # T_cn_cnm1 is the left camera in the right one
     np.testing.assert_allclose(c.T_b_c[:3, 3], [0.02, -0.01, -0.03], atol=1e-12)
     assert c.imu == ImuCalibration(1.87e-4, 2.66e-5, 1.86e-3, 4.33e-4, 190.0)
     assert c.topics == ("/cam0/image_raw", "/cam1/image_raw")
@@ -147,13 +146,13 @@ def test_a_chain_whose_cameras_know_the_imu_only(tmp_path: Path) -> None:
         "[0.0, 0.0, 1.0, 0.03]", "[0, 0, 1, 0]"
     )
     c = told(tmp_path, camchain=text)
-    assert c.T_c_r is not None and c.T_c_r[0, 3] == pytest.approx(0.1)
+    assert c.T_c_r[0, 3] == pytest.approx(0.1)
 
 
 def test_ros_files_of_a_pair(tmp_path: Path) -> None:
     c = told(tmp_path, left=ROS.format(side="left", tx=0), right=ROS.format(side="right", tx=-48.0))
     assert c.cameras[0].lens is Lens.RADTAN and c.cameras[0].distortion[0] == -0.36
-    assert c.T_c_r is not None and c.T_c_r[0, 3] == pytest.approx(0.12) and c.T_b_c is None
+    assert c.T_c_r[0, 3] == pytest.approx(0.12) and c.T_b_c is None
     rig = c.rig()
     assert not rig.has_body and rig.right is not None
 
@@ -233,7 +232,8 @@ def test_each_fault_names_file_key_and_what_was_expected(
     ("text", "message"),
     [("", "expected a calibration file"), ("- 1\n- 2\n", "expected a calibration file"), ("a: [1\nb", "no YAML"),
      ("speed: 3\n", "no calibration that is known.*speed"), ("\x00\x01\x02", "no YAML"),
-     ("[" * 3000, "nested more than 16 deep"), ("kiteline_calibration: 7\n", "kiteline_calibration to be 1"),
+     *[(text, "nested more than 16 deep") for text in ("[" * 4000, "{" * 60_000, "[1," * 2000, "a: " + "[{" * 900)],
+     ("kiteline_calibration: 7\n", "kiteline_calibration to be 1"),
      ("x" * (2 << 20), "far smaller")],
 )  # fmt: skip
 def test_what_is_no_calibration_is_refused(tmp_path: Path, text: str, message: str) -> None:
@@ -329,12 +329,3 @@ def test_damaged_files_raise_nothing_but_a_source_error(tmp_path: Path, text: st
         assert np.isfinite((c.fx, c.fy, c.cx, c.cy, *c.distortion)).all() and c.fx > 0 and c.width > 0
     for T in (back.T_c_r, back.T_b_c):
         assert T is None or np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-9)
-
-
-@pytest.mark.parametrize("text", ["[" * 4000, "{" * 60_000, "[1," * 2000, "a: " + "]" * 50 + "[{" * 900])
-def test_brackets_nested_deep_are_refused_before_they_are_read(text: str, tmp_path: Path) -> None:
-    """The reader of YAML took a second and a half for 4000 brackets."""
-    path = tmp_path / "calibration.yaml"
-    path.write_text(text)
-    with pytest.raises(SourceError, match="nested more than 16 deep"):
-        read_calibration(str(path))

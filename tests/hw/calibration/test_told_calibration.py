@@ -58,8 +58,8 @@ def test_tum_vi_folder(tmp_path: Path) -> None:
     assert 100 < frames[0].left.mean() < 155  # 16 bits are scaled, not cut
     assert sum(len(i.t_ns) for i in items if isinstance(i, ImuBatch)) == 20
     assert source.rig.left.lens is Lens.EQUIDISTANT and source.rig.has_body
-    assert source.imu is not None and source.imu.rate_hz == 190.0
-    assert source.ground_truth is not None and source.ground_truth.T_w_b[3, 0, 3] == pytest.approx(0.3)
+    assert source.imu.rate_hz == 190.0
+    assert source.ground_truth.T_w_b[3, 0, 3] == pytest.approx(0.3)
     camera = Rectifier(source.rig).camera
     # 120 degrees are left of a lens of 195: more cannot be drawn on a plane
     assert np.degrees(2.0 * np.arctan(0.5 * camera.width / camera.fx)) > 100.0
@@ -88,7 +88,7 @@ def test_images_without_camera_yaml(tmp_path: Path) -> None:
     chain.write_text(CHAIN)
     pair = f"images:{tmp_path}/l/*.png,{tmp_path}/r/*.png"
     source = open_source(pair, calibration=str(chain))
-    assert source.rig.right is not None and source.rig.right.lens is Lens.EQUIDISTANT
+    assert source.rig.right.lens is Lens.EQUIDISTANT
     assert len([f for f in source if isinstance(f, Frame)]) == 2
     chain.write_text(CHAIN.split("cam1:")[0])
     assert open_source(f"images:{tmp_path}/l/*.png", calibration=str(chain)).rig.right is None
@@ -127,7 +127,6 @@ def test_own_calibration_of_a_recording_told_again_changes_nothing(data_dir: Pat
     assert told.rig.T_c_r is not None and plain.rig.T_c_r is not None
     np.testing.assert_array_equal(told.rig.T_c_r, plain.rig.T_c_r)
     np.testing.assert_allclose(told.rig.T_b_c, plain.rig.T_b_c, atol=1e-15)
-    assert told.ground_truth is not None and plain.ground_truth is not None
     np.testing.assert_array_equal(told.ground_truth.T_w_b, plain.ground_truth.T_w_b)
 
 
@@ -170,7 +169,7 @@ def test_a_live_pair_by_a_calibration_file(tmp_path: Path) -> None:
     by_option = read_rig("v4l2", options, stereo=True)
     by_flag = read_rig("v4l2", LiveOptions(calibration="none.yaml"), stereo=True, told=read_calibration(str(chain)))
     for rig in (by_option, by_flag):
-        assert rig.right is not None and rig.right.fx == 190.44236969414825 and rig.has_body
+        assert rig.right.fx == 190.44236969414825 and rig.has_body
     assert read_rig("v4l2", options, stereo=False).right is None
     chain.write_text(CHAIN.split("cam1:")[0])
     with pytest.raises(SourceError, match="one camera"):

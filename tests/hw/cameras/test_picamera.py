@@ -1,7 +1,5 @@
 """Picamera2 behind a model of its interface."""
 
-from __future__ import annotations
-
 import sys
 import time
 from pathlib import Path
@@ -91,7 +89,7 @@ def test_images_stamps_settings_and_a_failure(calibration: Path) -> None:
     assert isinstance(source, CameraSource)
     try:
         frame = source.poll(time.monotonic_ns() + 5_000_000_000)
-        assert frame is not None and frame.left.shape == (H, W) and (frame.left == 77).all()
+        assert frame.left.shape == (H, W) and (frame.left == 77).all()
         assert 3_000_000 <= time.monotonic_ns() - frame.t_ns < 200_000_000
         assert Picamera2.asked["controls"] == {"FrameRate": 50.0, "ExposureTime": 4000, "AnalogueGain": 2.0}
         said_until(source, "YUV420 at 50 Hz")

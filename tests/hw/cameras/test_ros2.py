@@ -1,7 +1,5 @@
 """Topics of ROS 2 behind a model of rclpy's interface."""
 
-from __future__ import annotations
-
 import sys
 import threading
 import time

@@ -1,7 +1,5 @@
 """V4L2 cameras on modelled devices behind the system calls: formats, stamps, pairs, faults."""
 
-from __future__ import annotations
-
 import ctypes
 import errno
 import platform
@@ -12,8 +10,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import U8
 from kiteline_core.frame import Frame
 from kiteline_hw.cameras import v4l2
 from kiteline_hw.cameras import v4l2_api as api
@@ -25,7 +23,6 @@ from kiteline_hw.sensors.raw_pixels import BadImage
 from kiteline_hw.sim.sensors.video_device import ModelDevice, ModelKernel
 from kiteline_hw.sources.open import open_source
 
-U8 = NDArray[np.uint8]
 W, H = 64, 48
 CALIBRATION = f"fx: 50\nfy: 50\ncx: 32\ncy: 24\nwidth: {W}\nheight: {H}\n"
 

@@ -1,7 +1,5 @@
 """Links opened by name."""
 
-from __future__ import annotations
-
 import socket
 import time
 

@@ -1,7 +1,5 @@
 """Sealed links, and the key file."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,11 +1,7 @@
 """What is sealed by default, pairing codes, and what a base lets strangers do."""
 
-from __future__ import annotations
-
-import socket
 import stat
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +25,7 @@ from kiteline_hw.system.key_store import (
     read_keys,
 )
 from kiteline_hw.system.process import state_folder
+from tests.hw.processes import free_endpoint, wait_for
 
 NETWORK, LOOPBACK = "zenoh:tcp/0.0.0.0:7447", "zenoh:tcp/127.0.0.1:7447"
 
@@ -130,16 +127,7 @@ def test_the_right_to_change_maps_is_kept_beside_the_keys(tmp_path: Path) -> Non
 
 @pytest.fixture
 def endpoint() -> str:
-    with socket.socket() as s:
-        s.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{s.getsockname()[1]}"
-
-
-def until(condition: Callable[[], object], seconds: float = 6.0) -> None:
-    end_s = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end_s
-        time.sleep(0.02)
+    return free_endpoint()
 
 
 def test_a_base_routes_nothing_between_its_clients(endpoint: str) -> None:
@@ -151,7 +139,7 @@ def test_a_base_routes_nothing_between_its_clients(endpoint: str) -> None:
                 stranger.declare_subscriber(key, direct(lambda sample: heard.append(str(sample.key_expr))))
                 for key in ("kiteline/1/default/*/up", "other/**")
             ]
-            until(lambda: agent.connected and 3 in hub.links())
+            wait_for(lambda: agent.connected and 3 in hub.links())
             received: list[bytes] = []
 
             def pass_packets() -> bool:
@@ -162,7 +150,7 @@ def test_a_base_routes_nothing_between_its_clients(endpoint: str) -> None:
                 received.extend(agent.receive())
                 return b"from the base" in received and b"from the agent" in hub.links()[3].receive()
 
-            until(pass_packets)
+            wait_for(pass_packets)
             time.sleep(0.3)
             received += agent.receive()
             assert set(received) == {b"from the base"}
@@ -175,13 +163,13 @@ def test_a_base_routes_nothing_between_its_clients(endpoint: str) -> None:
 
 def test_two_agents_with_one_number_are_found_on_both_ends_within_three_seconds(endpoint: str) -> None:
     with ZenohHub(endpoint) as hub, ZenohLink(endpoint, 3) as one:
-        until(lambda: one.connected)
+        wait_for(lambda: one.connected)
         with ZenohLink(endpoint, 3) as other, ZenohLink(endpoint, 4) as third:
-            until(lambda: other.connected and third.connected)
+            wait_for(lambda: other.connected and third.connected)
             assert hub.doubles() == frozenset()
-            until(lambda: hub.doubles() == {3} and one.doubled and other.doubled, 3.0)
+            wait_for(lambda: hub.doubles() == {3} and one.doubled and other.doubled, 3.0)
             assert not third.doubled
-        until(lambda: not hub.doubles())
+        wait_for(lambda: not hub.doubles())
 
 
 def test_names_that_strangers_announce_take_little_memory() -> None:
@@ -203,7 +191,7 @@ def test_what_is_too_long_is_dropped_before_it_takes_memory(endpoint: str) -> No
                     "kiteline/1/default/3/up", bytes(100_000), congestion_control=zenoh.CongestionControl.BLOCK
                 )
             stranger.put("kiteline/1/default/3/up", b"short")
-            until(lambda: 3 in hub.links())
+            wait_for(lambda: 3 in hub.links())
             time.sleep(0.2)
             assert hub.links()[3].receive() == [b"short"]
             assert hub.counters.overrun_packets > 0
@@ -228,6 +216,6 @@ def test_strangers_take_up_no_place_of_a_base_for_paired_agents_alone(endpoint: 
             with pytest.raises(zenoh.ZError):
                 zenoh.open(config)
         with ZenohLink(endpoint, 3, logins=ours) as agent, ZenohLink(endpoint, 4, logins=login_of(4, bytes([1]) * 32)):
-            until(lambda: agent.connected and hub.alive() == {3}, 20.0)
+            wait_for(lambda: agent.connected and hub.alive() == {3}, 20.0)
     with ZenohHub(endpoint) as hub, ZenohLink(endpoint, 3, logins=ours) as agent:  # and one for anyone
-        until(lambda: agent.connected and hub.alive() == {3})
+        wait_for(lambda: agent.connected and hub.alive() == {3})

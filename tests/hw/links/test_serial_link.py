@@ -1,7 +1,5 @@
 """The serial link on pseudo terminals: noise, full buffers, hang-ups and reopening."""
 
-from __future__ import annotations
-
 import os
 import time
 import zlib
@@ -153,11 +151,7 @@ def test_a_framer_that_raises_is_counted() -> None:
         def feed(self, data: bytes) -> list[bytes]:
             raise RuntimeError("broken")
 
-    with (
-        SerialPair() as pair,
-        SerialLink(pair.a, 57600, CobsFramer()) as a,
-        SerialLink(pair.b, 57600, Broken()) as b,
-    ):
+    with SerialPair() as pair, SerialLink(pair.a, 57600, CobsFramer()) as a, SerialLink(pair.b, 57600, Broken()) as b:
         a.send(b"x")
         wait_for(lambda: b.counters.callback_errors > 0)
         b.send(b"still alive")

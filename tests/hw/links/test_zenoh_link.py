@@ -1,7 +1,5 @@
 """Zenoh links: reconnect with either side, never block the caller, never keep a process from ending."""
 
-from __future__ import annotations
-
 import signal
 import time
 from typing import Any
@@ -230,7 +228,7 @@ def test_a_process_with_an_open_link_ends(way: str, status: int) -> None:
     with ZenohHub(endpoint) as hub:
         process = start(AGENT, endpoint, way, free_endpoint())
         try:
-            assert process.stdout is not None and process.stdout.readline() == "connected\n"
+            assert process.stdout.readline() == "connected\n"
             wait_for(lambda: hub.alive() == {1})
             for i in range(100):
                 hub.links()[1].send(b"%d" % i)  # callbacks are running while the process ends

@@ -1,7 +1,5 @@
 """Zenoh with certificates on both sides and access control: a base, its agent, and two agents without access."""
 
-from __future__ import annotations
-
 import datetime
 import ipaddress
 import json

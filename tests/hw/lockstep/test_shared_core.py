@@ -1,7 +1,5 @@
 """Processes that share a modelled core."""
 
-from __future__ import annotations
-
 import pytest
 
 from kiteline_hw.lockstep.shared_core import SharedCore

@@ -1,14 +1,20 @@
 """The barrier between processes: every message is answered in order, and errors when either side ends."""
 
-from __future__ import annotations
-
+import contextlib
 import signal
 import threading
 import time
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
+import zenoh
+from hypothesis import given
+from hypothesis import strategies as st
 
 from kiteline_hw.links import zenoh_session
+from kiteline_hw.lockstep.agent_end import AgentBarrier
+from kiteline_hw.lockstep.messages import Down, Phase, Up
 from kiteline_hw.lockstep.zenoh_lockstep import LockstepClient, LockstepServer
 from kiteline_hw.ports import LinkError
 from tests.hw.processes import free_endpoint, start
@@ -82,7 +88,7 @@ def test_a_killed_base_is_noticed_at_once() -> None:
             assert client.exchange(b"%d" % tick, 10.0) == b"%d" % tick
 
         def kill() -> None:
-            assert process.stdout is not None and process.stdout.readline() == "collected\n"
+            assert process.stdout.readline() == "collected\n"
             process.kill()
 
         thread = threading.Thread(target=kill)
@@ -138,3 +144,61 @@ def test_close_is_quick_with_a_frozen_base() -> None:
     finally:
         process.kill()
         process.communicate()
+
+
+class _NoParent:
+    def send_event(self, event: str, **values: Any) -> None:
+        raise AssertionError(f"{event} {values}")
+
+
+def test_an_agent_waits_minutes_for_a_base_to_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    endpoint = free_endpoint()
+    open_zenoh, passed_s, servers = zenoh.open, [0.0], []
+
+    def refused_once(config: zenoh.Config) -> zenoh.Session:
+        if not passed_s[0]:
+            passed_s[0] = 120.0
+            monkeypatch.setattr(zenoh, "open", open_zenoh)
+            servers.append(LockstepServer(endpoint))
+            raise zenoh.ZError("nobody listens")
+        return open_zenoh(config)
+
+    clock = SimpleNamespace(monotonic=lambda: time.monotonic() + passed_s[0], sleep=lambda _: None)
+    monkeypatch.setattr(zenoh_session, "time", clock)
+    monkeypatch.setattr(zenoh, "open", refused_once)
+    barrier = AgentBarrier(endpoint, 3, _NoParent())  # type: ignore[arg-type]
+    assert not barrier.lost
+    barrier.close()
+    servers[0].close()
+
+
+times = st.integers(0, 2**62)
+packets = st.lists(st.binary(max_size=40), max_size=5).map(tuple)
+
+
+@given(times | st.none(), st.booleans(), st.booleans(), packets)
+def test_up_round_trip(next_ns: int | None, quiet: bool, equal: bool, sent: tuple[bytes, ...]) -> None:
+    up = Up(next_ns, quiet, equal, sent)
+    assert Up.decode(up.encode()) == up
+
+
+@given(times, st.sampled_from(Phase), packets)
+def test_down_round_trip(now_ns: int, phase: Phase, sent: tuple[bytes, ...]) -> None:
+    down = Down(now_ns, phase, sent)
+    assert Down.decode(down.encode()) == down
+
+
+@given(st.binary(max_size=60))
+def test_any_bytes_are_a_message_or_a_link_error(noise: bytes) -> None:
+    for kind in (Up, Down):
+        with contextlib.suppress(LinkError):
+            kind.decode(noise)
+
+
+def test_cut_and_padded_messages_are_refused() -> None:
+    message = Up(None, True, False, (b"abc", b"")).encode()
+    for wrong in (message[:-1], message + b"x", b""):
+        with pytest.raises(LinkError):
+            Up.decode(wrong)
+    with pytest.raises(LinkError, match="phase"):
+        Down.decode(Down(0, Phase.FLY, ()).encode()[:8] + b"\x09\0\0\0\0")

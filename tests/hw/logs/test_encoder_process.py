@@ -1,7 +1,5 @@
 """Images encoded in another process: the same pixels, in order, also when that process ends before its time."""
 
-from __future__ import annotations
-
 import os
 import signal
 import time
@@ -9,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import U8
 from kiteline_core.frame import Frame
 from kiteline_hw.logs import encoder_process
 from kiteline_hw.logs.encoder_process import EncoderProcess
@@ -19,7 +17,7 @@ from kiteline_hw.logs.mcap_log import LEFT, RIGHT, LogReader, LogWriter
 from kiteline_hw.sensors.images import decode_grey, encode_image
 
 
-def picture(seed: int, shape: tuple[int, int] = (48, 75)) -> NDArray[np.uint8]:
+def picture(seed: int, shape: tuple[int, int] = (48, 75)) -> U8:
     return np.random.default_rng(seed).integers(0, 256, shape, np.uint8)
 
 
@@ -28,7 +26,6 @@ def test_the_same_bytes_as_here_and_slots_are_used_again(monkeypatch: pytest.Mon
     apart = EncoderProcess((48, 75), 3)
     for k in range(10):
         done = apart.submit(picture(k))
-        assert done is not None
         apart.wait(done)
         assert done.result() == encode_image(picture(k))
     waiting = [apart.submit(picture(k)) for k in range(3)]
@@ -66,7 +63,6 @@ def test_a_log_is_whole_whenever_the_process_ends(tmp_path: Path, kill_at: int |
             log.blob("/packets", k, b"%d" % k)
             if k == kill_at:
                 process = encoder._process
-                assert process is not None
                 process._process.kill()
             if k % 3 == 2:
                 time.sleep(0.1)

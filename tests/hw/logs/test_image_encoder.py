@@ -1,15 +1,13 @@
 """Raw images of a log: encoded apart, in order, never lost."""
 
-from __future__ import annotations
-
 import threading
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import U8
 from kiteline_core.frame import EncodedImage, Frame
 from kiteline_hw.logs import image_encoder
 from kiteline_hw.logs.image_encoder import EncodingPolicy, ImageEncoder
@@ -17,7 +15,7 @@ from kiteline_hw.logs.mcap_log import LEFT, RIGHT, LogReader, LogWriter
 from kiteline_hw.sensors.images import decode_grey, encode_image, store_image
 
 
-def picture(seed: int, shape: tuple[int, int] = (48, 75)) -> NDArray[np.uint8]:
+def picture(seed: int, shape: tuple[int, int] = (48, 75)) -> U8:
     noise = np.random.default_rng(seed).integers(0, 256, shape, np.uint8)
     return np.asarray(cv2.GaussianBlur(noise, (5, 5), 1.5), np.uint8)
 
@@ -38,7 +36,7 @@ def slow(monkeypatch: pytest.MonkeyPatch) -> threading.Semaphore:
     """The encoder's thread encodes an image for each permit."""
     permits = threading.Semaphore(0)
 
-    def encode(pixels: NDArray[np.uint8]) -> EncodedImage:
+    def encode(pixels: U8) -> EncodedImage:
         permits.acquire()
         return encode_image(pixels)
 

@@ -112,7 +112,6 @@ def test_depth_and_ground_truth_round_trip(tmp_path: Path) -> None:
         assert isinstance(got, Frame) and got.depth_m is not None and frame.depth_m is not None
         np.testing.assert_array_equal(got.left, frame.left)
         np.testing.assert_allclose(got.depth_m, frame.depth_m, rtol=1e-6)
-        assert source.ground_truth is not None
         np.testing.assert_allclose(source.ground_truth.T_w_b, truth.T_w_b, atol=1e-14)
         assert not source.rig.has_body
 
@@ -167,7 +166,6 @@ def test_foxglove_reads_it_with_its_own_schemas(tmp_path: Path) -> None:
         for schema, channel, _, message in make_reader(
             stream, decoder_factories=[DecoderFactory()]
         ).iter_decoded_messages(topics=[t for t in LogReader(tmp_path / "log.mcap").topics if t != "/rig"]):
-            assert schema is not None
             found[channel.topic] = (schema.name, message)
     assert found["/left/image"][0] == "foxglove.CompressedImage"
     assert (found["/left/image"][1].timestamp.seconds, found["/left/image"][1].format) == (5, "png")
@@ -239,7 +237,7 @@ def test_the_rig_in_json_is_exact_to_the_last_bit(values: list[float], depth: bo
     got, imu = rig_from_json(json.loads(json.dumps(rig_to_json(rig, ImuCalibration(values[0])))))
     assert got.left == rig.left and got.right is None and got.has_depth == depth
     np.testing.assert_array_equal(got.T_b_c, t)
-    assert imu is not None and imu.gyro_noise == values[0]
+    assert imu.gyro_noise == values[0]
 
 
 @given(st.integers(0, 300) | st.integers(16_000, 17_000))

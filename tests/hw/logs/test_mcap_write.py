@@ -1,7 +1,5 @@
 """The writer of MCAP files, beside the mcap package's."""
 
-from __future__ import annotations
-
 import io
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Poses pushed to a sink while a condition holds."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """The IMU of a flight controller against values by hand: frames, signs, units, clocks, and the choice of message."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from pymavlink.dialects.v20 import common
@@ -46,7 +44,7 @@ def test_samples_in_every_body_frame(axes: str) -> None:
     for i in range(len(data)):
         stream.receive(data[i : i + 1], 5 * S)  # byte by byte
     batch = stream.take_imu(5 * S)
-    assert batch is not None and batch.t_ns.tolist() == [5 * S]
+    assert batch.t_ns.tolist() == [5 * S]
     np.testing.assert_allclose(batch.accel[0], IN_BODY[axes][0], atol=1e-5)
     np.testing.assert_allclose(batch.gyro[0], IN_BODY[axes][1], atol=1e-6)
     assert stream.take_imu(9 * S) is None
@@ -66,7 +64,6 @@ def test_samples_in_mg_and_mrad(data: bytes) -> None:
     stream, _ = stream_of(unit("frd"))
     stream.receive(data, 5 * S)
     batch = stream.take_imu(5 * S)
-    assert batch is not None
     np.testing.assert_allclose(batch.accel[0], [4.9033, 0.0, -8.4926], atol=1e-4)
     np.testing.assert_allclose(batch.gyro[0], [0.0, 0.1, 0.3], atol=1e-12)
 
@@ -109,7 +106,6 @@ def test_stamps_are_converted_by_the_least_delay() -> None:
         t_ns = 100 * S + 40 * k * MS
         imu.receive(VehicleImu((t_ns - 60 * S) // 1000, *NOSE_UP), None, t_ns + delay_ms * MS)
     batch = imu.take_until(101 * S)
-    assert batch is not None
     late_ms = (batch.t_ns - (100 * S + 40 * MS * np.arange(4))) / MS
     np.testing.assert_allclose(late_ms, [30, 4, 4, 4], atol=0.1)
 
@@ -122,8 +118,8 @@ def test_late_samples_come_with_the_next_frame() -> None:
     imu.receive(VehicleImu(45_000, *NOSE_UP), None, S + 55 * MS)  # overtaken on its way
     imu.receive(VehicleImu(60_000, *NOSE_UP), None, S + 60 * MS)
     second = imu.take_until(S + 99 * MS)
-    assert first is not None and first.t_ns.tolist() == [S]
-    assert second is not None and second.t_ns.tolist() == [S + 50 * MS, S + 60 * MS]
+    assert first.t_ns.tolist() == [S]
+    assert second.t_ns.tolist() == [S + 50 * MS, S + 60 * MS]
 
 
 def test_the_buffer_is_bounded() -> None:
@@ -131,7 +127,7 @@ def test_the_buffer_is_bounded() -> None:
     for k in range(30):
         imu.receive(VehicleImu(k * 5000, *NOSE_UP), None, S + k * 5 * MS)
     batch = imu.take_until(9 * S)
-    assert batch is not None and len(batch.t_ns) == 10
+    assert len(batch.t_ns) == 10
     imu.receive(VehicleImu(200_000, *NOSE_UP), None, S + 200 * MS)
     assert imu.take_until(9 * S) is not None
 

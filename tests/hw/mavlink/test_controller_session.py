@@ -1,7 +1,5 @@
 """The session with a flight controller: what modelled ArduPilot and PX4 accept, when, and with which values."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from math import cos, inf, nan, sin
 
@@ -171,7 +169,7 @@ def test_the_controller_is_known_by_its_heartbeat() -> None:
     for message in controller.poll(0):
         stream.receive(message, 0)
     seen = stream.autopilot(S)
-    assert seen is not None and (seen.system, seen.component, seen.autopilot) == (1, 1, 3)
+    assert (seen.system, seen.component, seen.autopilot) == (1, 1, 3)
     assert stream.autopilot(4 * S) is None
     stream.receive(MavlinkCodec(255, 190).encode(Heartbeat(6, 8)), 4 * S)  # a ground station
     assert stream.autopilot(4 * S) is None
@@ -238,7 +236,6 @@ def test_a_pose_with_velocity_and_rate_is_sent_at_once_and_as_of_its_time() -> N
     pose = circling(S)
     velocity, rate = np.array([1.0, 2.0, 0.5]), np.array([0.0, 0.0, 0.4])
     message = stream._pose_message(replace(pose, velocity=velocity, rate=rate), S)
-    assert message is not None
     step_s = 1e-5
     moved = pose.T_o_b.copy()
     moved[:3, 3] += step_s * velocity

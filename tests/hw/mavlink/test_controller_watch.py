@@ -1,7 +1,5 @@
 """What is said about modelled ArduPilot and PX4, with the faults that users have."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from math import radians, sin
@@ -9,8 +7,8 @@ from math import radians, sin
 import numpy as np
 import pytest
 
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
-from kiteline_core.geometry.se3 import F64
 from kiteline_hw.mavlink.codec import MavlinkCodec
 from kiteline_hw.mavlink.controller_session import ControllerSession
 from kiteline_hw.mavlink.coordinate_frames import R_L_O, mounting

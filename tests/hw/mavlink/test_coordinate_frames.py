@@ -1,7 +1,5 @@
 """Coordinate frames against values by hand."""
 
-from __future__ import annotations
-
 from math import cos, radians, sin
 
 import numpy as np
@@ -37,32 +35,21 @@ RIGHT_WING_DOWN_20 = [[1.0, 0.0, 0.0], [0.0, C20, -S20], [0.0, S20, C20]]  # the
 
 
 @pytest.mark.parametrize(
-    ("rotation", "q"),
+    ("axes", "rotation", "q"),
     [
-        (LEVEL, [1.0, 0.0, 0.0, 0.0]),
-        (YAW_LEFT_90, [0.70710678, 0.0, 0.0, -0.70710678]),  # yaw is positive to the right in FRD
-        (NOSE_UP_30, [0.96592583, 0.0, 0.25881905, 0.0]),  # pitch is positive nose up
-        (RIGHT_WING_DOWN_20, [0.98480775, 0.17364818, 0.0, 0.0]),  # roll is positive right wing down
+        ("flu", LEVEL, [1.0, 0.0, 0.0, 0.0]),
+        ("flu", YAW_LEFT_90, [0.70710678, 0.0, 0.0, -0.70710678]),  # yaw is positive to the right in FRD
+        ("flu", NOSE_UP_30, [0.96592583, 0.0, 0.25881905, 0.0]),  # pitch is positive nose up
+        ("flu", RIGHT_WING_DOWN_20, [0.98480775, 0.17364818, 0.0, 0.0]),  # roll is positive right wing down
+        # EuRoC's body (up, right, forward), level; a camera (right, down, forward) that looks along o's +y.
+        ("urf", [[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [1.0, 0.0, 0.0]], [1.0, 0.0, 0.0, 0.0]),
+        ("rdf", [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]], [0.70710678, 0.0, 0.0, -0.70710678]),
     ],
 )
-def test_attitude_by_hand(rotation: list[list[float]], q: list[float]) -> None:
-    position, attitude = local_pose(pose(rotation, (1.0, 2.0, 3.0)), FLU)
+def test_attitude_by_hand(axes: str, rotation: list[list[float]], q: list[float]) -> None:
+    position, attitude = local_pose(pose(rotation, (1.0, 2.0, 3.0)), mounting(axes))
     np.testing.assert_allclose(attitude, q, atol=1e-8)
     np.testing.assert_allclose(position, [1.0, -2.0, -3.0])  # 2 m to the left and 3 m up
-
-
-def test_euroc_mounting() -> None:
-    """EuRoC's body has x up, y right, z forward. Standing level, looking along o's +x."""
-    t = pose([[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [1.0, 0.0, 0.0]], (0.0, 0.0, 0.0))
-    _, q = local_pose(t, mounting("urf"))
-    np.testing.assert_allclose(q, [1.0, 0.0, 0.0, 0.0], atol=1e-12)
-
-
-def test_camera_mounting() -> None:
-    """A camera (right, down, forward) that looks along o's +y: yawed left by 90 degrees."""
-    t = pose([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]], (0.0, 0.0, 0.0))
-    _, q = local_pose(t, mounting("rdf"))
-    np.testing.assert_allclose(q, [0.70710678, 0.0, 0.0, -0.70710678], atol=1e-8)
 
 
 def test_offset_of_the_flight_controller() -> None:

@@ -1,7 +1,5 @@
 """Our messages read by MAVSDK's server, which shares no code with ours."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import socket

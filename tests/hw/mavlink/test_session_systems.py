@@ -1,7 +1,5 @@
 """Which vehicle is served, origins and the older messages; frames as they are on the wire."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -53,11 +51,11 @@ def test_the_vehicle_is_learnt_and_others_are_not_mixed_in() -> None:
         session.receive(other.encode(LocalPosition(i, (0.0, 0.0, 0.0), (9.0, 0.0, 0.0))), now_ns)
         session.receive(ours.encode(VehicleImu(i * 5000, (0.0, 0.0, -9.8), (0.0, 0.0, 0.0))), now_ns)
     batch = session.take_imu(S)
-    assert batch is not None and len(batch.t_ns) == 5 and (batch.accel[:, 2] < -9.7).all()
+    assert len(batch.t_ns) == 5 and (batch.accel[:, 2] < -9.7).all()
     assert session.take_odometry(S) is None
     assert session.counters.other_autopilots == 5 and session.codec.other_systems == 21
     found = session.autopilot(S)
-    assert found is not None and found.system == 7
+    assert found.system == 7
 
 
 def test_a_system_that_was_told_is_the_only_one() -> None:
@@ -89,11 +87,7 @@ def test_the_older_messages_say_the_same_as_odometry() -> None:
     _, position, speed = read(session.step(pose, 0))
     assert position.get_type() == "VISION_POSITION_ESTIMATE" and speed.get_type() == "VISION_SPEED_ESTIMATE"
     assert [position.x, position.y, position.z] == [3.0, -4.0, -1.0]
-    np.testing.assert_allclose(
-        [position.roll, position.pitch, position.yaw],
-        [0.0, 0.0, -np.pi / 2],
-        atol=1e-6,
-    )
+    np.testing.assert_allclose([position.roll, position.pitch, position.yaw], [0.0, 0.0, -np.pi / 2], atol=1e-6)
     np.testing.assert_allclose([speed.x, speed.y, speed.z], [1.0, -2.0, -0.5], atol=1e-6)
     assert position.usec == speed.usec == S // 1000
     lost = PoseSample(2 * S, np.eye(4), False, -1, velocity=np.zeros(3), rate=np.zeros(3))

@@ -1,7 +1,5 @@
 """Signed messages: who is believed, and stamps that never go back."""
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 

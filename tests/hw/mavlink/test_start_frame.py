@@ -1,7 +1,5 @@
 """The frame of the poses sent: at the start, north, or where it was before a restart."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from math import cos, degrees, pi, radians, sin
@@ -61,7 +59,6 @@ class Flight:
 
 
 def yaw_of(m: Odometry | None) -> float:
-    assert m is not None
     roll, pitch, yaw = euler_angles(m.q)
     assert abs(roll) < 1e-6 and abs(pitch) < 1e-6
     return yaw
@@ -73,7 +70,6 @@ def test_a_flight_begins_with_heading_zero_however_the_body_is_mounted(axes: str
     flight.hear(Heartbeat(2, 3), 0)
     m = flight.pose(S, forward_m=2.0)
     assert yaw_of(m) == pytest.approx(0.0, abs=1e-9)
-    assert m is not None
     np.testing.assert_allclose(m.position_m, [2.0, 0.0, 0.0], atol=1e-9)  # forward is x
     assert flight.requested == []  # a disarmed controller without a flight before is asked for nothing
 
@@ -97,10 +93,8 @@ def test_a_restart_in_flight_goes_on_where_the_controller_believes_itself_to_be(
     flight.hear(Attitude(0, (0.0, 0.0, yaw), (0.0, 0.0, rate)), 2 * S)
     m = flight.pose(2 * S + S // 10)
     assert yaw_of(m) == pytest.approx(yaw + 0.04)  # it kept turning since
-    assert m is not None
     np.testing.assert_allclose(m.position_m, [4.1, -3.0, -2.0], atol=1e-9)
     later = flight.pose(3 * S, forward_m=1.0)
-    assert later is not None
     ahead = np.array([cos(yaw + 0.04), sin(yaw + 0.04), 0.0])
     np.testing.assert_allclose(later.position_m, [4.1, -3.0, -2.0] + ahead, atol=1e-9)
 
@@ -118,7 +112,6 @@ def test_a_silent_controller_is_replaced_by_the_last_pose() -> None:
     assert flight.pose(0) is None and flight.pose(4 * S) is None
     m = flight.pose(5 * S)
     assert yaw_of(m) == pytest.approx(1.25)
-    assert m is not None
     np.testing.assert_allclose(m.position_m, [4.0, -3.0, -2.0], atol=1e-9)
 
 
@@ -154,7 +147,6 @@ def test_north_is_the_controllers() -> None:
     flight.hear(LocalPosition(0, (50.0, 60.0, -7.0), (0.0, 0.0, 0.0)), 30 * S)
     m = flight.pose(30 * S)
     assert yaw_of(m) == pytest.approx(-2.0)
-    assert m is not None
     np.testing.assert_allclose(m.position_m, 0.0, atol=1e-9)  # a flight begins at the origin
 
 

@@ -1,7 +1,5 @@
 """The survey of a flight controller, against models of both autopilots with wrong parameters and faults."""
 
-from __future__ import annotations
-
 import pytest
 
 from kiteline_hw.mavlink.codec import MavlinkCodec

@@ -1,7 +1,5 @@
 """Who is served over UDP, TCP that comes and goes, and poses, IMU and tunnel on one serial line."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import socket
@@ -66,7 +64,7 @@ def test_a_stranger_gets_nothing_and_changes_nothing(monkeypatch: pytest.MonkeyP
             sink.push(PoseSample(now_ns, np.eye(4), True, 90), now_ns)
         assert heard(stranger) == 0 and heard(controller) > 5
         found = sink.autopilot()
-        assert found is not None and found.autopilot == 3
+        assert found.autopilot == 3
         time.sleep(0.6)  # the controller's program ends, and another one begins on its host
         stranger.sendto(autopilot, to)
         push_while(sink, lambda: heard(stranger) == 0)
@@ -187,7 +185,6 @@ def test_poses_imu_and_tunnel_on_one_serial_line() -> None:
                     batch = sink.take_imu(CLOCK.now_ns())
                     samples += 0 if batch is None else len(batch.t_ns)
                     link = sink.tunnel_link()
-                    assert link is not None
                     link.send(b"up" * 50)
                     down.extend(link.receive())
                     return len(model.accepted) < 20 or samples < 100 or len(up) < 3 or len(down) < 3

@@ -1,7 +1,5 @@
 """Packets through a flight controller's radio: chunks, flow control, and the delay of telemetry."""
 
-from __future__ import annotations
-
 import random
 import socket
 import time

@@ -1,7 +1,5 @@
 """Grey images in words of 16 bits, of which a camera fills 10, 12 or 14: scaled by these, packed or not."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import cv2

@@ -1,7 +1,5 @@
 """People and cars in the view, and surfaces that mislead."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -67,7 +65,7 @@ def test_people_walk_and_keep_off_the_camera() -> None:
 def test_cars_drive_on_the_road_ahead_and_towards_the_camera() -> None:
     source = open_sim("street", seconds=10.0, **SMALL)
     actors = make_actors(source.world, source.path, source.rig.T_b_c, 0, 2, 3)
-    assert actors is not None and [gap > 0.0 for gap in actors.gaps_s] == [False, True]
+    assert [gap > 0.0 for gap in actors.gaps_s] == [False, True]
     gaps = []
     for t_s in np.arange(2.0, 6.0, 0.5):
         oncoming, ahead = actors.boxes(float(t_s)).reshape(2, 2, 8)

@@ -1,7 +1,5 @@
 """The renderer against a plain reference and the camera model."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import cv2

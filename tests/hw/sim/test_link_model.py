@@ -1,7 +1,5 @@
 """The link model: reproducible, with the rates that its settings state."""
 
-from __future__ import annotations
-
 from collections import Counter
 from itertools import pairwise
 

@@ -1,7 +1,5 @@
 """Objects and floors of indoor scenes that are hard on an occupancy grid."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -112,7 +110,6 @@ def test_a_bare_floor_shows_nothing() -> None:
     for floor in ("flat", "bare"):
         world = flight("room", seed=1, floor=floor).world
         camera = SimCamera(world, CameraModel(32, 24, 160.0, 160.0, 15.5, 11.5, Lens.NONE, ()), np.eye(4))
-        assert world.shell is not None
         eye = np.array([*flight("room", seed=1).path.positions()[0][:2], world.floor_m + 0.6])
         radiance, _, hits = camera.cast(se3.from_rt(DOWN, eye))
         assert (hits == 6 * world.shell + 4).all()

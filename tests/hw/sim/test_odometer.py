@@ -1,7 +1,5 @@
 """The simulated odometer."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -34,7 +32,6 @@ def true_velocity(source: SimSource, t_ns: np.ndarray) -> np.ndarray:
 def test_the_odometer_measures_the_true_motion_with_noise() -> None:
     source = simulated(odometry_noise=0.03, odometry_scale=1.05)
     told = source.odometry()
-    assert told is not None
     assert np.diff(told.t_ns).tolist() == [20_000_000] * (len(told.t_ns) - 1)
     rest = told.velocity - 1.05 * true_velocity(source, told.t_ns)
     assert rest.std() == pytest.approx(0.03, rel=0.15)
@@ -44,7 +41,6 @@ def test_the_odometer_measures_the_true_motion_with_noise() -> None:
 def test_slips_are_rare_and_fast() -> None:
     source = simulated(odometry_noise=0.0, odometry_slip=0.25)
     told = source.odometry()
-    assert told is not None
     truth = true_velocity(source, told.t_ns)
     moving = np.linalg.norm(truth, axis=1) > 0.1
     factor = np.linalg.norm(told.velocity, axis=1)[moving] / np.linalg.norm(truth, axis=1)[moving]
@@ -57,7 +53,6 @@ def test_slips_are_rare_and_fast() -> None:
 def test_wheels_measure_along_the_optical_axis_only() -> None:
     source = simulated(odometry_noise=0.0, odometry_wheels=True)
     told = source.odometry()
-    assert told is not None
     ahead = source.rig.T_b_c[:3, 2]
     np.testing.assert_allclose(told.velocity @ ahead, true_velocity(source, told.t_ns) @ ahead, atol=1e-4)
     assert np.linalg.norm(told.velocity - np.outer(told.velocity @ ahead, ahead)) < 1e-9

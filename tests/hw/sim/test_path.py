@@ -1,7 +1,5 @@
 """Paths, and inertial samples that are consistent with them."""
 
-from __future__ import annotations
-
 from pathlib import Path as FilePath
 
 import numpy as np

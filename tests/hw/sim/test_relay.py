@@ -1,7 +1,5 @@
 """Link models between real peers: datagrams through a relay, bytes through a slow cable, turns and outages."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import socket

@@ -1,7 +1,5 @@
 """A simulated flight as a source: reproducible to the byte, and its options."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -52,7 +50,7 @@ def test_samples_come_in_order_up_to_each_frame() -> None:
         assert batch.t_ns[0] > last and batch.t_ns[-1] == frame.t_ns and (np.diff(batch.t_ns) == 5_000_000).all()
         last = frame.t_ns
     truth = source.ground_truth
-    assert truth is not None and [f.t_ns for f in items if isinstance(f, Frame)] == truth.t_ns.tolist()
+    assert [f.t_ns for f in items if isinstance(f, Frame)] == truth.t_ns.tolist()
 
 
 def test_images_have_the_statistics_of_photographs() -> None:

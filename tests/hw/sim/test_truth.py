@@ -1,7 +1,5 @@
 """True occupancy: what is solid, and what of it could be seen."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The worn rig: what is drawn is what the measurements show, and the calibration that is told stays the good one."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 
@@ -105,7 +103,6 @@ def test_saturation_clips_and_gaps_lose_samples() -> None:
 
 def test_noise_is_not_the_told_one() -> None:
     source, noisy = samples(1.0, "noise")
-    assert source.imu is not None
     assert 1.4 <= source.worn.imu.noise.gyro_noise / source.imu.gyro_noise <= 2.6
     assert 2.1 <= source.worn.imu.noise.accel_walk / source.imu.accel_walk <= 3.9
     still = noisy.gyro[:180]  # at rest

@@ -1,7 +1,5 @@
 """Scenes that keep their distance from the paths, and statistics of textures."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -37,13 +35,7 @@ def test_textures_have_natural_spectra_and_edges() -> None:
     slopes = {name: spectrum_slope(pool.image(name)) for name in names}
     assert all(-2.9 < slope < -1.3 for slope in slopes.values()), slopes
     assert -2.7 < np.mean(list(slopes.values())) < -1.5
-    for name in (
-        "leaves",
-        "posters",
-        "facade",
-        "brick",
-        "clutter",
-    ):  # unlike plain noise, steps have heavy tails
+    for name in ("leaves", "posters", "facade", "brick", "clutter"):  # unlike plain noise, steps have heavy tails
         step = np.diff(pool.image(name).astype(float), axis=1).ravel()
         assert ((step - step.mean()) ** 4).mean() / step.var() ** 2 > 6, name
 

@@ -27,12 +27,12 @@ def test_euroc_recording(data_dir: Path) -> None:
     assert 9.0 < np.linalg.norm(batches[0].accel[0]) < 10.5
     rig = source.rig
     assert rig.left.lens is Lens.RADTAN and rig.left.distortion == (-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05)
-    assert rig.right is not None and rig.right.fx == 457.587
+    assert rig.right.fx == 457.587
     assert rig.has_body and rig.T_c_r is not None
     assert rig.T_c_r[0, 3] == pytest.approx(0.110074, abs=1e-6)
     assert rig.T_b_c[:3, 3] == pytest.approx([-0.0216401454975, -0.064676986768, 0.00981073058949])
-    assert source.imu is not None and source.imu.gyro_noise == 1.6968e-4 and source.imu.rate_hz == 200
-    assert source.ground_truth is not None and len(source.ground_truth.t_ns) == 64
+    assert source.imu.gyro_noise == 1.6968e-4 and source.imu.rate_hz == 200
+    assert len(source.ground_truth.t_ns) == 64
     assert not source.report.skipped
 
 
@@ -42,7 +42,7 @@ def test_tum_recording(data_dir: Path) -> None:
     assert len(frames) == 10 and source.rig.has_depth and not source.rig.has_body
     assert frames[0].t_ns == 1305031102175304000
     depth = frames[0].depth_m
-    assert depth is not None and depth.dtype == np.float32
+    assert depth.dtype == np.float32
     raw = cv2.imread(str(data_dir / "tum_rgbd_xyz/depth/1305031102.175304.png"), cv2.IMREAD_UNCHANGED)
     np.testing.assert_allclose(depth, raw / 5000.0, rtol=1e-6)
     assert [e.format for e in frames[0].encoded] == ["png", "png/5000"]
@@ -114,7 +114,6 @@ def test_euroc_body_becomes_the_imu_frame(tmp_path: Path) -> None:
     (root / "gt.tum").write_text("0.000001 1 2 3 0 0 0 1\n")
     source = open_source(str(root))
     np.testing.assert_allclose(t_b_i @ source.rig.T_b_c, np.eye(4), atol=1e-9)  # the camera sat at the old body frame
-    assert source.ground_truth is not None
     np.testing.assert_allclose(source.ground_truth.T_w_b[0, :3, 3], np.array([1, 2, 3]) + t_b_i[:3, 3])
     frames, batches = read(source)
     assert len(frames) == 4 and sum(len(b.t_ns) for b in batches) == 31
@@ -331,7 +330,7 @@ def test_images_by_pattern(tmp_path: Path) -> None:
         open_source(pair)
     (tmp_path / "camera.yaml").write_text(calib + "baseline_m: 0.12\n")
     stereo = open_source(pair)
-    assert stereo.rig.T_c_r is not None and stereo.rig.T_c_r[0, 3] == 0.12 and len(read(stereo)[0]) == 3
+    assert stereo.rig.T_c_r[0, 3] == 0.12 and len(read(stereo)[0]) == 3
     with pytest.raises(SourceError, match="no file matches"):
         open_source(f"images:{tmp_path}/none/*.png")
 

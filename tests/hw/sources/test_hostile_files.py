@@ -1,7 +1,5 @@
 """Files that mean harm: only SourceError or BadImage comes of them, soon and in little memory."""
 
-from __future__ import annotations
-
 import json
 import math
 import struct

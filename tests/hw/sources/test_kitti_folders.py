@@ -18,9 +18,9 @@ def test_kitti_recordings(data_dir: Path) -> None:
     frames, batches = read(source)
     assert len(frames) == 51 and not batches and source.imu is None
     assert (frames[0].t_ns, frames[-1].t_ns) == (0, 5_000_000_000)  # no times.txt: 10 Hz
-    assert source.rig.T_c_r is not None and source.rig.T_c_r[0, 3] == pytest.approx(BASELINE_M)
+    assert source.rig.T_c_r[0, 3] == pytest.approx(BASELINE_M)
     assert not source.rig.has_body and source.rig.left.lens is Lens.NONE
-    assert source.ground_truth is not None and len(source.ground_truth.t_ns) == 51
+    assert len(source.ground_truth.t_ns) == 51
     mono = open_source(f"kitti:{data_dir / 'kitti07_mono'}")
     frames, _ = read(mono)
     assert len(frames) == 80 and mono.rig.right is None
@@ -61,7 +61,6 @@ def test_kitti_layouts(tmp_path: Path, left: str, right: str | None, calib: str,
     assert len(frames) == 3 and frames[0].left.shape == (48, 64)
     assert (source.rig.right is not None) == (baseline_m is not None)
     if baseline_m is not None:
-        assert source.rig.T_c_r is not None
         assert source.rig.T_c_r[0, 3] == pytest.approx(baseline_m)
         np.testing.assert_array_equal(source.rig.T_c_r[1:, 3], [0, 0, 1])
 

@@ -1,7 +1,5 @@
 """Messages that are too large are named, not dropped silently; a kiteline log in several files is one recording."""
 
-from __future__ import annotations
-
 import sqlite3
 from contextlib import closing
 from pathlib import Path

@@ -25,9 +25,9 @@ def test_room_recording(data_dir: Path) -> None:
     assert sum(len(b.t_ns) for b in batches) == 4391 and len(batches) == 440
     assert [e.format for e in frames[0].encoded] == ["jpeg", "jpeg"]
     assert source.rig.left.fx == 458.654 and source.rig.right is not None and source.rig.right.fx == 457.587
-    assert source.rig.T_c_r is not None and source.rig.T_c_r[0, 3] == pytest.approx(0.110074, abs=1e-6)
+    assert source.rig.T_c_r[0, 3] == pytest.approx(0.110074, abs=1e-6)
     assert source.rig.has_body and source.imu is not None and source.imu.rate_hz == pytest.approx(200, abs=0.5)
-    assert source.ground_truth is not None and len(source.ground_truth.t_ns) == 1100
+    assert len(source.ground_truth.t_ns) == 1100
     assert source.ground_truth.T_w_b[0, :3, 3] == pytest.approx([-2.060154, -1.404402, 1.913249])
     assert not source.report.skipped
     source.close()

@@ -1,7 +1,5 @@
 """ROS 2 bags in SQLite storage, in parts, packed message by message; and bags that are refused with what helps."""
 
-from __future__ import annotations
-
 import os
 import sqlite3
 import threading
@@ -45,7 +43,6 @@ def _write_part(path: Path, mcap: McapFile, messages: list[RawMessage], packed: 
         file.executescript(_TABLES)
         for channel, described in mcap.channels.items():
             schema = mcap.schema_of(channel)
-            assert schema is not None
             row = (channel + first_id, described.topic, schema.name, "cdr", "")
             file.execute("INSERT INTO topics VALUES(?,?,?,?,?)", row)
         for m in messages:
@@ -152,7 +149,6 @@ def test_messages_packed_one_by_one_in_mcap(tmp_path: Path) -> None:
         numbers = {}
         for number, channel in plain.channels.items():
             schema = plain.schema_of(number)
-            assert schema is not None
             known = writer.register_schema(schema.name, schema.encoding, schema.data)
             numbers[number] = writer.register_channel(channel.topic, "cdr", known)
         for m in plain.messages():

@@ -1,7 +1,5 @@
 """Inertial samples and poses of ROS 2 are decoded as by mcap_ros2, which reads any schema, field by field."""
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """CPU time, clocks, and the kernel's CPU limit where it may be set."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import threading

@@ -1,7 +1,5 @@
 """Kernels are compiled once, by a process of their own."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -40,11 +38,7 @@ def fly(folder: Path, module: str, kind: str = "alone") -> tuple[list[str], str]
     paths = [str(folder), *sys.path]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths), "NUMBA_CACHE_DIR": str(folder / "cache")}
     done = subprocess.run(
-        [sys.executable, "-c", FLIGHT, module, kind],
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=True,
+        [sys.executable, "-c", FLIGHT, module, kind], env=environment, capture_output=True, text=True, check=True
     )
     return done.stdout.split(), done.stderr
 

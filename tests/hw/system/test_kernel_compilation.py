@@ -1,7 +1,5 @@
 """Listed kernels are shared out among processes, which neither hang nor outlive the first."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """Numbers of starts only grow, on full, failing and lost disks, and are not repeated by other processes or machines."""
 
-from __future__ import annotations
-
 import errno
 import multiprocessing
 import os
@@ -80,7 +78,7 @@ def test_a_full_disk_takes_the_next_number(tmp_path: Path, monkeypatch: pytest.M
     assert (tmp_path / NAME).stat().st_size == size
 
 
-def _take(folder: str, count: int, out: multiprocessing.Queue[list[int]]) -> None:
+def _take(folder: str, count: int, out: "multiprocessing.Queue[list[int]]") -> None:
     out.put([numbers_in(Path(folder)).next().order for _ in range(count)])
 
 

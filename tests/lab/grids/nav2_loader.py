@@ -1,7 +1,5 @@
 """The rules by which nav2's map_server loads a map (nav2_map_server, map_io.cpp), as far as they can refuse ours."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

@@ -1,7 +1,5 @@
 """Maps that kiteline writes load in nav2's map_server with every cell as it was meant, and read the same here."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Pictures of grids, and their alignment."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

@@ -1,7 +1,5 @@
 """Precision and recall on grids small enough to know the answer."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`kiteline grid truth`: the true grid of a simulated flight, and of a recording with a list of its solids."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,15 +1,11 @@
 """Bias, scale and axes of the accelerometer, the vertical and the scale of the images, from positions by images."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.inertial.calibration.robust_update import AxesFilter, robust_update
 from kiteline_agent.inertial.calibration.window import Window
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
-
-F64 = NDArray[np.float64]
 
 _AXES, _BIAS, _TILT, _SCALE = slice(0, 9), slice(9, 12), slice(12, 15), 15
 _BIAS_M_S2, _TILT_RAD = 0.1, 0.03  # standard deviations at the start
@@ -56,7 +52,7 @@ class AccelCalibration(AxesFilter):
         """True if gravity in the map is known."""
         return self._gravity is not None
 
-    def continue_map(self, other: AccelCalibration) -> None:
+    def continue_map(self, other: "AccelCalibration") -> None:
         """Take over the vertical of another filter in the same map."""
         self._gravity = other._gravity
 

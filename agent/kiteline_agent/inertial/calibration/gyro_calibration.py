@@ -1,15 +1,11 @@
 """Time offset, bias, scale and axes of the gyro, from rotations by images over short windows."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.inertial.calibration.robust_update import AxesFilter, robust_update
 from kiteline_agent.inertial.calibration.window import Window
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
-
-F64 = NDArray[np.float64]
 
 _AXES, _OFFSET, _BIAS = slice(0, 9), 9, slice(10, 13)
 _BIAS_RAD_S = 0.1  # standard deviation of an unknown bias

@@ -1,13 +1,10 @@
 """What earlier flights found of an IMU, with deviations: the prior of the next flight."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-F64 = NDArray[np.float64]
+from kiteline_core.arrays import F64
 
 _SIZES = {"offset_s": 2, "gyro": 9, "gyro_sigma": 9, "accel": 9, "accel_sigma": 9}
 _MAX_OFFSET_S, _MAX_AXES = 0.5, 0.2  # beyond these no IMU was found, but something else is wrong

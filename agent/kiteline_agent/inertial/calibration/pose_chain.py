@@ -5,17 +5,13 @@ time offset towards zero. A window is complete once all its samples have arrived
 camera's.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.inertial.preintegration import Samples
 from kiteline_agent.inertial.sample_buffer import SampleBuffer
-
-F64 = NDArray[np.float64]
+from kiteline_core.arrays import F64
 
 _RATE_NS = 12_000_000  # to either side of an instant, averaged for the rate there
 _LONGEST = 4.0  # times the window: longer ones have a gap

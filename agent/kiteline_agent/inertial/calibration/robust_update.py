@@ -1,14 +1,11 @@
 """What the filters of gyro and accelerometer share: their axes and bias, and an update in which outliers weigh less."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-F64 = NDArray[np.float64]
+from kiteline_core.arrays import F64
 
 _OUTLIER = 9.0  # squared error over its variance from which a window weighs less
 _EXCESS_GAIN = 0.05  # weight of a window in `excess`: the mean reaches over about 20

@@ -4,13 +4,10 @@ Filters beside the smoother, at a few updates a second: these values change slow
 the filters contradict that significantly; then their estimates correct the samples.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.inertial.calibration.accel_calibration import AccelCalibration
 from kiteline_agent.inertial.calibration.gyro_calibration import GyroCalibration
@@ -20,10 +17,9 @@ from kiteline_agent.inertial.calibration.turn_scatter import added_variance
 from kiteline_agent.inertial.calibration.window import Window
 from kiteline_agent.inertial.preintegration import Samples
 from kiteline_agent.inertial.sample_buffer import SampleBuffer
+from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry import se3
-
-F64 = NDArray[np.float64]
 
 _KEPT = 0.25  # share of a window's added variance that the next has at least: the map that was dragged is still seen
 

@@ -3,17 +3,13 @@
 Within a window the gyro's bias and the time offset are fitted to the rotations between frames; what is left is neither.
 """
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.inertial.calibration.pose_chain import Link, rate_at
 from kiteline_agent.inertial.calibration.window import Window
 from kiteline_agent.inertial.sample_buffer import SampleBuffer
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
-
-F64 = NDArray[np.float64]
 
 _FITTED = 4  # bias and time offset
 _CHANCE = 4.0  # times the expected mean square: chance makes up to 3 of it, and worn lenses seldom more

@@ -1,16 +1,12 @@
 """IMU samples integrated over a window between two frames."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.inertial.calibration.window_kernels import integrate_window
 from kiteline_agent.inertial.preintegration import Samples
-
-F64 = NDArray[np.float64]
+from kiteline_core.arrays import F64
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +25,7 @@ class Window:
     last_rate: F64
 
     @staticmethod
-    def of(samples: Samples, matrix: F64, bias: F64, first_rate: F64, last_rate: F64) -> Window:
+    def of(samples: Samples, matrix: F64, bias: F64, first_rate: F64, last_rate: F64) -> "Window":
         """Integrate samples. matrix (3,3), bias (3,): rate = matrix @ gyro - bias."""
         turn, by_rate, by_force, time = np.empty((3, 3)), np.empty((3, 9)), np.empty((2, 3, 9)), np.empty((2, 3, 3))
         integrate_window(samples.t_s, samples.gyro, samples.accel, matrix, bias, turn, by_rate, by_force, time)

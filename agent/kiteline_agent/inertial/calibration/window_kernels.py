@@ -1,14 +1,10 @@
 """Kernel of the integrals of IMU samples over a window, linear in the calibration of the accelerometer."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_agent.inertial.imu_kernels import copy33, mul33, so3_exp
+from kiteline_core.arrays import F64
 from kiteline_core.jit import njit
-
-F64 = NDArray[np.float64]
 
 
 @njit

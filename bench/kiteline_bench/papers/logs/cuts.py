@@ -1,7 +1,5 @@
 """Cuts a log at any byte, and reads what is left."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Hours of a flight's log in minutes: the agent's runtime, its log and its limit on the disk, without tracking."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`kiteline bench papers/logs`: logs over hours of flight, cut anywhere, and replayed."""
 
-from __future__ import annotations
-
 import os
 import resource
 import subprocess

@@ -1,16 +1,12 @@
 """Figures: the scenes from above; memory of the grid and CPU of its updates, as figure 67 of the thesis."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64
 from kiteline_hw.sim.truth.occupancy import TrueGrid
-
-F64 = NDArray[np.float64]
 
 
 def plot_updates(path: Path, costs: Mapping[str, tuple[F64, F64]], their_mb: float) -> None:

@@ -3,8 +3,6 @@
 The thesis prints sizes, not plans: areas, lengths, camera heights and objects are its own, the shapes are ours.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -12,9 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_bench.harness.recording import Item, Recording
+from kiteline_core.arrays import F64
 from kiteline_core.frame import Frame, ImuBatch
 from kiteline_core.geometry import se3, tum
 from kiteline_hw.sim.config import read_config
@@ -23,7 +21,6 @@ from kiteline_hw.sim.source import SimSource
 from kiteline_hw.sim.world.textures import make_pool
 from kiteline_hw.sim.world.world import NO_GROUND, Builder, World
 
-F64 = NDArray[np.float64]
 Points = Sequence[tuple[float, float]]
 
 _TEXTURES = ("leaves", "leaves2", "clutter", "posters", "plaster", "concrete", "wood", "brick")

@@ -4,8 +4,6 @@ The thesis, sections 7.3 and 7.4: maps are opened, aligned with the truth and ju
 free in truth, whether a camera could see it or not.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -13,7 +11,6 @@ from pathlib import Path
 from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.grid.grid_updates import GridUpdates
@@ -26,6 +23,7 @@ from kiteline_bench.papers.segfloor.plot import plot_scenes, plot_updates
 from kiteline_bench.papers.segfloor.scenes import Scene, corridor_1, corridor_2, rendered, synthetic, trajectory
 from kiteline_codec.channel import RecordChannel
 from kiteline_codec.schema import KeyframeScan, Record
+from kiteline_core.arrays import F64
 from kiteline_hw.sim.source import SimSource
 from kiteline_hw.sim.truth.occupancy import OCCUPIED as BLACK
 from kiteline_hw.sim.truth.occupancy import UNKNOWN as GREY
@@ -34,8 +32,6 @@ from kiteline_hw.sim.truth.sight import HEIGHTS_M, look
 from kiteline_lab.grids.files import FREE, OCCUPIED, UNKNOWN, GridFile
 from kiteline_lab.grids.picture import draw_comparison
 from kiteline_lab.grids.prm import GridEvalConfig, GridScore, score
-
-F64 = NDArray[np.float64]
 
 TITLE = "Occupancy grids, and Segfloor"
 

@@ -1,15 +1,12 @@
 """Figure: the keyframes of all robots in one world, beside the true paths."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-F64 = NDArray[np.float64]
+from kiteline_core.arrays import F64
 
 _COLUMNS = 4
 _COLOURS = ("#1f77b4", "#2ca02c", "#d62728", "#9467bd")

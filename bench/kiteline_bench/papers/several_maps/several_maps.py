@@ -5,15 +5,12 @@ what ORB-SLAM2 reached on the same sequence (R. Mur-Artal and J. D. Tardos, "ORB
 proportion to the path: the thesis calls its own results similar to that (03, 09) or worse (05, 07).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_bench.harness.bars import Bar, Bench, at_most, is_true, table
 from kiteline_bench.harness.placed import KeyframesInWorld
@@ -22,11 +19,10 @@ from kiteline_bench.harness.run import Part, Scenario, fly_with_base
 from kiteline_bench.papers.sequences import find_sequences
 from kiteline_bench.papers.several_maps.plot import Drawn, plot_experiments
 from kiteline_bench.papers.several_maps.street import street_recording
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
 from kiteline_hw.ports import SourceError
 from kiteline_lab.evaluation import metrics
-
-F64 = NDArray[np.float64]
 
 TITLE = "Several maps of one path, and the thesis"
 
@@ -194,7 +190,7 @@ def indoors(bench: Bench) -> list[Experiment]:
 
 
 def real(bench: Bench) -> list[Experiment]:
-    """Recordings of real cameras: a street in stereo, and a flight with one eye and IMU."""
+    """Recordings of real cameras: a street in stereo, and a flight with one camera and IMU."""
     street, flight = bench.source("kitti_straight"), bench.source("euroc_mh01_air")
     return [
         Experiment("kitti_straight, two robots", SEQUENCE_03, robots(f"kitti:{street}", 10.0, overlapping(51, 2)), 1),

@@ -1,7 +1,5 @@
 """KITTI 06's path in a simulated street, with a stereo camera like KITTI's, at 10 Hz."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor

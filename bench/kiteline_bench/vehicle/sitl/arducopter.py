@@ -1,7 +1,5 @@
 """The process of a built ArduCopter, driven step by step over its JSON interface."""
 
-from __future__ import annotations
-
 import os
 import signal
 import socket
@@ -39,7 +37,7 @@ def binary() -> Path | None:
 class ArduCopter(Closing):
     """A running autopilot. folder: for its memory. serial: TCP ports of SERIAL0, SERIAL1 and SERIAL2."""
 
-    def __init__(self, program: Path, folder: Path, copter: Copter, changes: Mapping[str, float] | None = None) -> None:
+    def __init__(self, program: Path, folder: Path, copter: Copter) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         self.copter = copter
         self.reboots = 0
@@ -49,9 +47,8 @@ class ArduCopter(Closing):
         self._since_s = copter.t_s
         self._count = -1
         self.serial = _free_ports(3)
-        values = {**PARAMETERS, **(changes or {})}
         defaults = folder / "defaults.parm"
-        defaults.write_text("".join(f"{name} {value:g}\n" for name, value in values.items()))
+        defaults.write_text("".join(f"{name} {value:g}\n" for name, value in PARAMETERS.items()))
         words = [str(program.resolve()), "--model", "JSON:127.0.0.1", "--defaults", defaults.name,
                  "--instance", str(os.getpid() % 89 + 10), "--sim-port-out", str(self._socket.getsockname()[1]),
                  "--home", "47.3977,8.5456,488,0", "--wipe"]  # fmt: skip

@@ -1,16 +1,12 @@
 """The physics of a quadrotor, for an autopilot that is given its state."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64, U16
 from kiteline_core.geometry import se3
-
-F64 = NDArray[np.float64]
 
 _G = 9.80665  # m/s^2
 _MASS_KG = 1.5
@@ -50,7 +46,7 @@ class Copter:
         """Heading, clockwise from north."""
         return float(np.arctan2(self.R_n_f[1, 0], self.R_n_f[0, 0]))
 
-    def step(self, pwm: NDArray[np.uint16], dt_s: float) -> None:
+    def step(self, pwm: U16, dt_s: float) -> None:
         """Advance by dt_s with the motors' commands (4,) in us."""
         u = np.clip((pwm.astype(np.float64) - 1000.0) / 1000.0, 0.0, 1.0)
         wanted = (1.0 - _EXPO) * u + _EXPO * u * u

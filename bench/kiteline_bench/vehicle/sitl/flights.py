@@ -1,19 +1,15 @@
 """Flights of ArduCopter in the loop: what each of them measures, as bars."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_bench.harness.bars import Bar, Bench, at_most, is_true
 from kiteline_bench.vehicle.sitl import arducopter, lines
 from kiteline_bench.vehicle.sitl.ground_station import GUIDED, HAS_POSITION, LAND, USES
 from kiteline_bench.vehicle.sitl.loop import Loop
-
-F64 = NDArray[np.float64]
+from kiteline_core.arrays import F64
 
 _HEIGHT_M = 1.2
 _SPAN_S = 60.0  # of each measurement

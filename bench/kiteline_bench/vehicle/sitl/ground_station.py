@@ -1,7 +1,5 @@
 """A pilot at a ground station: commands to the autopilot, and a record of what it says."""
 
-from __future__ import annotations
-
 import contextlib
 import socket
 import time

@@ -1,7 +1,5 @@
 """One line to ArduCopter in the loop, on the ground: poses, inertial samples and a tunnel together; signing."""
 
-from __future__ import annotations
-
 import time
 from pathlib import Path
 

@@ -1,20 +1,18 @@
 """The closed loop: physics, autopilot, rendered images, agent and pilot, step by step in simulated time."""
 
-from __future__ import annotations
-
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_bench.vehicle.sitl.arducopter import STEP_S, ArduCopter
 from kiteline_bench.vehicle.sitl.copter import Copter
 from kiteline_bench.vehicle.sitl.ground_station import GroundStation
 from kiteline_bench.vehicle.sitl.onboard import Onboard, Setting, SimulatedClock
+from kiteline_core.arrays import F64
 from kiteline_core.frame import Frame
 from kiteline_core.geometry import se3
 from kiteline_hw.mavlink.coordinate_frames import mounting
@@ -24,13 +22,12 @@ from kiteline_hw.sim.source import SimSource
 from kiteline_hw.sim.world.scenes import build_indoor
 from kiteline_hw.system.closing import Closing
 
-F64 = NDArray[np.float64]
-
 AXES = "urf"  # of the simulated rig's body
 _START_NS = 1_000_000_000_000  # clock at simulated time zero
 _LEGS_M = 0.15  # of the controller above the ground
 _PACE = 1.0  # simulated over wall time, at most: threads of the connection need their turn
 _POLL_STEPS = 8  # between two looks at the ground station
+_SEED = 1  # of world, rig and wind
 _SCALE = 0.5  # of a 752x480 image: a quarter of the rendering
 _GAIN = 185.0  # grey values per unit of radiance
 _R_W_N = np.diag([1.0, -1.0, -1.0])  # from NED to the world, whose z is up
@@ -52,20 +49,17 @@ class Truth:
 
 
 class Loop(Closing):
-    """Everything that flies. program: a built ArduCopter. seed: of world, rig and wind."""
+    """Everything that flies. program: a built ArduCopter."""
 
-    def __init__(
-        self, program: Path, folder: Path, *, seed: int = 1, tunnel: bool = False,
-        changes: Mapping[str, float] | None = None,
-    ) -> None:  # fmt: skip
+    def __init__(self, program: Path, folder: Path, *, tunnel: bool = False) -> None:
         self._files = ExitStack()
-        self.copter = Copter(seed)
-        self.autopilot = self._files.enter_context(ArduCopter(program, folder / "autopilot", self.copter, changes))
+        self.copter = Copter(_SEED)
+        self.autopilot = self._files.enter_context(ArduCopter(program, folder / "autopilot", self.copter))
         self.pilot = self._files.enter_context(GroundStation(self.autopilot.serial[0]))
         self.clock = SimulatedClock(_START_NS)
         self.truth = Truth()
         source = SimSource(
-            SimConfig("room", seed, seconds=1.0, scale=_SCALE), world=build_indoor("room", _volume(), seed, 10)
+            SimConfig("room", _SEED, seconds=1.0, scale=_SCALE), world=build_indoor("room", _volume(), _SEED, 10)
         )
         self._cameras, self._noise = source.cameras(), (source.config.read_noise, source.config.shot_noise)
         self._shutter, self._frame_ns = Shutter(source.config.exposure_s), source.config.frame_ns

@@ -1,7 +1,5 @@
 """kiteline on board in simulated time: the agent, its connection to the autopilot, and what it says."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

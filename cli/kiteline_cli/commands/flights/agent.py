@@ -1,7 +1,5 @@
 """`kiteline agent`."""
 
-from __future__ import annotations
-
 SUMMARY = "run the onboard half live: images in, poses out, map updates to the base"
 EXAMPLES = (
     "kiteline agent flight.mcap --link zenoh:tcp/10.0.0.1:7447 --log logs",

@@ -1,7 +1,5 @@
 """`kiteline base`."""
 
-from __future__ import annotations
-
 SUMMARY = "run the base station live: one map for any number of agents"
 EXAMPLES = (
     "kiteline base --link zenoh:tcp/0.0.0.0:7447 --store maps --web 0.0.0.0:8080",

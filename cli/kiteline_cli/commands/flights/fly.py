@@ -1,7 +1,5 @@
 """`kiteline fly`."""
 
-from __future__ import annotations
-
 SUMMARY = "fly recordings or a simulation: agents and a base as processes of this machine"
 EXAMPLES = (
     "kiteline fly euroc:V1_01_easy --out out",

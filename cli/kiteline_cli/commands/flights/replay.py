@@ -1,12 +1,7 @@
 """`kiteline replay`."""
 
-from __future__ import annotations
-
 SUMMARY = "run an agent or a base again from its log, and compare the outputs"
-EXAMPLES = (
-    "kiteline replay out/agent0/log.mcap --verify",
-    "kiteline replay out/agent0/log.mcap --cpu 20 --out slower",
-)
+EXAMPLES = ("kiteline replay out/agent0/log.mcap --verify", "kiteline replay out/agent0/log.mcap --cpu 20 --out slower")
 
 
 def run(argv: list[str]) -> int | None:

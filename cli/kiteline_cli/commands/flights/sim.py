@@ -1,12 +1,7 @@
 """`kiteline sim`."""
 
-from __future__ import annotations
-
 SUMMARY = "record a simulated flight"
-EXAMPLES = (
-    "kiteline sim room --out room.mcap",
-    "kiteline sim 'hall?seed=3&seconds=20' --out hall.mcap",
-)
+EXAMPLES = ("kiteline sim room --out room.mcap", "kiteline sim 'hall?seed=3&seconds=20' --out hall.mcap")
 
 
 def run(argv: list[str]) -> int | None:

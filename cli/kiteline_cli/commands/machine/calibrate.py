@@ -1,7 +1,5 @@
 """`kiteline calibrate`."""
 
-from __future__ import annotations
-
 SUMMARY = "calibrate a camera or a pair by a printed board; convert calibration files"
 EXAMPLES = (
     "kiteline calibrate board charuco:9x7:0.03 --out board.png",

@@ -1,7 +1,5 @@
 """`kiteline config`."""
 
-from __future__ import annotations
-
 SUMMARY = "print, explain and check the options of agent and base"
 EXAMPLES = (
     "kiteline config > kiteline.toml",

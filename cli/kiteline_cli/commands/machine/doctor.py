@@ -1,13 +1,7 @@
 """`kiteline doctor`."""
 
-from __future__ import annotations
-
 SUMMARY = "check this machine and its flight controller, and compile the kernels beforehand"
-EXAMPLES = (
-    "kiteline doctor",
-    "kiteline doctor --warm",
-    "kiteline doctor --mavlink serial:/dev/ttyAMA0:921600",
-)
+EXAMPLES = ("kiteline doctor", "kiteline doctor --warm", "kiteline doctor --mavlink serial:/dev/ttyAMA0:921600")
 
 
 def run(argv: list[str]) -> int | None:

@@ -1,12 +1,7 @@
 """`kiteline install-units`."""
 
-from __future__ import annotations
-
 SUMMARY = "install agent and base as services that start at boot"
-EXAMPLES = (
-    "kiteline install-units agent",
-    "kiteline install-units base --user",
-)
+EXAMPLES = ("kiteline install-units agent", "kiteline install-units base --user")
 
 
 def run(argv: list[str]) -> int | None:

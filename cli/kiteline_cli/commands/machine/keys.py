@@ -1,12 +1,7 @@
 """`kiteline keys`."""
 
-from __future__ import annotations
-
 SUMMARY = "make and show the keys that seal packets between agents and base"
-EXAMPLES = (
-    "kiteline keys new 3",
-    "kiteline keys show --secret 3 > agent3.key",
-)
+EXAMPLES = ("kiteline keys new 3", "kiteline keys show --secret 3 > agent3.key")
 
 
 def run(argv: list[str]) -> int | None:

@@ -1,12 +1,7 @@
 """`kiteline uninstall-units`."""
 
-from __future__ import annotations
-
 SUMMARY = "remove the services; settings, keys, maps and logs stay"
-EXAMPLES = (
-    "kiteline uninstall-units",
-    "kiteline uninstall-units base --user",
-)
+EXAMPLES = ("kiteline uninstall-units", "kiteline uninstall-units base --user")
 
 
 def run(argv: list[str]) -> int | None:

@@ -1,12 +1,7 @@
 """`kiteline convert`."""
 
-from __future__ import annotations
-
 SUMMARY = "write a data set or a ROS 2 bag as a kiteline log"
-EXAMPLES = (
-    "kiteline convert euroc:V1_01_easy v101.mcap",
-    "kiteline convert bag.mcap flight.mcap",
-)
+EXAMPLES = ("kiteline convert euroc:V1_01_easy v101.mcap", "kiteline convert bag.mcap flight.mcap")
 
 
 def run(argv: list[str]) -> int | None:

@@ -1,7 +1,5 @@
 """`kiteline export`."""
 
-from __future__ import annotations
-
 SUMMARY = "write a base's map in the formats of other tools: TUM, PLY, PGM, g2o"
 EXAMPLES = (
     "kiteline export maps --format ply --out map.ply",

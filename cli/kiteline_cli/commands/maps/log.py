@@ -1,7 +1,5 @@
 """`kiteline log`."""
 
-from __future__ import annotations
-
 SUMMARY = "inspect and repair logs: info, recover, cut, merge"
 EXAMPLES = (
     "kiteline log info out/agent0/log.mcap",

@@ -1,7 +1,5 @@
 """`kiteline maps`."""
 
-from __future__ import annotations
-
 SUMMARY = "maps of a running base: list, get, name, merge, split, delete; stores: check, repair, backup"
 EXAMPLES = (
     "kiteline maps list",

@@ -1,7 +1,5 @@
 """`kiteline rig`."""
 
-from __future__ import annotations
-
 SUMMARY = "show and export what flights found of cameras"
 EXAMPLES = (
     "kiteline rig show maps",

@@ -1,13 +1,7 @@
 """`kiteline status`."""
 
-from __future__ import annotations
-
 SUMMARY = "what a running base does: agents and their links, map, store, and what is wrong"
-EXAMPLES = (
-    "kiteline status",
-    "kiteline status --base tcp/10.0.0.1:7447 --watch",
-    "kiteline status --json",
-)
+EXAMPLES = ("kiteline status", "kiteline status --base tcp/10.0.0.1:7447 --watch", "kiteline status --json")
 
 
 def run(argv: list[str]) -> int | None:

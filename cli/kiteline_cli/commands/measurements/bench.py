@@ -1,7 +1,5 @@
 """`kiteline bench`."""
 
-from __future__ import annotations
-
 SUMMARY = "run measurements and write docs/results.md"
 EXAMPLES = (
     "kiteline bench",

@@ -1,7 +1,5 @@
 """`kiteline eval`."""
 
-from __future__ import annotations
-
 SUMMARY = "compare a trajectory with ground truth: ATE, RPE, KITTI drift, coverage"
 EXAMPLES = (
     "kiteline eval out/base/agent0.tum euroc:V1_01_easy",

@@ -1,7 +1,5 @@
 """`kiteline grid`."""
 
-from __future__ import annotations
-
 import importlib
 import sys
 

@@ -1,7 +1,5 @@
 """Camera intrinsics of an agent."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Self
 

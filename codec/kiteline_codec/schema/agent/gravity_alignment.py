@@ -1,14 +1,10 @@
 """The rotation that makes a submap's z axis point up."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
-
-import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_codec.schema.poses import read_pose, write_pose
 from kiteline_codec.schema.record import Field, IdOf, Priority, Record, register
+from kiteline_core.arrays import F64
 from kiteline_core.ids import SubmapId
 
 
@@ -26,4 +22,4 @@ class GravityAlignment(Record):
     CODE = (Field("T_l_m", write_pose, read_pose),)
 
     submap: SubmapId
-    T_l_m: NDArray[np.float64]
+    T_l_m: F64

@@ -1,18 +1,14 @@
 """The flight between two keyframes in short steps, each by images and by the IMU."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_codec.coding.packing import Reader, WireError, Writer
 from kiteline_codec.schema.record import MAX_KEYFRAME_ID, IdOf, Key, Priority, Record, register
+from kiteline_core.arrays import F64
 from kiteline_core.ids import KeyframeId
-
-F64 = NDArray[np.float64]
 
 MAX_STEPS = 128
 _NOISE_STEPS = 1_000_000.0  # codes in one m/s^2/sqrt(Hz)

@@ -1,17 +1,13 @@
 """The header of a keyframe: time, parent, pose relative to the parent, and where gravity points."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Self
-
-import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_codec.coding import quantise
 from kiteline_codec.coding.packing import Reader, WireError, Writer, unzigzag, zigzag
 from kiteline_codec.schema.poses import read_pose, write_pose
 from kiteline_codec.schema.record import MAX_KEYFRAME_ID, IdOf, Key, Priority, Record, register
+from kiteline_core.arrays import F64
 from kiteline_core.ids import MAX_KEYPOINTS, NO_KEYFRAME, KeyframeId
 
 
@@ -32,9 +28,9 @@ class KeyframeHeader(Record):
     keyframe: KeyframeId
     t_ns: int
     parent: KeyframeId
-    T_p_k: NDArray[np.float64]
+    T_p_k: F64
     keypoints: int  # how many keypoints the keyframe has, over all sections
-    up: NDArray[np.float64] | None = None
+    up: F64 | None = None
     up_rad: float = 0.0
 
     def write(self, out: Writer) -> None:

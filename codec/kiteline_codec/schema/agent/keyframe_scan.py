@@ -1,24 +1,19 @@
 """The column scans of a keyframe and of frames after it, and which of its keypoints lie on the ground."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_codec.coding import quantise
 from kiteline_codec.coding import scan_kernels as kernels
 from kiteline_codec.coding.packing import Reader, WireError, Writer, unzigzag, zigzag
 from kiteline_codec.schema.poses import read_coarse_pose, read_direction, write_coarse_pose, write_direction
 from kiteline_codec.schema.record import IdOf, Key, Priority, Record, register
+from kiteline_core.arrays import F64, I64, U8
 from kiteline_core.geometry import se3
 from kiteline_core.ground.column_scan import MAX_COLUMNS, ColumnScan, level_rotation
 from kiteline_core.ids import MAX_KEYPOINTS, KeyframeId
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 _AZIMUTH_STEPS = 1 << 12  # codes in 1 rad, of the first column: an error of 0.12 mrad
 _STEP_STEPS = 1 << 18  # codes in 1 rad: over 128 columns an error of 0.25 mrad
@@ -50,7 +45,7 @@ class KeyframeScan(Record):
 
     keyframe: KeyframeId
     scan: ColumnScan
-    labels: NDArray[np.uint8]
+    labels: U8
     part: int = 0
     T_k_s: F64 | None = None
 
@@ -139,7 +134,7 @@ def _levelled(T_k_s: F64, up_c: F64) -> F64:
     return se3.from_rt(T_k_s[:3, :3] @ level_rotation(up_c) @ level_rotation(_LEVEL_UP_C).T, T_k_s[:3, 3])
 
 
-def _packed(columns: I64, labels: NDArray[np.uint8]) -> bytes:
+def _packed(columns: I64, labels: U8) -> bytes:
     data = np.empty(kernels.MAX_CODE, np.uint8)
     size = kernels.code_scan(columns.copy(), labels.copy(), quantise.RANGE_CODES - 1, False, data)
     return data[:size].tobytes()

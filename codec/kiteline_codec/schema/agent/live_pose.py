@@ -1,16 +1,12 @@
 """The newest pose of an agent."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Self
-
-import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_codec.coding.packing import Reader, WireError, Writer
 from kiteline_codec.schema.poses import read_pose, write_pose
 from kiteline_codec.schema.record import MAX_KEYFRAME_ID, IdOf, Key, Priority, Record, register
+from kiteline_core.arrays import F64
 from kiteline_core.ids import AgentId, KeyframeId
 
 
@@ -26,7 +22,7 @@ class LivePose(Record):
     agent: AgentId
     t_ns: int
     keyframe: KeyframeId
-    T_k_c: NDArray[np.float64]
+    T_k_c: F64
     quality: int
 
     def write(self, out: Writer) -> None:

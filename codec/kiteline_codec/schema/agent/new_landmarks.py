@@ -1,7 +1,5 @@
 """New landmarks of a keyframe."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from kiteline_codec.schema.described_landmarks import DescribedLandmarks

@@ -1,19 +1,13 @@
 """Observations of landmarks in a keyframe."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar
-
-import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_codec.coding.packing import Writer
 from kiteline_codec.schema.columns import Columns, Landmarks, write_landmarks
 from kiteline_codec.schema.record import MAX_PARTS, IdOf, Priority, Record, register
+from kiteline_core.arrays import F32, I64, U8, U16
 from kiteline_core.ids import KeyframeId
-
-I64 = NDArray[np.int64]
 
 
 @register
@@ -32,11 +26,11 @@ class Observations(Record):
 
     keyframe: KeyframeId
     part: int
-    index: NDArray[np.uint16]
-    uv: NDArray[np.float32]
-    inv_depth: NDArray[np.float32]
-    octave: NDArray[np.uint8]
-    point: NDArray[np.int64]
+    index: U16
+    uv: F32
+    inv_depth: F32
+    octave: U8
+    point: I64
 
     def write_rows(self, out: Writer, codes: I64, rows: I64) -> None:
         """Append all but the key of some rows. codes: (5,n) of the columns of all."""

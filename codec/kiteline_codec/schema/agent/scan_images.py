@@ -1,19 +1,13 @@
 """Images of a keyframe, or of a frame after it, of which the base makes a column scan."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Self
-
-import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_codec.coding.packing import Reader, WireError, Writer
 from kiteline_codec.schema.poses import read_direction, read_pose, write_direction, write_pose
 from kiteline_codec.schema.record import IdOf, Key, Priority, Record, register
+from kiteline_core.arrays import F64
 from kiteline_core.ids import KeyframeId
-
-F64 = NDArray[np.float64]
 
 _MOST_STRETCHES = 1 << 32
 

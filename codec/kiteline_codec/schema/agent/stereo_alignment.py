@@ -1,17 +1,13 @@
 """What an agent knows of its right camera."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from kiteline_codec.coding.packing import Reader, WireError, Writer
 from kiteline_codec.schema.calibration_sigma import read_factors, read_sigma, write_factors, write_sigma
 from kiteline_codec.schema.record import Field, IdOf, Priority, Record, register
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import disparity_offset
 from kiteline_core.ids import AgentId
 
@@ -56,8 +52,8 @@ class StereoAlignment(Record):
     )
 
     agent: AgentId
-    rows_px: NDArray[np.float64]
+    rows_px: F64
     rows_read: bool
-    disparity_px: NDArray[np.float64]
+    disparity_px: F64
     sigma_px: float | None = None
     good_calibration: bool = False

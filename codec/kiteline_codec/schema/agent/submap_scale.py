@@ -1,7 +1,5 @@
 """The unit of length of a monocular agent's submap."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from kiteline_codec.schema.poses import read_scale, write_scale

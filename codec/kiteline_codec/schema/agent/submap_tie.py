@@ -1,15 +1,11 @@
 """How a submap lies to the one before it: over a loss of images, or where a monocular map goes on in other metres."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
-
-import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_codec.coding.packing import Writer
 from kiteline_codec.schema.poses import read_deviation, read_pose, write_deviation, write_pose
 from kiteline_codec.schema.record import MAX_KEYFRAME_ID, Field, IdOf, Priority, Record, register
+from kiteline_core.arrays import F64
 from kiteline_core.ids import KeyframeId, SubmapId
 
 
@@ -35,6 +31,6 @@ class SubmapTie(Record):
 
     submap: SubmapId
     since: KeyframeId
-    T_k_f: NDArray[np.float64]
+    T_k_f: F64
     sigma_m: float
     sigma_rad: float

@@ -1,15 +1,11 @@
 """A keyframe that the base sends down into an agent's map cache."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
-
-import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_codec.coding.packing import Writer
 from kiteline_codec.schema.poses import read_pose, write_pose
 from kiteline_codec.schema.record import MAX_SUBMAP_ID, Field, IdOf, Priority, Record, register
+from kiteline_core.arrays import F64
 from kiteline_core.ids import KeyframeId, SubmapId
 
 
@@ -28,4 +24,4 @@ class CachedKeyframe(Record):
 
     keyframe: KeyframeId
     submap: SubmapId
-    T_m_k: NDArray[np.float64]
+    T_m_k: F64

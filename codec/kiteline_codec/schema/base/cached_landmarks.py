@@ -1,7 +1,5 @@
 """Landmarks that the base sends down into an agent's map cache."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from kiteline_codec.schema.described_landmarks import DescribedLandmarks

@@ -1,7 +1,5 @@
 """A batch of corrections."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Self

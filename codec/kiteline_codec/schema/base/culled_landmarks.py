@@ -1,16 +1,12 @@
 """Landmarks, and perhaps a whole keyframe, that the base culled."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar
-
-import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_codec.coding.packing import Writer
 from kiteline_codec.schema.columns import Columns
 from kiteline_codec.schema.record import Field, IdOf, Priority, Record, read_flag, register
+from kiteline_core.arrays import U16
 from kiteline_core.ids import KeyframeId
 
 
@@ -26,5 +22,5 @@ class CulledLandmarks(Record):
     CODE = (COLUMNS, Field("keyframe_too", Writer.u8, read_flag))
 
     keyframe: KeyframeId
-    index: NDArray[np.uint16]
+    index: U16
     keyframe_too: int  # 0 or 1

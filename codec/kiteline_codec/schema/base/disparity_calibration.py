@@ -1,16 +1,12 @@
 """Calibration of an agent's stereo disparities."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import partial
-
-import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_codec.schema.batches import read_batch, write_batch
 from kiteline_codec.schema.calibration_sigma import read_factors, read_sigma, write_factors, write_sigma
 from kiteline_codec.schema.record import Field, IdOf, Priority, Record, register
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import disparity_offset
 from kiteline_core.ids import AgentId
 
@@ -33,6 +29,6 @@ class DisparityCalibration(Record):
     )
 
     agent: AgentId
-    disparity_px: NDArray[np.float64]
+    disparity_px: F64
     sigma_px: float | None = None
     batch: int = 0

@@ -1,14 +1,10 @@
 """Landmarks of a keyframe that were fused into others."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
-
-import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_codec.schema.columns import Columns, Landmarks
 from kiteline_codec.schema.record import IdOf, Priority, Record, register
+from kiteline_core.arrays import I64, U16
 from kiteline_core.ids import KeyframeId
 
 
@@ -23,5 +19,5 @@ class FusedLandmarks(Record):
     CODE = (Columns("index"), Landmarks("point"))
 
     keyframe: KeyframeId
-    index: NDArray[np.uint16]
-    point: NDArray[np.int64]
+    index: U16
+    point: I64

@@ -1,16 +1,14 @@
 """A tile of the occupancy grid."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_codec.coding import tile_kernels as kernels
 from kiteline_codec.coding.packing import Reader, WireError, Writer
 from kiteline_codec.schema.record import IdOf, Key, Priority, Record, register
+from kiteline_core.arrays import I8, I64
 
 TILE_CELLS = kernels.SIDE  # along each side
 UNKNOWN, FREE = -1, 0  # values of cells; others are masks of occupied height bands
@@ -41,7 +39,7 @@ class GridTile(Record):
     row: int
     storey: int
     cell_m: float
-    cells: NDArray[np.int8]
+    cells: I8
 
     @property
     def part(self) -> int:
@@ -95,10 +93,10 @@ class GridTile(Record):
         return cls(*cls.place(key), cell / _CELL_STEPS, cells)
 
 
-def _packed(cells: NDArray[np.int8]) -> bytes:
+def _packed(cells: I8) -> bytes:
     out = np.empty(kernels.MAX_CODE, np.uint8)
     return out[: kernels.pack_cells(np.ascontiguousarray(cells), _model(), out)].tobytes()
 
 
-def _model() -> NDArray[np.int64]:
+def _model() -> I64:
     return np.empty((2, kernels.CONTEXTS), np.int64)

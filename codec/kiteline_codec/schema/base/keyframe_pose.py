@@ -1,15 +1,11 @@
 """The refined pose of a keyframe."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
-
-import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_codec.schema.batches import read_batch, write_batch
 from kiteline_codec.schema.poses import read_pose, write_pose
 from kiteline_codec.schema.record import Field, IdOf, Priority, Record, register
+from kiteline_core.arrays import F64
 from kiteline_core.ids import KeyframeId
 
 
@@ -24,5 +20,5 @@ class KeyframePose(Record):
     CODE = (Field("T_m_k", write_pose, read_pose), Field("batch", write_batch, read_batch))
 
     keyframe: KeyframeId
-    T_m_k: NDArray[np.float64]
+    T_m_k: F64
     batch: int = 0

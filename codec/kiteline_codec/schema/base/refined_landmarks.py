@@ -1,16 +1,12 @@
 """Refined positions of a keyframe's landmarks."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar
-
-import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_codec.schema.batches import read_batch, write_batch
 from kiteline_codec.schema.columns import Columns
 from kiteline_codec.schema.record import Field, IdOf, Priority, Record, register
+from kiteline_core.arrays import F32, U16
 from kiteline_core.ids import KeyframeId
 
 
@@ -28,7 +24,7 @@ class RefinedLandmarks(Record):
     CODE = (COLUMNS, Field("batch", write_batch, read_batch))
 
     keyframe: KeyframeId
-    index: NDArray[np.uint16]
-    inv_depth: NDArray[np.float32]
-    offset: NDArray[np.float32]
+    index: U16
+    inv_depth: F32
+    offset: F32
     batch: int = 0

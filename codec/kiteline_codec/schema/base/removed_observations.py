@@ -1,14 +1,10 @@
 """Observations that the base rejected as outliers."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
-
-import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_codec.schema.columns import Columns
 from kiteline_codec.schema.record import IdOf, Priority, Record, register
+from kiteline_core.arrays import U16
 from kiteline_core.ids import KeyframeId
 
 
@@ -23,4 +19,4 @@ class RemovedObservations(Record):
     CODE = (Columns("index"),)
 
     keyframe: KeyframeId
-    index: NDArray[np.uint16]
+    index: U16

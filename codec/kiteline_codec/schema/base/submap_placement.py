@@ -1,18 +1,14 @@
 """The placement of a submap in the world."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Self
-
-import numpy as np
-from numpy.typing import NDArray
 
 from kiteline_codec.coding import quantise
 from kiteline_codec.coding.packing import Reader, WireError, Writer
 from kiteline_codec.schema.batches import read_batch, write_batch
 from kiteline_codec.schema.poses import read_pose, read_scale, write_pose, write_scale
 from kiteline_codec.schema.record import IdOf, Key, Priority, Record, register
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import sim3
 from kiteline_core.ids import SubmapId
 
@@ -32,7 +28,7 @@ class SubmapPlacement(Record):
     PRIORITY = Priority.POSE  # few bytes, and the whole error of a pose in the world
 
     submap: SubmapId
-    S_w_m: NDArray[np.float64]
+    S_w_m: F64
     recognised: bool = False
     batch: int = 0
     scale_sigma: float = 0.0

@@ -1,7 +1,5 @@
 """A connection to a flight controller over UDP, TCP or a serial port that carries MAVLink messages. Never blocks."""
 
-from __future__ import annotations
-
 import contextlib
 import threading
 import time

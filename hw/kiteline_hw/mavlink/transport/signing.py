@@ -1,7 +1,5 @@
 """Signatures of MAVLink 2 messages, with a stamp that never goes back, even on a computer without a clock."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import time

@@ -1,7 +1,5 @@
 """UDP and TCP sockets of a flight controller. Sending never blocks; receiving waits for a while at most."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import select

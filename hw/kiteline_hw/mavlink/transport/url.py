@@ -1,7 +1,5 @@
 """Addresses of flight controllers."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from kiteline_hw.links.kinds import MAVLINK_FORMS
@@ -24,7 +22,7 @@ class MavlinkUrl:
     port: int
     system: int | None = None
 
-    def same_port(self, other: MavlinkUrl) -> bool:
+    def same_port(self, other: "MavlinkUrl") -> bool:
         """True if both name the same serial device or socket."""
         if self.kind == other.kind == "serial":
             return self.address == other.address

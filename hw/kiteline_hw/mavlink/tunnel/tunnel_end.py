@@ -7,8 +7,6 @@ not forward it) the rate follows the reports in which each end tells the other w
 heartbeats, from which routers on the way learn where to forward.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from dataclasses import dataclass
 

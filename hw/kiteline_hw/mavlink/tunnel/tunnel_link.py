@@ -1,7 +1,5 @@
 """The tunnel through a flight controller as a ByteLink, over UDP, TCP or a serial port."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import deque

@@ -1,7 +1,5 @@
 """Flow control of a tunnel by what arrives: each end reports it, and the other sets its rate by that. Pure."""
 
-from __future__ import annotations
-
 import struct
 from collections import deque
 

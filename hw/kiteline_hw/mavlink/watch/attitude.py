@@ -5,8 +5,6 @@ All 24 ways in which axes can be mounted are judged by the same samples: rotatio
 common north or gravity, and the direction of gravity. The axes in use are wrong when others fit far better.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections import deque
 from dataclasses import dataclass
@@ -14,8 +12,8 @@ from math import cos, sin
 
 import numpy as np
 
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
-from kiteline_core.geometry.se3 import F64
 from kiteline_hw.mavlink.controller_odometry import StampClock
 from kiteline_hw.mavlink.coordinate_frames import R_L_O, mounting
 from kiteline_hw.mavlink.messages import Attitude
@@ -81,8 +79,8 @@ def attitude_rotation(angles_rad: tuple[float, float, float]) -> F64:
 class AttitudeWatch:
     """Poses and ATTITUDE messages in, findings out. R_b_f: (3,3) of the controller's axes (FRD) in the body, in use."""
 
-    def __init__(self, R_b_f: F64, log: FindingLog, config: AttitudeWatchConfig | None = None) -> None:
-        self.config = config or AttitudeWatchConfig()
+    def __init__(self, R_b_f: F64, log: FindingLog) -> None:
+        self.config = AttitudeWatchConfig()
         self._log = log
         self._in_use = int(np.argmax([np.trace(r @ R_b_f) for r in _R_F_B]))
         self._clock = StampClock()

@@ -1,15 +1,13 @@
 """Watches the flight controller of a flight: what it is, whether it uses the poses, whether attitudes agree. Pure."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from kiteline_core.geometry.se3 import F64
-from kiteline_hw.mavlink.messages import Attitude, Heartbeat, MavlinkMessage, TimeSync
+from kiteline_core.arrays import F64
+from kiteline_hw.mavlink.messages import Attitude, Heartbeat, MavlinkMessage, MessageInterval, TimeSync
 from kiteline_hw.mavlink.watch import messages as wire
 from kiteline_hw.mavlink.watch.attitude import TOPIC as AXES
 from kiteline_hw.mavlink.watch.attitude import AttitudeWatch
@@ -45,8 +43,8 @@ class ControllerWatch:
     T_b_f: (4,4) flight controller in the body. url: of the connection, for messages. baud: of its serial port, else 0.
     """
 
-    def __init__(self, T_b_f: F64, url: str = "", baud: int = 0, config: ControllerWatchConfig | None = None) -> None:
-        self.config = config or ControllerWatchConfig()
+    def __init__(self, T_b_f: F64, url: str = "", baud: int = 0) -> None:
+        self.config = ControllerWatchConfig()
         self._log = FindingLog()
         self.presence = PresenceWatch(url, self._log)
         self.estimator = EstimatorWatch(self._log)
@@ -145,12 +143,7 @@ class ControllerWatch:
             if message in self._seen_ns and now_ns - self._seen_ns[message] < c.request_ns:
                 continue
             self._seen_ns[message] = now_ns
-            out.append(
-                wire.Command(
-                    controller.system, controller.component, wire.SET_MESSAGE_INTERVAL, float(message),
-                    float(interval_us),
-                )
-            )  # fmt: skip
+            out.append(MessageInterval(controller.system, controller.component, message, interval_us))
         return out
 
     def _on_attitude(self, m: Attitude, now_ns: int) -> None:

@@ -1,7 +1,5 @@
 """Says whether a flight controller's estimator uses the poses that it is sent. Pure."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from kiteline_hw.mavlink.watch.findings import FindingLog, Level
@@ -36,8 +34,8 @@ class EstimatorConfig:
 class EstimatorWatch:
     """Poses and reports of the estimator in, findings out."""
 
-    def __init__(self, log: FindingLog, config: EstimatorConfig | None = None) -> None:
-        self.config = config or EstimatorConfig()
+    def __init__(self, log: FindingLog) -> None:
+        self.config = EstimatorConfig()
         self._log = log
         self._first_pose_ns: int | None = None
         self._last_pose_ns: int | None = None

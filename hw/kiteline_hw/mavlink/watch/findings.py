@@ -1,7 +1,5 @@
 """What is found about a flight controller, said once and again when it changes."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import IntEnum
 

@@ -1,7 +1,5 @@
 """Measures how late poses leave, and says the delay to set in the flight controller. Pure."""
 
-from __future__ import annotations
-
 from collections import deque
 from dataclasses import dataclass
 
@@ -24,8 +22,8 @@ class LatencyConfig:
 class LatencyWatch:
     """Ages of sent poses in, findings out. baud: of the serial port to the controller; 0: not serial."""
 
-    def __init__(self, log: FindingLog, baud: int = 0, config: LatencyConfig | None = None) -> None:
-        self.config = config or LatencyConfig()
+    def __init__(self, log: FindingLog, baud: int = 0) -> None:
+        self.config = LatencyConfig()
         self._log = log
         self._wire_ms = 1e3 * _FRAME_BYTES * _BITS_PER_BYTE / baud if baud > 0 else 0.0
         self._ages_ms: deque[float] = deque(maxlen=self.config.poses)

@@ -1,7 +1,5 @@
 """The MAVLink messages by which a flight controller reports its state: estimator, version, parameters, texts."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass

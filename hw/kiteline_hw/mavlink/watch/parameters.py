@@ -1,7 +1,5 @@
 """The parameters of ArduPilot and PX4 that decide whether poses are used, and what they should be. Pure."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Says whether a flight controller is there, which one, and why not. Pure."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from pymavlink.dialects.v20 import common
@@ -50,8 +48,8 @@ def autopilot_name(kind: int) -> str:
 class PresenceWatch:
     """Heartbeats and the connection's state in, findings out. url: of the connection, for messages."""
 
-    def __init__(self, url: str, log: FindingLog, config: PresenceConfig | None = None) -> None:
-        self.config = config or PresenceConfig()
+    def __init__(self, url: str, log: FindingLog) -> None:
+        self.config = PresenceConfig()
         self._url, self._log = url, log
         self._start_ns: int | None = None
         self.heartbeat: Heartbeat | None = None  # the last one of the controller

@@ -1,7 +1,5 @@
 """Rate and jitter of a stream of messages by their arrivals. Pure."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 

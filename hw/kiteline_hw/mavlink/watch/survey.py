@@ -3,8 +3,6 @@
 Streams are measured on a disarmed vehicle only, and set back to their own rates at the end.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -15,6 +13,7 @@ from kiteline_hw.mavlink.messages import (
     Attitude,
     Heartbeat,
     MavlinkMessage,
+    MessageInterval,
     RadioStatus,
     TimeSync,
     VehicleImu,
@@ -24,7 +23,6 @@ from kiteline_hw.mavlink.watch import parameters
 from kiteline_hw.mavlink.watch.findings import Finding, FindingLog, Level
 from kiteline_hw.mavlink.watch.messages import (
     AutopilotVersion,
-    Command,
     CommandAck,
     EkfStatusReport,
     EstimatorStatus,
@@ -64,8 +62,8 @@ class SurveyConfig:
 class ControllerSurvey:
     """Messages and times in, messages to send out, and at the end findings. url: for messages."""
 
-    def __init__(self, url: str, config: SurveyConfig | None = None) -> None:
-        self.config = config or SurveyConfig()
+    def __init__(self, url: str) -> None:
+        self.config = SurveyConfig()
         self._log = FindingLog()
         self.presence = PresenceWatch(url, self._log)
         self._presence_findings: list[Finding] = []
@@ -148,7 +146,7 @@ class ControllerSurvey:
             return []
         target = controller.system, controller.component
         wanted = self._wanted(controller)
-        return [Command(*target, wire.SET_MESSAGE_INTERVAL, float(message), 0.0) for _, message, _ in wanted]
+        return [MessageInterval(*target, message, 0) for _, message, _ in wanted]
 
     def _stream_requests(self, controller: Heartbeat, now_ns: int) -> list[MavlinkMessage]:
         c = self.config
@@ -158,7 +156,7 @@ class ControllerSurvey:
         self._stream_tries += 1
         target = controller.system, controller.component
         return [
-            Command(*target, wire.SET_MESSAGE_INTERVAL, float(message), round(1e6 / hz))
+            MessageInterval(*target, message, round(1e6 / hz))
             for name, message, hz in self._wanted(controller)
             if name not in self._rates
         ]

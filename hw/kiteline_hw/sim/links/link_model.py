@@ -4,8 +4,6 @@ Burst losses follow Gilbert's two-state chain (Bell System Technical Journal 39,
 loss, and a bad one, entered at random, in which all packets are lost.
 """
 
-from __future__ import annotations
-
 import heapq
 import random
 from collections import deque

@@ -1,7 +1,5 @@
 """Link models between real processes: two UDP ports with a LinkModel or a telemetry radio between them."""
 
-from __future__ import annotations
-
 import contextlib
 import select
 import socket

@@ -1,7 +1,5 @@
 """Two serial devices connected by a modelled cable: pseudo terminals, and a thread that copies bytes between them."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import pty

@@ -5,8 +5,6 @@ reported in RADIO_STATUS. The controller also sends its own telemetry; like Ardu
 without priorities, first come, first served.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from dataclasses import dataclass
 

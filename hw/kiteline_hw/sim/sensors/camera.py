@@ -1,12 +1,10 @@
 """A simulated camera: renders the world to grey values and depth."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F32, F64, I32, U8
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraModel
 from kiteline_hw.sim.sensors.lens import pixel_rays, vignette
@@ -16,11 +14,6 @@ from kiteline_hw.sim.world.overlay_kernels import overlay
 from kiteline_hw.sim.world.raycast_kernels import NO_SHELL, TILE, render, tile_lists, visible_boxes
 from kiteline_hw.sim.world.textures import DETAIL_M
 from kiteline_hw.sim.world.world import NO_GROUND, World
-
-F64 = NDArray[np.float64]
-F32 = NDArray[np.float32]
-I32 = NDArray[np.int32]
-U8 = NDArray[np.uint8]
 
 LAMP_HZ = 119.7  # twice the mains' frequency, which is a little off: a whole number of periods a frame would hide it
 

@@ -1,22 +1,18 @@
 """The samples of an IMU on the body along a path."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64, I64, Bool
 from kiteline_core.frame import ImuBatch, ImuCalibration
 from kiteline_hw.sim.sensors.wear import ImuWear
 from kiteline_hw.sim.world.path import EASE_S, GRAVITY, Path, flight_s
-
-F64 = NDArray[np.float64]
 
 START_GYRO_BIAS = 0.003  # rad/s, standard deviation of the bias at switch-on
 START_ACCEL_BIAS = 0.05  # m/s^2, likewise
 
 
 def measure(
-    path: Path, t_ns: NDArray[np.int64], start_ns: int, calibration: ImuCalibration, seed: int, noise: bool = True,
+    path: Path, t_ns: I64, start_ns: int, calibration: ImuCalibration, seed: int, noise: bool = True,
     wear: ImuWear | None = None,
 ) -> ImuBatch:  # fmt: skip
     """Samples at t_ns (n,): angular rate and specific force, with white noise and random-walk biases.
@@ -59,7 +55,7 @@ def _worn(path: Path, t_s: F64, gyro: F64, accel: F64, seed: int, wear: ImuWear)
     return gyro @ wear.gyro_matrix.T, accel @ wear.accel_matrix.T
 
 
-def _lost(n: int, seed: int, wear: ImuWear) -> NDArray[np.bool_]:
+def _lost(n: int, seed: int, wear: ImuWear) -> Bool:
     """Whether each sample (n,) is lost, singly or in a gap."""
     draws = np.random.default_rng([seed, 23]).random((n, 3))
     lost = draws[:, 0] < wear.sample_loss

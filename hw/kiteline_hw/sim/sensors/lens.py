@@ -1,14 +1,9 @@
 """Lens models of the simulated cameras: distortion, projection, pixel rays and vignette."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F32, F64
 from kiteline_core.geometry.cameras import CameraModel, Lens
-
-F64 = NDArray[np.float64]
-F32 = NDArray[np.float32]
 
 
 def distort(camera: CameraModel, points: F64) -> F64:

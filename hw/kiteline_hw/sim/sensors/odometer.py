@@ -1,23 +1,17 @@
 """The velocities that wheels or a flight controller on the body would measure along a path."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64, I64
 from kiteline_core.frame import UNMEASURED, OdometryBatch
 from kiteline_hw.sim.config import SimConfig
 from kiteline_hw.sim.world.path import Path, flight_s
-
-F64 = NDArray[np.float64]
 
 SLIP_S = 1.0  # s; mean duration of a slip
 SLIP_FACTOR = 2.5  # largest factor on the true speed while a wheel slips
 
 
-def measure(
-    path: Path, t_ns: NDArray[np.int64], start_ns: int, config: SimConfig, camera_in_body: F64
-) -> OdometryBatch:
+def measure(path: Path, t_ns: I64, start_ns: int, config: SimConfig, camera_in_body: F64) -> OdometryBatch:
     """Samples at t_ns (n,): velocity and angular rate of the body in its own axes, with noise, scale error and slips.
 
     Wheels measure only along the optical axis and about the camera's vertical axis. camera_in_body: T_b_c (4,4). The

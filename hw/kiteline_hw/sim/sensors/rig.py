@@ -1,16 +1,12 @@
 """The calibrated stereo rig of a simulated vehicle (EuRoC's), and the true one that differs a little."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraModel, CameraRig, Lens
-
-F64 = NDArray[np.float64]
 
 # Rotations of the left and right camera in the body frame (x up, z forward), and lens coefficients left and right.
 _R_B_C = np.array([[0.0149, -0.9999, 0.0041], [0.9996, 0.0150, 0.0257], [-0.0258, 0.0038, 0.9997]])

@@ -1,15 +1,9 @@
 """From radiance to grey values: motion blur and rolling shutter, vignette, exposure, noise, quantisation."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F32, F64, U8
 from kiteline_core.jit import njit
-
-F64 = NDArray[np.float64]
-F32 = NDArray[np.float32]
-U8 = NDArray[np.uint8]
 
 _MIN_STREAK_PX = 0.7  # resampling would blur more than a shorter streak
 _MAX_TAPS = 17

@@ -4,8 +4,6 @@ It keeps the driver's rules: a queue of mapped buffers, sequence numbers that co
 errors by number. `device.unplug()`, `plug()`, `silence()`, `garbage()`, `lose(n)` do what happens in the field.
 """
 
-from __future__ import annotations
-
 import ctypes
 import errno
 import threading
@@ -89,14 +87,10 @@ class ModelDevice:
 
 
 class ModelKernel:
-    """The system calls on modelled devices, by path. clock and sleep: of the model's time."""
+    """The system calls on modelled devices, by path."""
 
-    def __init__(
-        self, devices: dict[str, ModelDevice], clock: Callable[[], int] = time.monotonic_ns,
-        sleep: Callable[[float], None] = time.sleep,
-    ) -> None:  # fmt: skip
+    def __init__(self, devices: dict[str, ModelDevice]) -> None:
         self.devices = devices
-        self._clock, self._sleep = clock, sleep
         self._open: dict[int, ModelDevice] = {}
         self._next_fd = 1000
         self._lock = threading.RLock()
@@ -127,13 +121,13 @@ class ModelKernel:
         return device.maps[offset // _SLOT_BYTES]
 
     def wait(self, fd: int, seconds: float) -> bool:
-        end_ns = self._clock() + round(seconds * 1e9)
+        end_ns = time.monotonic_ns() + round(seconds * 1e9)
         while True:
             with self._lock:
                 device = self._open[fd]
                 if not device.plugged:
                     return True
-                now_ns = self._clock()
+                now_ns = time.monotonic_ns()
                 self._fill(device, now_ns)
                 ready = device.streaming and not device.silent and device.due_ns() <= now_ns and bool(device.queued)
                 due_ns = device.due_ns() if device.streaming and not device.silent else end_ns
@@ -141,7 +135,7 @@ class ModelKernel:
                 return True
             if now_ns >= end_ns:
                 return False
-            self._sleep(max(1e-4, (min(due_ns, end_ns, now_ns + 10_000_000) - now_ns) / 1e9))
+            time.sleep(max(1e-4, (min(due_ns, end_ns, now_ns + 10_000_000) - now_ns) / 1e9))
 
     def ioctl(self, fd: int, request: int, argument: ctypes.Structure | ctypes.c_int) -> None:
         with self._lock:
@@ -233,7 +227,7 @@ class ModelKernel:
         d.queued.append(a.index)
 
     def _dequeue(self, d: ModelDevice, a: api.Buffer) -> None:
-        now_ns = self._clock()
+        now_ns = time.monotonic_ns()
         self._fill(d, now_ns)
         if d.silent or not d.streaming or d.due_ns() > now_ns or not d.queued:
             raise BlockingIOError(errno.EAGAIN, "Resource temporarily unavailable")
@@ -253,9 +247,9 @@ class ModelKernel:
         d.streaming, d.sequence, d.next_image = True, 0, d.next_image + 1
         # Images keep their rhythm and their order through a replug.
         if not d.begin_ns:
-            d.begin_ns, d.next_image = self._clock(), 0
+            d.begin_ns, d.next_image = time.monotonic_ns(), 0
         else:
-            passed = (self._clock() - d.begin_ns) / 1e9 * d.fps
+            passed = (time.monotonic_ns() - d.begin_ns) / 1e9 * d.fps
             d.next_image = max(d.next_image, int(passed) + 1)
 
     def _off(self, d: ModelDevice, a: ctypes.c_int) -> None:

@@ -4,22 +4,18 @@ Each kind of wear is drawn from a seed of its own, so a kind that is left out ch
 the nominal one times 0.7 to 1.3; signs and directions are random.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64, I64, Bool
 from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraModel, CameraRig
 from kiteline_hw.logs.rig_json import rig_to_json
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 Rng = np.random.Generator
 
 KINDS = ("lens", "extrinsics", "imu", "vibration", "range", "noise", "stamps", "gaps", "pairs")
@@ -125,7 +121,7 @@ class WornRig:
         late = self.late_s + self.jitter_s * np.clip(draws, -3.0, 3.0)
         return np.asarray(exposed_ns + np.round(1e9 * late).astype(np.int64))
 
-    def has_partner(self, frames: int) -> NDArray[np.bool_]:
+    def has_partner(self, frames: int) -> Bool:
         """Whether the right image of each frame (n,) arrives."""
         return np.asarray(np.random.default_rng([self.seed, 71]).random(frames) >= self.pair_loss)
 

@@ -1,7 +1,5 @@
 """Worlds given as a list of solid boxes: a CSV file beside a recording that someone else rendered."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

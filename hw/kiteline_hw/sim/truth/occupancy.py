@@ -1,19 +1,13 @@
 """The true occupancy grid of a world, whether its cells were seen or not."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64, U8, Bool
 from kiteline_hw.sim.world.world import World
-
-F64 = NDArray[np.float64]
-U8 = NDArray[np.uint8]
-Bool = NDArray[np.bool_]
 
 OCCUPIED, FREE, UNKNOWN = 0, 254, 205  # grey values of map_server images
 MARGIN_M = 0.3  # m of unknown cells around the walls
@@ -32,7 +26,7 @@ class TrueGrid:
         r, c = np.indices(self.image.shape)
         return np.stack([self.corner[0] + (c + 0.5) * self.cell_m, self.corner[1] + (r + 0.5) * self.cell_m], 2)
 
-    def only(self, known: Bool) -> TrueGrid:
+    def only(self, known: Bool) -> "TrueGrid":
         """The grid with all other cells UNKNOWN. known: (rows, columns)."""
         return replace(self, image=np.where(known, self.image, np.uint8(UNKNOWN)))
 

@@ -1,21 +1,16 @@
 """What of a world true camera poses could see: cells with a line of sight, by height band."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64, U8
 from kiteline_core.geometry.cameras import CameraModel
 from kiteline_hw.sim.sensors.lens import pixel_rays
 from kiteline_hw.sim.truth.occupancy import FREE, OCCUPIED, TrueGrid, occupancy
 from kiteline_hw.sim.truth.sight_kernels import mark_sight
 from kiteline_hw.sim.world.raycast_kernels import NO_SHELL, visible_boxes
 from kiteline_hw.sim.world.world import World
-
-F64 = NDArray[np.float64]
-U8 = NDArray[np.uint8]
 
 HEIGHTS_M = (0.1, 0.5, 1.2, 2.0)  # above the ground: limits of the height bands; what is lower is ground
 CELL_M = 0.05

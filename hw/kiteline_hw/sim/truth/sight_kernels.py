@@ -1,17 +1,10 @@
 """Kernel that marks the cells of a grid which rays of sight cross. Arrays in, caller's arrays out."""
 
-from __future__ import annotations
-
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F32, F64, I32, U8
 from kiteline_hw.sim.world.raycast_kernels import box_hit, ground_hit
-
-F64 = NDArray[np.float64]
-F32 = NDArray[np.float32]
-I32 = NDArray[np.int32]
-U8 = NDArray[np.uint8]
 
 _INTO_M = 1e-4  # m behind a surface that is hit: its cell is that of the solid
 

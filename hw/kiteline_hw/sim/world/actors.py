@@ -1,17 +1,14 @@
 """People and cars that move through a scene: where their boxes are at any time. Deterministic."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64
 from kiteline_hw.sim.world.path import Path
 from kiteline_hw.sim.world.textures import TEXEL_M, TexturePool
 from kiteline_hw.sim.world.world import World
 
-F64 = NDArray[np.float64]
 Rng = np.random.Generator
 
 PASS_S = 4.0  # s before and after a person crosses the view

@@ -1,15 +1,11 @@
 """The built-in path of each scene: a closed course, flown as often as needed."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
 from kiteline_hw.sim.world.path import Path
 from kiteline_hw.sim.world.path_fit import fit
-
-F64 = NDArray[np.float64]
 
 # Camera axes (columns) of a level camera that looks along +x: right is -y, down is -z.
 _R_LEVEL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])

@@ -1,15 +1,11 @@
 """Floors that are not flat, or have no texture: a ramp, waves, pits, steps, bare ground."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64
 from kiteline_hw.sim.world.world import World
-
-F64 = NDArray[np.float64]
 
 FLOORS = ("flat", "ramp", "wave", "pits", "steps", "bare")
 _CELL_M = 0.1  # m; cell of the ground's field

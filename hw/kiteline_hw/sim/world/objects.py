@@ -1,16 +1,13 @@
 """Objects that are hard on an occupancy grid: chairs on thin legs, tables, cylinders, half-open doors, pillars."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64
 from kiteline_hw.sim.world.world import Builder, World, box_distances
 
-F64 = NDArray[np.float64]
 Parts = list[tuple[F64, F64, float]]  # centre, half-extents, yaw of each box; x, y about the object, z above the ground
 Rng = np.random.Generator
 

@@ -1,22 +1,15 @@
 """Draws moving solids over an image of the still ones."""
 
-from __future__ import annotations
-
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F32, F64, I32, I64, U8
 from kiteline_hw.sim.world.raycast_kernels import NO_SHELL, SKY, TILE, cast_ray, sample_ray, shade_hit
-
-F64 = NDArray[np.float64]
-F32 = NDArray[np.float32]
-I32 = NDArray[np.int32]
-U8 = NDArray[np.uint8]
 
 
 @njit(cache=True, nogil=True)
 def overlay(
-    boxes: F64, faces: F64, field: F32, frame: F64, ground: F64, atlas: U8, table: NDArray[np.int64], detail_m: float,
+    boxes: F64, faces: F64, field: F32, frame: F64, ground: F64, atlas: U8, table: I64, detail_m: float,
     o: F64, rot: F64, rays: F32, pixel: float, far: float, near: F64, items: I32, lists: I32, lengths: I32, first: int,
     radiance: F32, distance: F32, hits: I32,
 ) -> None:  # fmt: skip

@@ -4,17 +4,13 @@ Position and (sign-continuous, not normalised) quaternion are splines over unifo
 (L. Piegl, W. Tiller, "The NURBS Book"). A path starts at rest: time is warped by a quintic ease-in.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from math import comb, factorial
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64, I64
 from kiteline_core.frame import Trajectory
-
-F64 = NDArray[np.float64]
 
 GRAVITY = 9.81  # m/s^2
 REST_S = 1.0  # s at rest at the start
@@ -124,11 +120,11 @@ def _rotations(q: F64) -> F64:
     return np.moveaxis(np.array(rows), 2, 0)
 
 
-def to_trajectory(path: Path, t_ns: NDArray[np.int64], start_ns: int) -> Trajectory:
+def to_trajectory(path: Path, t_ns: I64, start_ns: int) -> Trajectory:
     """Ground truth at the stamps t_ns (n,), where `start_ns` is flight time zero."""
     return Trajectory(t_ns, path.motion(flight_s(t_ns, start_ns)).T_w_b)
 
 
-def flight_s(t_ns: NDArray[np.int64], start_ns: int) -> F64:
+def flight_s(t_ns: I64, start_ns: int) -> F64:
     """Flight times in seconds of stamps (n,)."""
     return np.asarray((t_ns - start_ns) * 1e-9, np.float64)

@@ -4,19 +4,15 @@ The penalty is on third differences of the coefficients (P. Eilers, B. Marx, "Fl
 penalties", 1996).
 """
 
-from __future__ import annotations
-
 import warnings
 from pathlib import Path as FilePath
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
 from kiteline_hw.ports import SourceError
 from kiteline_hw.sim.world.path import BASIS, ORDER, Path
-
-F64 = NDArray[np.float64]
 
 # Rotates KITTI's world (x right, y down, z forward) to a world with z up.
 _R_UP = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])

@@ -14,16 +14,10 @@ are swapped, plus GLOSSY where lights are reflected.
 Faces are numbered 2 * axis + (1 where the outward normal is positive). A hit is 6 * box + face, or SKY or GROUND.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-F64 = NDArray[np.float64]
-F32 = NDArray[np.float32]
-I32 = NDArray[np.int32]
-U8 = NDArray[np.uint8]
+from kiteline_core.arrays import F32, F64, I32, I64, U8
 
 TILE = 16  # px, side of a screen tile
 SKY = -1
@@ -213,7 +207,7 @@ def _bilinear(atlas: U8, base: int, bits: int, u: float, v: float) -> float:
 
 
 @njit(cache=True, nogil=True, _nrt=False, forceinline=True)
-def texture_value(atlas: U8, table: NDArray[np.int64], k: int, u: float, v: float, lod: float) -> float:
+def texture_value(atlas: U8, table: I64, k: int, u: float, v: float, lod: float) -> float:
     """Value, 0..255, of texture k at texel (u, v) of its finest level. table (n, 1 + levels): log2 of side, offsets.
 
     Two mip levels are blended in the middle half between them; elsewhere the nearer one is used.
@@ -236,7 +230,7 @@ def texture_value(atlas: U8, table: NDArray[np.int64], k: int, u: float, v: floa
 
 @njit(cache=True, nogil=True, _nrt=False, forceinline=True)
 def _surface(
-    atlas: U8, table: NDArray[np.int64], faces: F64, n: int, u: float, v: float, eu: float, ev: float,
+    atlas: U8, table: I64, faces: F64, n: int, u: float, v: float, eu: float, ev: float,
     across: float, along: float, detail_m: float,
 ) -> float:  # fmt: skip
     """Radiance of a surface point. u, v in m; (eu, ev) unit direction of the footprint's long side; sides in m."""
@@ -260,7 +254,7 @@ def _surface(
 
 @njit(cache=True, nogil=True, _nrt=False, forceinline=True)
 def shade_hit(
-    boxes: F64, faces: F64, shell: int, field: F32, frame: F64, ground: F64, atlas: U8, table: NDArray[np.int64],
+    boxes: F64, faces: F64, shell: int, field: F32, frame: F64, ground: F64, atlas: U8, table: I64,
     detail_m: float, o: F64, dx: float, dy: float, dz: float, t: float, hit: int, pixel: float,
 ) -> float:  # fmt: skip
     if hit == SKY:
@@ -335,7 +329,7 @@ def sample_ray(rays: F32, rot: F64, y: int, x: int, k: int) -> tuple[float, floa
 
 @njit(cache=True, nogil=True)
 def render(
-    boxes: F64, faces: F64, shell: int, field: F32, frame: F64, ground: F64, atlas: U8, table: NDArray[np.int64],
+    boxes: F64, faces: F64, shell: int, field: F32, frame: F64, ground: F64, atlas: U8, table: I64,
     detail_m: float, o: F64, rot: F64, rays: F32, pixel: float, far: float,
     near: F64, items: I32, lists: I32, lengths: I32, radiance: F32, distance: F32, hits: I32,
 ) -> None:  # fmt: skip

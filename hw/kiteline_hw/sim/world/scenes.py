@@ -1,14 +1,10 @@
 """Indoor scenes, built around the paths flown in them."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64
 from kiteline_hw.sim.world.textures import make_pool
 from kiteline_hw.sim.world.world import NO_GROUND, Builder, World
-
-F64 = NDArray[np.float64]
 
 CLEARANCE_M = 0.5  # smallest distance of a solid from a path
 SCENES = ("room", "hall", "corridor", "street")

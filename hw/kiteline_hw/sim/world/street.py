@@ -1,16 +1,11 @@
 """A street along the paths: a road at their height, pavements, houses, parked cars, poles and trees."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F32, F64
 from kiteline_hw.sim.world.textures import make_pool
 from kiteline_hw.sim.world.world import Builder, World, bilinear
-
-F64 = NDArray[np.float64]
-F32 = NDArray[np.float32]
 
 CAMERA_HEIGHT_M = 1.65  # m of the path above the road
 CLEARANCE_M = 0.6

@@ -1,7 +1,5 @@
 """Surfaces that mislead a tracker: patterns that repeat, and gloss in which lights move with the camera."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,17 +1,13 @@
 """Paints opaque shapes onto a square texture that wraps around."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F32, I32
 from kiteline_core.jit import njit
-
-F32 = NDArray[np.float32]
 
 
 @njit
-def paint(shapes: F32, kinds: NDArray[np.int32], out: F32) -> None:
+def paint(shapes: F32, kinds: I32, out: F32) -> None:
     """Paint shapes in order, later ones over earlier ones; `out` (n, n), n a power of two, wraps around.
 
     shapes (m, 9): centre x y, half-sides a b in texels, cos and sin of the rotation, value, its gradient along a and b

@@ -5,18 +5,13 @@ with sizes distributed as r^-3, which gives sharp edges and a power spectrum nea
 bricks, posters and windows. Every texture wraps around and has mean 128; its contrast is set by the face that uses it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F32, F64, I32, I64, U8
 from kiteline_hw.sim.world.texture_kernels import paint
-
-F32 = NDArray[np.float32]
-U8 = NDArray[np.uint8]
 
 TEXEL_M = 0.005  # side of the finest texel of a surface texture
 DETAIL_M = 0.0015  # side of a texel of the detail texture, which all surfaces use at different offsets
@@ -33,7 +28,7 @@ class TexturePool:
     """
 
     atlas: U8
-    table: NDArray[np.int64]
+    table: I64
     names: tuple[str, ...]
 
     def index(self, name: str) -> int:
@@ -92,11 +87,11 @@ def pink(rng: Rng, side: int, slope: float = 1.0, stretch: float = 1.0) -> F32:
 def shapes(
     rng: Rng, side: int, cover: float, smallest: float, largest: float, spread: float = 40.0, exponent: float = 3.0,
     tone: float = 0.0,
-) -> tuple[F32, NDArray[np.int32]]:  # fmt: skip
+) -> tuple[F32, I32]:  # fmt: skip
     """Random shapes for `paint` that cover the texture `cover` times; radii from `smallest` to `largest` texels."""
     power = 1.0 - exponent
 
-    def radii(n: int) -> NDArray[np.float64]:
+    def radii(n: int) -> F64:
         u = rng.random(n)
         return np.asarray((smallest**power + u * (largest**power - smallest**power)) ** (1.0 / power))
 
@@ -292,7 +287,7 @@ def detail(rng: Rng, side: int) -> F32:
 
 def _strokes(
     rng: Rng, side: int, count: int, length: tuple[float, float], width: tuple[float, float], tone: float
-) -> tuple[F32, NDArray[np.int32]]:
+) -> tuple[F32, I32]:
     """Cracks: chains of thin rectangles of wandering direction. `count` is are for a texture of 2048 texels."""
     rows = []
     for _ in range(max(1, int(count * (side / 2048) ** 2))):

@@ -1,16 +1,11 @@
 """A world of textured solids: its arrays and its builder."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F32, F64
 from kiteline_hw.sim.world.textures import TEXEL_M, TexturePool
-
-F64 = NDArray[np.float64]
-F32 = NDArray[np.float32]
 
 NO_GROUND = np.zeros((0, 1, 1), np.float32)
 

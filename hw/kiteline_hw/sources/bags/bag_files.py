@@ -1,7 +1,5 @@
 """Files of recorded messages: which are the parts of a bag, and in which storage and compression."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import zstandard

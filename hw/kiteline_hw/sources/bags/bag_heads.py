@@ -1,7 +1,5 @@
 """The first bytes of recordings of messages, and errors for those that cannot be read. It imports nothing heavy."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from kiteline_hw.ports import SourceError

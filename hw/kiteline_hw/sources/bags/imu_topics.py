@@ -1,7 +1,5 @@
 """Chooses the IMU of a bag: one topic, or a gyroscope and an accelerometer whose samples are joined."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, replace

@@ -2,8 +2,6 @@
 BAG_1.mcap…, or of a kiteline log that went on in further files, LOG.mcap, LOG_1.mcap…
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Collection, Iterator
 from itertools import pairwise

@@ -3,8 +3,6 @@
 Source: the packages of common_interfaces, rcl_interfaces and geometry2; the same from ROS 2 Dashing on.
 """
 
-from __future__ import annotations
-
 import re
 
 _HEADER = "std_msgs/Header header\n"

@@ -3,8 +3,6 @@
 The decoder of mcap_ros2 reads any schema, one field at a time: of an IMU at 200 Hz that takes a share of a core.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable
 from typing import Any, NamedTuple

@@ -4,8 +4,6 @@ Format: the tables `topics` and `messages` of rosbag2_storage_sqlite3. Older bag
 those of the messages that are used are in `ros2_definitions`.
 """
 
-from __future__ import annotations
-
 import re
 import sqlite3
 from collections.abc import Collection, Iterator

@@ -1,7 +1,5 @@
 """`kiteline doctor --camera SOURCE`: watch cameras for some seconds, as an agent would."""
 
-from __future__ import annotations
-
 import re
 import time
 from collections.abc import Iterator
@@ -10,14 +8,12 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F32, U8
 from kiteline_core.frame import Frame
 from kiteline_hw.ports import FrameSource, is_live
 from kiteline_hw.sources.open import open_source
 from kiteline_lab.tools.checks.check import DoctorCheck, Severity
-
-U8 = NDArray[np.uint8]
 
 WATCH_S = 6.0  # s of images
 _PATIENCE_S = 15.0  # s until the first image
@@ -218,7 +214,7 @@ def edge_ratio(view: U8) -> float:
     return _steepness(image) / max(_steepness(np.asarray(half, np.float32)), 1e-6)
 
 
-def _steepness(image: NDArray[np.float32]) -> float:
+def _steepness(image: F32) -> float:
     """Mean gradient of the steepest hundredth of the pixels."""
     gradient = np.hypot(cv2.Scharr(image, cv2.CV_32F, 1, 0), cv2.Scharr(image, cv2.CV_32F, 0, 1))
     n = max(1, gradient.size // 100)

@@ -1,7 +1,5 @@
 """`kiteline doctor --mavlink URL`: check a flight controller."""
 
-from __future__ import annotations
-
 from kiteline_lab.tools.checks.check import DoctorCheck, Severity
 
 

@@ -1,7 +1,5 @@
 """Checks of the files of keys that seal packets: the user's own, and those that the services name."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Checks of the computer on a vehicle: time, disk, temperature, and what a Raspberry Pi says of its power."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Iterable
 from pathlib import Path

@@ -1,6 +1,4 @@
-"""`kiteline keys` at a base and at an agent."""
-
-from __future__ import annotations
+"""Keys and answers of the base's maps on the command line."""
 
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -8,8 +6,9 @@ from pathlib import Path
 import pytest
 
 from kiteline_core.ids import MAX_AGENTS
+from kiteline_hw.ports import LinkError
 from kiteline_hw.system.key_store import new_key, read_file
-from kiteline_lab.tools import keys
+from kiteline_lab.tools import keys, maps
 
 
 def test_a_base_that_pairs_before_its_first_start_has_the_keys_of_all(
@@ -46,3 +45,25 @@ def test_what_is_no_number_of_an_agent(agent: str, tmp_path: Path, capsys: pytes
     with pytest.raises(SystemExit):
         keys.main(["--file", str(tmp_path / "keys"), "pair", "--", agent])
     assert "no agent's number" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("asked_for", [["list"], ["--json", "list"]])
+@pytest.mark.parametrize(
+    "answer",
+    [(True, "<html>"), (False, "go away"), (False, "[]"), (True, "3"), (True, '{"maps": 3}'), (False, "{}"),
+     (True, '{"maps": [{"id": "0.0.0"}]}'), (True, "[" * 100_000)],
+)  # fmt: skip
+def test_an_answer_of_another_program_is_told_in_a_line(
+    answer: tuple[bool, str], asked_for: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(maps, "ask", lambda *_, **__: answer)
+    monkeypatch.setattr(maps, "default_path", lambda: Path("no keys"))
+    with pytest.raises(LinkError, match="answers"):
+        maps.main(asked_for)
+
+
+def test_options_may_follow_the_verb() -> None:
+    given = maps.parser().parse_args(["--base", "a", "--json", "get", "hangar", "--base", "b", "--key", "k"])
+    assert (given.base, given.key, given.json) == ("b", Path("k"), True)
+    given = maps.parser().parse_args(["--base", "a", "--key", "k", "list"])
+    assert (given.base, given.key, given.json) == ("a", Path("k"), False)

@@ -1,20 +1,17 @@
-"""The motion over a loss: the velocity after it corrects the IMU's error, and the deviations tell how far."""
-
-from __future__ import annotations
+"""Motion over a loss, motion between frames, and an IMU that falls silent."""
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from kiteline_agent.inertial.gravity_alignment import up_of
 from kiteline_agent.inertial.inertial_config import InertialConfig, StartDeviations
 from kiteline_agent.inertial.inertial_tracker import InertialTracker
 from kiteline_agent.motion.loss_motion import LossMotion, LossMotionEstimator, _largest
+from kiteline_agent.motion.recent_motion import RecentMotion
+from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuBatch, ImuCalibration
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
-
-F64 = NDArray[np.float64]
 
 CALIBRATION = ImuCalibration()
 CAMERA = RectifiedCamera(752, 480, 420.0, 420.0, 376.0, 240.0, 0.11, True, np.eye(4))
@@ -42,7 +39,6 @@ def flown(accel_error: F64, gap: int, seen: int) -> tuple[list[LossMotion], F64]
         true = VELOCITY * k * PERIOD_NS * 1e-9
         if k <= gap:
             state = tracker.dead_reckon(k * PERIOD_NS)
-            assert state is not None
             off = true - state.T_m_b[:3, 3]
         if k == gap:
             first = estimator.begin(k * PERIOD_NS, state.T_m_b, np.eye(3))
@@ -104,3 +100,28 @@ def test_up_is_that_of_the_state_and_as_certain() -> None:
 def test_a_deviation_is_never_none_at_all() -> None:
     """A record cannot tell a deviation of 0."""
     assert 0.0 < _largest(np.zeros((3, 3))) < 1e-5
+
+
+MS = 1_000_000
+
+
+def at(t_s: float) -> np.ndarray:
+    T = np.eye(4)
+    T[0, 3] = 1.5 * t_s**2  # 3 m/s^2
+    return T
+
+
+def test_it_is_of_the_instant_asked_for_but_looks_ahead_one_frame_at_most() -> None:
+    motion = RecentMotion()
+    for i in range(10):
+        motion.add(i * 50 * MS, at(0.05 * i), measured=True)
+    for ask_ms, t_s in ((450, 0.45), (480, 0.48), (500, 0.5), (900, 0.5)):
+        found = motion.rates(ask_ms * MS)
+        assert found[0] == pytest.approx([3.0 * t_s, 0.0, 0.0], abs=1e-6)
+
+
+def test_a_loss_forgets_the_motion() -> None:
+    motion = RecentMotion()
+    for i in range(5):
+        motion.add(i * 50 * MS, at(0.05 * i), measured=i != 3)
+    assert motion.rates(210 * MS) is None
