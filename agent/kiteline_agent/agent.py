@@ -105,7 +105,7 @@ class Agent:
         if self._has_depth and config.scan.on:
             self._scans = ScanStage(
                 self._camera, self._rectifier, self.map, maker, self._governor, channel, config.scan, config.ground,
-                self.work,
+                self.work, config.detector.covered_parts,
             )  # fmt: skip
         self._local_grid = LocalGrid(config.local_grid)
         self._loss = LossStage(

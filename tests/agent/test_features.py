@@ -1,13 +1,18 @@
 """Corners and descriptors: spread, repeatable, and the same as written plainly."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 
+from kiteline_agent.config import AgentConfig
 from kiteline_agent.imaging import corner_kernels, features
 from kiteline_agent.imaging import feature_kernels as kernels
 from kiteline_agent.imaging.features import DetectorConfig, build_pyramid, describe, detect
+from kiteline_core import config as configuration
 from kiteline_core.arrays import I32, I64, U8
+from kiteline_core.config import ConfigError
 
 
 def blobs(seed: int, turn_deg: float = 0.0) -> U8:
@@ -40,6 +45,27 @@ def test_one_corner_a_free_cell_strongest_first() -> None:
     again = detect(pyramid, taken, config)
     free = {tuple(c) for c in (taken // config.cell_px).astype(int)}
     assert not free & {tuple(c) for c in (again.uv // config.cell_px).astype(int)}
+
+
+def test_covered_parts_have_no_corners_and_the_rest_has_the_same() -> None:
+    pyramid, config = build_pyramid(blobs(1), 4), DetectorConfig()
+    h, w = pyramid[0].shape
+    covered = replace(config, covered=(0.0, 0.5, 0.25, 1.0, 0.9, 0.0, 1.0, 0.1))
+    every, left = (detect(pyramid, np.zeros((0, 2)), c).uv for c in (config, covered))
+    inside = ((left[:, 0] < 0.25 * w) & (left[:, 1] >= 0.5 * h)) | ((left[:, 0] >= 0.9 * w) & (left[:, 1] < 0.1 * h))
+    assert not inside.any()
+    cells = (every // config.cell_px).astype(int) * config.cell_px  # a cell is covered if a part of it is
+    free = ((cells[:, 0] >= 0.25 * w) | (cells[:, 1] + config.cell_px <= 0.5 * h)) & (
+        (cells[:, 0] + config.cell_px <= 0.9 * w) | (cells[:, 1] >= 0.1 * h)
+    )
+    assert 40 < free.sum() < len(every)
+    assert {tuple(uv) for uv in every[free]} == {tuple(uv) for uv in left}
+
+
+@pytest.mark.parametrize("covered", ["[0, 0.5, 0.25]", "[0, 0.5, 0.25, 1.5]", "[0.3, 0, 0.2, 1]", "[0, 0.5, 1, 0.5]"])
+def test_what_is_no_part_of_an_image_is_refused(covered: str) -> None:
+    with pytest.raises(ConfigError, match="covered: "):
+        configuration.load(AgentConfig(), f"[agent.detector]\ncovered = {covered}", "agent", "file")
 
 
 def test_flat_image_has_no_corner() -> None:

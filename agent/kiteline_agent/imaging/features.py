@@ -1,5 +1,6 @@
 """Image pyramids, corner detection spread over the image, and binary descriptors."""
 
+import math
 from dataclasses import dataclass
 
 import cv2
@@ -45,6 +46,18 @@ class DetectorConfig:
     min_score: float = 12.0  # (grey levels / px)^2; weaker corners are sensor noise
     faint_below: int = 100  # corners, existing ones included: with fewer, empty cells are searched for faint corners
     max_corners: int = 200  # new landmarks of a keyframe: what fits in 12 kB
+    covered: tuple[float, ...] = ()  # shares of the image: left, top, right, bottom of each part that shows the vehicle
+
+    def __post_init__(self) -> None:
+        if len(self.covered) % 4 or not all(0.0 <= share <= 1.0 for share in self.covered):
+            raise ValueError("covered: expected four numbers from 0 to 1 a part: left, top, right, bottom")
+        if any(left >= right or top >= bottom for left, top, right, bottom in self.covered_parts):
+            raise ValueError("covered: left and top of a part are less than right and bottom")
+
+    @property
+    def covered_parts(self) -> F64:
+        """Left, top, right, bottom (n,4) of the covered parts, in shares of the image."""
+        return np.reshape(self.covered, (-1, 4)).astype(np.float64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,10 +86,13 @@ def build_pyramid(image: U8, levels: int) -> Pyramid:
 
 
 def detect(pyramid: Pyramid, taken: F64, config: DetectorConfig) -> Corners:
-    """Detect the best corners of the cells without any of `taken` (n,2) level-0 px."""
+    """Detect the best corners of the cells without any of `taken` (n,2) level-0 px, and outside of covered parts."""
     h, w = pyramid[0].shape
     rows, columns = -(-h // config.cell_px), -(-w // config.cell_px)
-    occupied = np.zeros((rows, columns), np.bool_)
+    covered = np.zeros((rows, columns), np.bool_)
+    for left, top, right, bottom in config.covered_parts * [w, h, w, h] / config.cell_px:
+        covered[int(top) : math.ceil(bottom), int(left) : math.ceil(right)] = True
+    occupied = covered.copy()
     kernels.occupy(np.ascontiguousarray(taken), float(config.cell_px), occupied)
     best_score = np.zeros((rows, columns))
     best_xy = np.zeros((rows, columns, 2), np.int32)
@@ -95,7 +111,7 @@ def detect(pyramid: Pyramid, taken: F64, config: DetectorConfig) -> Corners:
             )
 
     search(config.fast_threshold, config.min_score)
-    if np.count_nonzero(occupied | (best_score > 0.0)) < config.faint_below:
+    if np.count_nonzero((occupied | (best_score > 0.0)) & ~covered) < config.faint_below:
         occupied |= best_score > 0.0
         noise = noise_of(pyramid[min(config.first, len(pyramid) - 1)])
         search(_FAINT_THRESHOLD, max(_FAINT_SCORE, _FAINT_NOISE * noise * noise))

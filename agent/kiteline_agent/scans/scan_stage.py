@@ -83,7 +83,9 @@ class ScanStage:
     def __init__(
         self, camera: CameraState, rectifier: Rectifier, local_map: LocalMap, maker: KeyframeMaker,
         governor: Governor, channel: RecordChannel, config: ScanConfig, ground: GroundConfig, work: Work,
+        covered: F64,
     ) -> None:  # fmt: skip
+        """covered: (n,4) left, top, right, bottom of parts that show no surroundings, in shares of the image."""
         self._camera = camera
         self._map = local_map
         self._maker = maker
@@ -95,6 +97,7 @@ class ScanStage:
         self._view = WideView(rectifier, replace(ground, wider=0.0, lower=0.0) if config.by_base else ground)
         self._segmenter = GroundSegmenter(self._view.camera, ground)
         self._stripes = DisparityStripes(self._segmenter.camera, ground) if local_map.camera.stereo else None
+        self._covered = self._covered_slices(covered)
         self._raw: tuple[U8, U8] | None = None  # images of the scan that was begun, until they are matched
         self._begun: _Begun | None = None
         self._last_T_o_c: F64 | None = None  # of the newest scan of another view
@@ -233,8 +236,23 @@ class ScanStage:
             part, T_k_s, uv = self._part, reference.T_k_c.copy(), np.empty((0, 2))
         self._begun = _Begun(reference.keyframe, part, T_k_s, up_c, T_o_c, uv, disparity, as_images=as_images)
 
+    def _covered_slices(self, covered: F64) -> tuple[tuple[slice, slice], ...]:
+        """Rows and columns of disparity images that show covered parts; what ends at a border ends at theirs."""
+        camera, seen = self._map.camera, self._segmenter.camera
+        slices = []
+        for left, top, right, bottom in covered:
+            corners = np.array([[left, top], [right, bottom]]) * [camera.width, camera.height]
+            rows, columns = seen.at(self._view.at(corners))
+            first_row, first_column = (0 if top <= 0.0 else rows[0]), (0 if left <= 0.0 else columns[0])
+            end_row = seen.height if bottom >= 1.0 else rows[1] + 1
+            end_column = seen.width if right >= 1.0 else columns[1] + 1
+            slices.append((slice(first_row, end_row), slice(first_column, end_column)))
+        return tuple(slices)
+
     def _finish(self, begun: _Begun, disparity: F32) -> Scanned:
         segmenter, stereo = self._segmenter, self._stripes is not None
+        for part in self._covered:
+            disparity[part] = 0.0
         seen = segmenter.segment(
             disparity, self._stripes.pair if self._stripes is not None else None, begun.up_c,
             self._map.disparity_offset * (segmenter.camera.bf / self._map.camera.bf) if stereo else None,

@@ -9,6 +9,7 @@ import pytest
 from kiteline_agent.agent import Agent
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.exchange.no_base import NoBaseChannel
+from kiteline_agent.imaging.features import DetectorConfig
 from kiteline_agent.scans import scan_queue
 from kiteline_agent.step import Identity, StepInput
 from kiteline_codec.schema import Key, KeyframeHeader, KeyframeScan, Record, messages
@@ -72,6 +73,25 @@ def test_a_scan_is_spread_over_frames_and_the_same_each_time(recording: Path) ->
     for scan in channel.scans:
         assert scan.keyframe in channel.keyframes
         assert (scan.scan.free_m >= scan.scan.free_from_m - 1e-9).all()
+
+
+def test_what_covers_the_view_is_neither_mapped_nor_scanned(recording: Path) -> None:
+    def covered(*part: float) -> tuple[Agent, Heard]:
+        agent, channel, _, _ = flown(recording, replace(eager(), detector=DetectorConfig(covered=part)))
+        return agent, channel
+
+    def seen_to_the_left(channel: Heard) -> bool:
+        return any(
+            (np.isfinite(s.scan.obstacle_m) | (s.scan.free_m > 0.0))[s.scan.azimuth0_rad
+             + s.scan.azimuth_step_rad * np.arange(len(s.scan.free_m)) > 0.1].any()
+            for s in channel.scans
+        )  # fmt: skip
+
+    (whole, every), (half, right) = covered(), covered(0.0, 0.0, 0.5, 1.0)
+    assert seen_to_the_left(every) and right.scans and not seen_to_the_left(right)
+    middle = 0.5 * half.map.camera.width
+    assert (whole.map.uv[whole.map.usable][:, 0] < middle).any()
+    assert half.map.usable.any() and (half.map.uv[half.map.usable][:, 0] >= middle).all()
 
 
 def test_a_slow_camera_matches_two_stripes_a_frame(recording: Path) -> None:
