@@ -4,6 +4,7 @@ Only argparse is loaded here, so that `kiteline --help` answers at once. Each su
 """
 
 import argparse
+import contextlib
 import difflib
 import errno
 import importlib
@@ -208,7 +209,8 @@ def run() -> None:
         signal.signal(number, _on_signal)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # a terminal in ASCII, a file name in another encoding
-            stream.reconfigure(errors="backslashreplace")
+            with contextlib.suppress(OSError):  # of a stream that has its place in a file no more
+                stream.reconfigure(errors="backslashreplace")
     status = main(sys.argv[1:])
     if status == _TERMINATED:
         _end(status)

@@ -166,8 +166,8 @@ def draw_free(
     rows, columns = hits.shape
     for i in range(ends.shape[0]):
         end = ends[i, 0], ends[i, 1], ends[i, 2]
-        low, clear = lows[i], clears[i] if camera_band >= 0 else 0.0
-        reach = max(end[0], end[1], end[2], low, clear, 0.0)
+        low, clear = max(lows[i], 0.0), max(clears[i], 0.0) if camera_band >= 0 else 0.0
+        reach = max(end[0], end[1], end[2], low, clear)
         if reach <= 0.0:
             continue
         begin2, start2, low2, clear2, sure2 = begins[i] ** 2, starts[i] ** 2, low * low, clear * clear, sures[i] ** 2
