@@ -38,6 +38,7 @@ _LEAST_PX = 0.2  # px, rms over the image; of an offset that is applied: good ca
 _MIN_SIDEWAYS = 0.2  # share of the motion across the optical axis below which errors of a lens pass for such
 _FORWARD_SHARE = 1.0 / 9.0  # of the information about a worn rig that is believed then: errors were three deviations
 _FORWARD_KEYFRAMES = 12  # that tell something of their own then; more of them repeat errors of lens and tracks
+_FORWARD_GOOD_KEYFRAMES = 3  # the same of a good calibration's offset, which is no larger than these errors are
 
 
 class DisparityAlignment:
@@ -237,13 +238,15 @@ class DisparityAlignment:
         What earlier flights found is dropped if the flight is likelier without it: the rig was repaired.
         """
         good = self._good
-        own = self._own_share()
-        h, b = own * (self._evicted_h + self._pair_h.sum(0)), own * (self._evicted_b + self._pair_b.sum(0))
-        beyond = b - h @ self.expected_px
-        good_cov = np.linalg.inv(h + good)
+        h, b = self._evicted_h + self._pair_h.sum(0), self._evicted_b + self._pair_b.sum(0)
+        own = self._own_share(_FORWARD_GOOD_KEYFRAMES)
+        beyond = own * (b - h @ self.expected_px)
+        good_cov = np.linalg.inv(own * h + good)
         self._good_estimate = self.expected_px + good_cov @ beyond
         is_larger = self._rms_px(np.outer(good_cov @ beyond, good_cov @ beyond)) > self._rms_px(good_cov)
-        self._good_is_known = is_larger and _log_evidence(h, beyond, good) > 0.0
+        self._good_is_known = is_larger and _log_evidence(own * h, beyond, good) > 0.0
+        own = self._own_share(_FORWARD_KEYFRAMES)
+        h, b = own * h, own * b
         log_odds = self._prior_log_odds
         if self._earlier_h.any() and self._moves_sideways():
             worn, usual = _log_evidence(h, b, self._prior), _log_evidence(h, b, good)
@@ -269,16 +272,16 @@ class DisparityAlignment:
         rows = 0.0 if self._moves_sideways() else self._row_evidence
         if _probability(self._log_odds + rows) < self._config.sure:
             return False
-        share = self._own_share() * self._believed_share()
+        share = self._own_share(_FORWARD_KEYFRAMES) * self._believed_share()
         h = share * (self._evicted_sure_h + np.einsum("s,sij->ij", self._share, self._pair_h)) + self._earlier_h
         b = share * (self._evicted_sure_b + self._share @ self._pair_b) + self._earlier_b
         odds = self._prior_log_odds + _log_evidence(h, b, self._prior) - _log_evidence(h, b, self._good)
         return _probability(odds + rows) >= self._config.sure
 
-    def _own_share(self) -> float:
-        """Share of the pairs' information that does not repeat the errors of other keyframes."""
+    def _own_share(self, most: int) -> float:
+        """Share of the pairs' information, if in forward motion no more than so many keyframes tell on their own."""
         keyframes = self._evicted + int(np.count_nonzero(self._score))
-        return 1.0 if self._moves_sideways() else min(1.0, _FORWARD_KEYFRAMES / max(keyframes, 1))
+        return 1.0 if self._moves_sideways() else min(1.0, most / max(keyframes, 1))
 
     def _believed_share(self) -> float:
         """Share of the pairs' information that counts where a worn rig is told from a good one."""
