@@ -240,11 +240,7 @@ class DisparityAlignment:
         good = self._good
         h, b = self._evicted_h + self._pair_h.sum(0), self._evicted_b + self._pair_b.sum(0)
         own = self._own_share(_FORWARD_GOOD_KEYFRAMES)
-        beyond = own * (b - h @ self.expected_px)
-        good_cov = np.linalg.inv(own * h + good)
-        self._good_estimate = self.expected_px + good_cov @ beyond
-        is_larger = self._rms_px(np.outer(good_cov @ beyond, good_cov @ beyond)) > self._rms_px(good_cov)
-        self._good_is_known = is_larger and _log_evidence(own * h, beyond, good) > 0.0
+        self._solve_good(own * h, own * b)
         own = self._own_share(_FORWARD_KEYFRAMES)
         h, b = own * h, own * b
         log_odds = self._prior_log_odds
@@ -263,6 +259,15 @@ class DisparityAlignment:
         self._log_odds = float(log_odds)
         self.worn = _probability(self._log_odds)
         self._set_rig_worn()
+
+    def _solve_good(self, h: F64, b: F64) -> None:
+        """Estimate the offset if the calibration is good: about the expected one, from information h (5,5), b (5,)."""
+        beyond = b - h @ self.expected_px
+        cov: F64 = np.asarray(np.linalg.inv(h + self._good), np.float64)
+        difference = cov @ beyond
+        self._good_estimate = self.expected_px + difference
+        is_larger = self._rms_px(np.outer(difference, difference)) > self._rms_px(cov)
+        self._good_is_known = bool(is_larger and _log_evidence(h, beyond, self._good) > 0.0)
 
     def _is_sure(self) -> bool:
         """True if the rig is worn though pairs tell less whose landmarks fit badly: some may be on people who walk.
