@@ -16,8 +16,7 @@ from kiteline_agent.initialisation.inertial_bundle import InertialBundle, lens_p
 from kiteline_agent.initialisation.inertial_window import WarmStart, WindowSolution
 from kiteline_agent.initialisation.landmark_realignment import realigned
 from kiteline_agent.initialisation.metric_restart import MetricPoints, metric_points_at
-from kiteline_agent.initialisation.vibration_levels import Vibration, vibration
-from kiteline_agent.initialisation.window_noise import LEAST, MOST, WindowNoise
+from kiteline_agent.initialisation.window_noise import LEAST, MOST, Vibration, WindowNoise, vibration
 from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_core.arrays import F64, I64
 from kiteline_core.frame import ImuCalibration

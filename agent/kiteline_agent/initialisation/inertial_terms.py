@@ -7,8 +7,7 @@ import numpy as np
 from kiteline_agent.inertial.preintegration import BiasPrior, Preintegrated, Samples, preintegrate
 from kiteline_agent.inertial_start_config import InertialBundleConfig
 from kiteline_agent.initialisation.inertial_window import WindowState, tangent
-from kiteline_agent.initialisation.vibration_levels import vibration
-from kiteline_agent.initialisation.window_noise import NoiseEvidence, WindowNoise
+from kiteline_agent.initialisation.window_noise import NoiseEvidence, WindowNoise, vibration
 from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry import se3
