@@ -282,12 +282,12 @@ class _Worker:
         self._corpus = read_corpus(_TESTS / "corpus")
         own = folder / str(os.getpid())
         own.mkdir()
-        self.doors = doors(own)
+        self._doors = doors(own)
         self._grown_mib = 0.0
 
     def round(self, number: int, inputs: int) -> FuzzResult:
         """Fuzz all doors with the seed of this round. grown_mib: in all rounds of this process."""
-        found = fuzz(self._corpus, self._values, inputs, seed=1 + number, others=self.doors, turns=TURNS)
+        found = fuzz(self._corpus, self._values, inputs, seed=1 + number, others=self._doors, turns=TURNS)
         self._grown_mib += found.grown_mib
         return replace(found, grown_mib=self._grown_mib)
 

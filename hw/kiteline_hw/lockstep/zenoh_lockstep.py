@@ -38,14 +38,13 @@ class LockstepClient(Closing):
         self._events: queue.SimpleQueue[tuple[str, int, bytes]] = queue.SimpleQueue()
         self._session = open_session(endpoint, "client", lease_ms=_LEASE_MS, connect_timeout_s=connect_timeout_s)
         try:
-            prefix = _PREFIX
             session_id = self._session.zid()
-            down, up = f"{prefix}/down/{agent}/{session_id}", f"{prefix}/up/{agent}/{session_id}"
+            down, up = f"{_PREFIX}/down/{agent}/{session_id}", f"{_PREFIX}/up/{agent}/{session_id}"
             self._subscriber = self._session.declare_subscriber(down, direct(self._on_answer))
             self._publisher = _publisher(self._session, up)
             liveliness = self._session.liveliness()
-            self._token = liveliness.declare_token(f"{prefix}/agent/{agent}/{session_id}")
-            self._watch = liveliness.declare_subscriber(f"{prefix}/base", direct(self._on_base), history=True)
+            self._token = liveliness.declare_token(f"{_PREFIX}/agent/{agent}/{session_id}")
+            self._watch = liveliness.declare_subscriber(f"{_PREFIX}/base", direct(self._on_base), history=True)
         except zenoh.ZError as error:
             close_session(self._session)
             raise LinkError(f"the link to {endpoint} broke while it was set up ({reason_of(error)})") from error
@@ -137,11 +136,10 @@ class LockstepServer(Closing):
         self.callback_errors = 0
         self._session = open_session(endpoint, "base", lease_ms=_LEASE_MS)
         try:
-            prefix = _PREFIX
             liveliness = self._session.liveliness()
-            self._watch = liveliness.declare_subscriber(f"{prefix}/agent/*/*", direct(self._on_agent), history=True)
-            self._subscriber = self._session.declare_subscriber(f"{prefix}/up/*/*", direct(self._on_message))
-            self._token = liveliness.declare_token(f"{prefix}/base")
+            self._watch = liveliness.declare_subscriber(f"{_PREFIX}/agent/*/*", direct(self._on_agent), history=True)
+            self._subscriber = self._session.declare_subscriber(f"{_PREFIX}/up/*/*", direct(self._on_message))
+            self._token = liveliness.declare_token(f"{_PREFIX}/base")
         except zenoh.ZError as error:
             close_session(self._session)
             raise LinkError(f"cannot set up the lock-step barrier on {endpoint}: {reason_of(error)}") from error
