@@ -87,7 +87,7 @@ class DisparityStripes:
         self._raw = np.empty((camera.height, camera.width + _PAD_PX), np.int16)
         self._most_px = config.disparities
         doubted = int(_DOUBTED * camera.width * camera.height)
-        self._errors = np.empty(camera.width, np.float32)
+        self._errors, self._search = np.empty(camera.width, np.float32), np.empty((4, camera.width), np.int32)
         self._doubted, self._better = np.empty(doubted, np.int32), np.empty(doubted, np.float32)
 
     def begin(self, left: U8, right: U8) -> None:
@@ -116,7 +116,7 @@ class DisparityStripes:
         disparity = unlocked(self._raw, _PAD_PX)
         assert self.pair is not None
         level_kernels.correct_thin_surfaces(
-            *self.pair, self._most_px, disparity, self._errors, self._doubted, self._better
+            *self.pair, self._most_px, disparity, self._errors, *self._search, self._doubted, self._better
         )
         return disparity
 

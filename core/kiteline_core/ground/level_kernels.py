@@ -27,46 +27,23 @@ def unlock(raw, first, table, out):  # type: ignore[no-untyped-def]
 
 
 @njit
-def correct_thin_surfaces(left, right, most_px, disparity, errors, doubted, better):  # type: ignore[no-untyped-def]
+def correct_thin_surfaces(left, right, most_px, disparity, errors, best, least, lowest, difference, doubted, better):  # type: ignore[no-untyped-def]
     """Replace disparities (h,w) in px of surfaces that are thinner than a matched block by those that the rows show.
 
     Semi-global matching gives such a surface the disparity of what lies behind. A disparity is in doubt where a row of
     2 _HALF_PX + 1 pixels does not fit, and a larger one, up to most_px, fits far better: it takes that one, or becomes
     unknown (0) if too few pixels around have it.
-    left, right: (h,w) uint8. errors: (w,) float32, doubted: (k,) int32, better: (k,) float32, for the kernel's own use.
-    At most k pixels are changed. Returns how many.
+    left, right: (h,w) uint8. errors: (w,) float32, best, least, lowest, difference: (w,) int32, doubted: (k,) int32,
+    better: (k,) float32, for the kernel's own use. At most k pixels are changed. Returns how many.
     """
     h, w = left.shape
-    wide, n = 2 * _HALF_PX + 1, 0
+    n = 0
     for v in range(h):
-        for u in range(w):
-            d = disparity[v, u]
-            errors[u] = np.float32(0.0)
-            if d > 0.0:
-                at = np.float32(u) - d
-                i = int(np.floor(at))
-                if i >= 0 and i + 1 < w:
-                    part = at - np.float32(i)
-                    a, b = np.float32(right[v, i]), np.float32(right[v, i + 1])
-                    errors[u] = abs(np.float32(left[v, u]) - (a + part * (b - a)))
-        for u in range(_HALF_PX, w - _HALF_PX):
-            d = disparity[v, u]
-            error = np.float32(0.0)
-            for k in range(u - _HALF_PX, u + _HALF_PX + 1):
-                error += errors[k]
-            if d <= 0.0 or error <= _LEAST_ERROR * wide:
-                continue
-            least, best = np.float64(_BETTER * error), -1
-            for q in range(int(d + _NEARER_PX) + 1, min(most_px, u - _HALF_PX + 1)):
-                other = np.int64(0)
-                for k in range(u - _HALF_PX, u + _HALF_PX + 1):
-                    other += abs(np.int64(left[v, k]) - np.int64(right[v, k - q]))
-                    if other >= least:
-                        break
-                if other < least:
-                    least, best = np.float64(other), q
-            if best >= 0 and n < len(doubted):
-                doubted[n], better[n] = v * w + u, best
+        _errors_of_row(left[v], right[v], disparity[v], errors)
+        first, last = _search_row(left[v], right[v], most_px, disparity[v], errors, best, least, lowest, difference)
+        for u in range(first, last + 1):
+            if best[u] >= 0 and n < len(doubted):
+                doubted[n], better[n] = v * w + u, best[u]
                 n += 1
     for k in range(n):
         disparity[doubted[k] // w, doubted[k] % w] = better[k]
@@ -81,6 +58,53 @@ def correct_thin_surfaces(left, right, most_px, disparity, errors, doubted, bett
         if doubted[k] < 0:
             disparity[(-1 - doubted[k]) // w, (-1 - doubted[k]) % w] = 0.0
     return n
+
+
+@helper
+def _errors_of_row(left, right, disparity, errors):  # type: ignore[no-untyped-def]
+    """Differences (w,) in grey levels of a row of the left image from the right one, by disparities (w,) in px."""
+    for u in range(len(left)):
+        d = disparity[u]
+        errors[u] = np.float32(0.0)
+        if d > 0.0:
+            at = np.float32(u) - d
+            i = int(np.floor(at))
+            if i >= 0 and i + 1 < len(left):
+                part = at - np.float32(i)
+                a, b = np.float32(right[i]), np.float32(right[i + 1])
+                errors[u] = abs(np.float32(left[u]) - (a + part * (b - a)))
+
+
+@helper
+def _search_row(left, right, most_px, disparity, errors, best, least, lowest, difference):  # type: ignore[no-untyped-def]
+    """The larger disparity that fits a row best at each pixel whose disparity is in doubt.
+
+    best: (w,) out, that disparity in px, -1 where none fits far better. Returns the first and the last pixel in
+    doubt; none if the first is not below the last. All disparities of a row are searched together in loops
+    without branches, of which the compiler takes several pixels at a time; so the sum over _HALF_PX is written out.
+    """
+    w = len(left)
+    first, last, begin_q = w, -1, most_px
+    for u in range(_HALF_PX, w - _HALF_PX):
+        error = np.float32(0.0)
+        for k in range(u - _HALF_PX, u + _HALF_PX + 1):
+            error += errors[k]
+        best[u], least[u], lowest[u] = -1, 0, most_px
+        if disparity[u] > 0.0 and error > _LEAST_ERROR * (2 * _HALF_PX + 1):
+            least[u] = int(np.ceil(_BETTER * error))
+            lowest[u] = int(disparity[u] + _NEARER_PX) + 1
+            first, last, begin_q = min(first, u), u, min(begin_q, lowest[u])
+    for q in range(begin_q, most_px):
+        begin = max(first, q + _HALF_PX)
+        for k in range(begin - _HALF_PX, last + _HALF_PX + 1):
+            difference[k] = abs(np.int32(left[k]) - np.int32(right[k - q]))
+        for u in range(begin, last + 1):
+            other = difference[u - 4] + difference[u - 3] + difference[u - 2] + difference[u - 1] + difference[u]
+            other += difference[u + 1] + difference[u + 2] + difference[u + 3] + difference[u + 4]
+            is_better = (other < least[u]) & (q >= lowest[u])
+            least[u] = other if is_better else least[u]
+            best[u] = q if is_better else best[u]
+    return first, last
 
 
 @helper
