@@ -18,13 +18,20 @@ from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import SubmapId
 
+_LEAST_M_S2 = 0.1  # of a specific force that points anywhere
 _ATTITUDE_TILT = np.array([0, 1, 2, 15, 16])  # in the covariance of a state
 AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # R_m_c of a level camera that looks along x
 
 
 def level_rotation(accel: F64) -> F64:
-    """R_m_b (3,3) with z up and yaw zero, from the mean specific force (3,) in the body, which points up at rest."""
-    up = accel / np.linalg.norm(accel)
+    """R_m_b (3,3) with z up and yaw zero, from the mean specific force (3,) in the body, which points up at rest.
+
+    1 if there is next to none: a sensor that gives zeros tells no vertical.
+    """
+    force_m_s2 = float(np.linalg.norm(accel))
+    if not force_m_s2 > _LEAST_M_S2:
+        return np.eye(3)
+    up = accel / force_m_s2
     z = np.array([0.0, 0.0, 1.0])
     axis = np.cross(up, z)
     s, c = float(np.linalg.norm(axis)), float(up @ z)
@@ -63,6 +70,10 @@ class GravityAligner:
     def R_l_o(self) -> F64 | None:
         """(3,3) that gravity-aligns the odometry frame, constant once known; None before."""
         return self._R_l_o
+
+    def forget(self) -> None:
+        """The vertical came from an IMU that contradicts the images: it is not known in this flight."""
+        self._inertial, self._R_l_o = None, None
 
     def first_pose(self, imu: ImuBatch | None) -> F64:
         """T_m_c of the first keyframe: body at the origin, z up by the accelerometer, else for a level camera."""

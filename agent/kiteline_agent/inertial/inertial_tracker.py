@@ -141,6 +141,16 @@ class InertialTracker:
             events.append(f"camera stamps + {found:.1f} ms are the IMU's time (deviation {sigma:.1f} ms)")
         return events
 
+    @property
+    def contradicts_images(self) -> bool:
+        """SelfCalibration.contradicts."""
+        return self._self_calibration.contradicts
+
+    @property
+    def is_proved(self) -> bool:
+        """SelfCalibration.is_proved."""
+        return self._self_calibration.is_proved
+
     def begin_with(self, known: KnownImuConfig) -> None:
         """Begin with what earlier flights found of the IMU."""
         self._self_calibration.begin_with(known)

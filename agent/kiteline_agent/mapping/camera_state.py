@@ -71,6 +71,8 @@ class CameraState:
     def fuse(self, ctx: FrameContext, track: Track) -> tuple[Track, list[str]]:
         """The track with the pose that images, IMU and odometer give together, and events."""
         fused = self.motion.fuse(track, ctx.t_ns)
+        if self.motion.has_false_vertical:
+            self.gravity.forget()
         if self.motion.tracker is not None:
             self.covariance.update_imu_offset(track.T_c_m, fused.T_c_m)
             self.covariance.set_camera_rotation(self.motion.tracker.camera_rotation_rad)

@@ -27,6 +27,11 @@ from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import KeyframeId
 
+_CONTRADICTS = (
+    "imu: contradicts the images and is not used any more in this flight, the images alone carry the pose: check the "
+    "camera's place in the IMU's axes (T_BS), the time offset and the units (rad/s, m/s^2)"
+)
+_NO_VERTICAL = "imu: the vertical is not known: a flight controller gets no poses, and no ground is found"
 _MOST_UP_RAD = 0.2  # deviation of a direction of gravity that is of use
 
 
@@ -63,6 +68,7 @@ class MotionModel:
         self.odometer = Odometer(camera.T_b_c, odometer, metric=metric)
         self._watch = ImuWatch(config.silent_s, config.gravity_m_s2)
         self._events: list[str] = []
+        self.has_false_vertical = False  # it came from an IMU that never agreed with the images
 
     @property
     def running(self) -> bool:
@@ -134,10 +140,19 @@ class MotionModel:
             state = self.tracker.update(t_ns, T_m_b, points, velocity)
             if self._steps is not None and self.tracker.metric and state is not None:
                 self._steps.see(t_ns, T_m_b, self.tracker)
+            if self._metric and self.tracker.contradicts_images:
+                self._leave_imu(self.tracker)
+                state = None
         if state is not None:
             track = replace(track, T_c_m=se3.inverse(state.T_m_b @ self._T_b_c))
         self.odometer.update(se3.inverse(track.T_c_m), t_ns)
         return track
+
+    def _leave_imu(self, tracker: InertialTracker) -> None:
+        """Fly on by images that measure distances themselves."""
+        self.has_false_vertical = not tracker.is_proved
+        self.tracker = self.loss_motion = None
+        self._events += [_CONTRADICTS, _NO_VERTICAL] if self.has_false_vertical else [_CONTRADICTS]
 
     def take_steps(self, keyframe: KeyframeId, t_ns: int) -> InertialSteps | None:
         """The steps from the keyframe before to a new one of this frame; None if the base cannot use them."""

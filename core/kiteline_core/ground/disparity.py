@@ -115,9 +115,11 @@ class DisparityStripes:
         self._padded = None
         disparity = unlocked(self._raw, _PAD_PX)
         assert self.pair is not None
+        best, least, lowest, difference = self._search
         level_kernels.correct_thin_surfaces(
-            *self.pair, self._most_px, disparity, self._errors, *self._search, self._doubted, self._better
-        )
+            *self.pair, self._most_px, disparity, self._errors, best, least, lowest, difference,
+            self._doubted, self._better,
+        )  # fmt: skip
         return disparity
 
     def learn_brightness(self, disparity: F32) -> None:

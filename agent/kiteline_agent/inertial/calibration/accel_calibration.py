@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from kiteline_agent.inertial.calibration.disagreement import Disagreement
 from kiteline_agent.inertial.calibration.robust_update import AxesFilter, robust_update
 from kiteline_agent.inertial.calibration.window import Window
 from kiteline_core.arrays import F64
@@ -21,8 +22,11 @@ class AccelCalibration(AxesFilter):
 
     BIAS = _BIAS
 
-    def __init__(self, axes_sigma: F64, scale_sigma: float, walk_m_s3: float, gravity_m_s2: float) -> None:
+    def __init__(
+        self, axes_sigma: F64, scale_sigma: float, walk_m_s3: float, gravity_m_s2: float, disagreement: Disagreement
+    ) -> None:  # fmt: skip
         """axes_sigma (9,), scale_sigma: of the calibration. walk_m_s3: of the bias, per sqrt(s)."""
+        self.disagreement = disagreement
         self._gravity_m_s2 = gravity_m_s2
         self._x = np.zeros(16)
         others = np.repeat([_BIAS_M_S2, _TILT_RAD, scale_sigma], [3, 3, 1])
@@ -81,6 +85,7 @@ class AccelCalibration(AxesFilter):
         fallen = 0.5 * (dt[0] + dt[1]) * self._gravity
         x = self._x
         error = (1.0 + x[_SCALE]) * moved - lever - fallen - force @ self.matrix.ravel() + time @ x[_BIAS]
+        self.disagreement.add(moved, error, variance, dt[1])
         j = np.empty((3, 16))  # of the negative error
         j[:, _AXES], j[:, _BIAS], j[:, _TILT], j[:, _SCALE] = force, -time, -se3.skew(fallen), -moved
         self._cov[np.diag_indices(16)] += self._walk * dt[1]

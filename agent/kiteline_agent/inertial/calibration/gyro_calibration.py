@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from kiteline_agent.inertial.calibration.disagreement import Disagreement
 from kiteline_agent.inertial.calibration.robust_update import AxesFilter, robust_update
 from kiteline_agent.inertial.calibration.window import Window
 from kiteline_core.arrays import F64
@@ -21,8 +22,11 @@ class GyroCalibration(AxesFilter):
 
     BIAS = _BIAS
 
-    def __init__(self, axes_sigma: F64, offset_sigma_s: float, offset_s: float, walk_rad_s2: float) -> None:
+    def __init__(
+        self, axes_sigma: F64, offset_sigma_s: float, offset_s: float, walk_rad_s2: float, disagreement: Disagreement
+    ) -> None:  # fmt: skip
         """axes_sigma (9,), offset_sigma_s: of the calibration. offset_s: calibrated. walk_rad_s2: of the bias."""
+        self.disagreement = disagreement
         self._x = np.zeros(13)
         self._x[_OFFSET] = offset_s
         self._cov = np.diag(np.concatenate([axes_sigma, [offset_sigma_s], np.full(3, _BIAS_RAD_S)]) ** 2)
@@ -57,7 +61,9 @@ class GyroCalibration(AxesFilter):
         j[:, _AXES] = back @ window.by_rate
         j[:, _OFFSET] = window.last_rate - back @ window.first_rate
         j[:, _BIAS] = -back @ window.time[0]
-        error = se3.so3_log(back @ R_b0_b1) - j[:, _OFFSET] * (self._x[_OFFSET] - offset_s)
+        turned = se3.so3_log(back @ R_b0_b1)
+        self.disagreement.add(se3.so3_log(R_b0_b1), turned, turn_variance, window.duration_s)
+        error = turned - j[:, _OFFSET] * (self._x[_OFFSET] - offset_s)
         self._cov[np.diag_indices(13)] += self._walk * window.duration_s
         update = robust_update(j, self._cov, error, turn_variance)
         self._count_excess(update.square)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from kiteline_agent.inertial.calibration.accel_calibration import AccelCalibration
+from kiteline_agent.inertial.calibration.disagreement import Disagreement
 from kiteline_agent.inertial.calibration.gyro_calibration import GyroCalibration
 from kiteline_agent.inertial.calibration.known_imu import KnownImuConfig, is_plausible, known_axes
 from kiteline_agent.inertial.calibration.pose_chain import Link, PoseChain
@@ -21,6 +22,11 @@ from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry import se3
 
+# Of gyro and accelerometer: time constant in s; squared motion of a few windows, in rad^2 and (m/s)^2; squared errors
+# over squared motion that no calibrated IMU has; bias in rad/s and m/s^2 that none has. Errors of real and of worn IMUs
+# reach 0.001 and 0.06; a camera turned by 20 degrees 0.04, a dead accelerometer 0.4.
+_TURNS_COMPARED = 1.5, 0.03, 0.03, 0.4
+_FORCES_COMPARED = 3.0, 0.1, 0.25, 1.0
 _KEPT = 0.25  # share of a window's added variance that the next has at least: the map that was dragged is still seen
 
 
@@ -79,16 +85,22 @@ class SelfCalibration:
         self._gyro_matrix, self._accel_matrix = np.eye(3), np.eye(3)  # applied to samples
         self._gyro_windows = 0  # in a row after which the gyro's axes differed significantly
         self._corrects_offset = self._corrects_gyro = self._corrects_accel = False
+        self.is_proved = False  # both sensors have agreed with the images, over turns
         self.camera_rotation_rad = 0.0  # against the gyro, rms as expected
         self._events: list[str] = []
 
     def _unknown_gyro(self) -> GyroCalibration:
         c = self._config
-        return GyroCalibration(c.axes_sigma, c.offset_sigma_s, c.offset_s, self._calibration.gyro_walk)
+        return GyroCalibration(
+            c.axes_sigma, c.offset_sigma_s, c.offset_s, self._calibration.gyro_walk, Disagreement(*_TURNS_COMPARED)
+        )  # fmt: skip
 
     def _unknown_accel(self) -> AccelCalibration:
         c = self._config
-        return AccelCalibration(c.axes_sigma, c.scale_sigma, self._calibration.accel_walk, self._gravity_m_s2)
+        return AccelCalibration(
+            c.axes_sigma, c.scale_sigma, self._calibration.accel_walk, self._gravity_m_s2,
+            Disagreement(*_FORCES_COMPARED),
+        )  # fmt: skip
 
     def begin_with(self, known: KnownImuConfig) -> None:
         """Begin with what earlier flights found, as a prior; it is dropped if the flight refutes it: after repairs."""
@@ -139,6 +151,11 @@ class SelfCalibration:
             "camera_rotation_deg": np.degrees(_measured(self.gyro.matrix)[1]).round(3).tolist(),
             "image_scale": [round(value, 5) for value in self.accel.scale],
         }
+
+    @property
+    def contradicts(self) -> bool:
+        """True if images and IMU measure other motions: no error of a calibrated IMU explains that."""
+        return self.gyro.disagreement.contradicts or self.accel.disagreement.contradicts
 
     def take_events(self) -> list[str]:
         """A line for the log for each sensor whose correction began."""
@@ -198,6 +215,8 @@ class SelfCalibration:
                 self._test_accel()
             elif move:
                 self._before = None
+        turns, forces = self.gyro.disagreement, self.accel.disagreement
+        self.is_proved |= turns.agrees and turns.moves and forces.agrees
         self._follow_offset(dt_s)
         return self._follow_axes(buffer, dt_s)
 
