@@ -80,6 +80,15 @@ class Recording:
             items.append(replace(item, odometry=part))
         return replace(self, items=tuple(items))
 
+    def with_imu(self, samples: ImuBatch) -> "Recording":
+        """The recording with these inertial samples in place of its own; those before its first frame go with it."""
+        items, first = [], 0
+        for item in self.items:
+            last = int(np.searchsorted(samples.t_ns, item.frame.t_ns, side="right"))
+            items.append(replace(item, imu=_rows(samples, first, last) if last > first else None))
+            first = last
+        return replace(self, items=tuple(items))
+
     def between_rests(self) -> "Recording":
         """The longest part between two moments at which the vehicle hardly moves: it can be flown to and fro."""
         truth = self.truth
@@ -100,20 +109,16 @@ class Recording:
         """
         sum_ns = self.items[0].frame.t_ns + self.items[-1].frame.t_ns
         samples = joined([item.imu for item in self.items if item.imu is not None])
-        items, first = list[Item](), 0
+        items = list[Item]()
         if samples is not None:
             samples = ImuBatch(
                 np.ascontiguousarray(sum_ns - samples.t_ns[::-1]), np.ascontiguousarray(-samples.gyro[::-1]),
                 np.ascontiguousarray(samples.accel[::-1]),
             )  # fmt: skip
         for item in reversed(self.items):
-            stamp, imu = sum_ns - item.frame.t_ns, None
-            if samples is not None:
-                last = int(np.searchsorted(samples.t_ns, stamp, side="right"))
-                imu = _rows(samples, first, last) if last > first else None
-                first = last
-            items.append(Item(replace(item.frame, t_ns=stamp), imu, T_w_b=item.T_w_b))
-        return replace(self, items=tuple(items))
+            items.append(Item(replace(item.frame, t_ns=sum_ns - item.frame.t_ns), T_w_b=item.T_w_b))
+        turned = replace(self, items=tuple(items))
+        return turned if samples is None else turned.with_imu(samples)
 
     def to_and_fro(self, frames: int) -> Iterator[Item]:
         """So many items, played forward and backward in turn, with stamps that go on.

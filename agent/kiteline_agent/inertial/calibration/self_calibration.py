@@ -24,9 +24,9 @@ from kiteline_core.geometry import se3
 
 # Of gyro and accelerometer: time constant in s; squared motion of a few windows, in rad^2 and (m/s)^2; squared errors
 # over squared motion that no calibrated IMU has; bias in rad/s and m/s^2 that none has. Errors of real and of worn IMUs
-# reach 0.001 and 0.06; a camera turned by 20 degrees 0.04, a dead accelerometer 0.4.
+# reach 0.001 and 0.08; a camera turned by 20 degrees 0.04, a dead accelerometer 0.3.
 _TURNS_COMPARED = 1.5, 0.03, 0.03, 0.4
-_FORCES_COMPARED = 3.0, 0.1, 0.25, 1.0
+_FORCES_COMPARED = 3.0, 0.3, 0.25, 1.0
 _KEPT = 0.25  # share of a window's added variance that the next has at least: the map that was dragged is still seen
 
 
