@@ -59,7 +59,7 @@ def _with_real_imu(bench: Bench) -> Recording:
     path = bench.source(f"trajectories/{_PATH}")
     begin_s = float(np.loadtxt(path, max_rows=1)[0])
     start_s = samples.t_ns[0] / _SECOND_NS - begin_s
-    command = ["hall", "--trajectory", path, "--start", f"{start_s:.6f}", "--seconds", f"{_SECONDS:g}", "--seed",
+    command = ["hall?rest=0", "--trajectory", path, "--start", f"{start_s:.6f}", "--seconds", f"{_SECONDS:g}", "--seed",
                f"{_SEED}"]  # fmt: skip
     rendered = load(str(render(bench, "real_imu_hall", command)[0]))
     shift_ns = rendered.items[0].frame.t_ns - round((begin_s + round(start_s, 6)) * _SECOND_NS)
