@@ -3,6 +3,7 @@
 Agent._process is the algorithm of one frame; its numbered steps are those of ARCHITECTURE.md.
 """
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,8 @@ import numpy as np
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.exchange.corrections import Corrections
 from kiteline_agent.governor.cost_model import Work
-from kiteline_agent.governor.governor import FULL, Extra, Governor, governed
+from kiteline_agent.governor.effort import FULL, governed
+from kiteline_agent.governor.governor import Extra, Governor
 from kiteline_agent.image_cells import with_cells_for
 from kiteline_agent.initialisation.inertial_start import InertialStart
 from kiteline_agent.initialisation.two_view_start import TwoViewStart
@@ -79,13 +81,12 @@ class Agent:
         self._image_shift = ImageShift(self._rectifier)
         self._stuck_camera = StuckCamera(camera)
         self._relocaliser = Relocaliser(
-            self.map, self._tracker, config, vocabulary, self.map_cache, self._is_consistent_place, self.work
-        )
+            self.map, self._tracker, config, vocabulary, self.map_cache,
+            partial(self._camera.is_consistent, relocalised=True), self.work,
+        )  # fmt: skip
         self.right_camera = None
         if rig.right is not None:
-            self.right_camera = RightCamera(
-                identity.agent, self._camera, self.map, self._rectifier, config, channel
-            )  # fmt: skip
+            self.right_camera = RightCamera(identity.agent, self._camera, self.map, self._rectifier, config, channel)
         self._corrections = Corrections(
             self.map, self.map_cache, config.smoothing,
             None if self.right_camera is None else self.right_camera.take_base, config.local_grid.tiles,
@@ -95,8 +96,10 @@ class Agent:
         self._keyframes = KeyframeStage(self._camera, maker, self._relocaliser, self._governor, channel, self.work)
         self._depth = DepthFromMotion(self.map, config, self.work)
         self._two_view_start = None if self._has_depth else TwoViewStart(camera, config, self.work)
-        inertial_start = None if self._has_depth or imu is None else InertialStart(camera, imu, config, self.work)
-        self._inertial_start = inertial_start
+        self._inertial_start = inertial_start = (
+            None if self._has_depth or imu is None
+            else InertialStart(camera, imu, config, self.work, self._governor.may_solve)
+        )  # fmt: skip
         self._submaps = SubmapStage(
             self._camera, self.map, self._tracker, maker, self._keyframes, self._relocaliser, self._depth,
             self._two_view_start, inertial_start, self._governor, channel, self._rectifier,
@@ -132,34 +135,51 @@ class Agent:
         events = self._take_corrections(self._channel.receive(step_input.packets, now_ns))
         self._camera.motion.add_odometry(step_input.odometry)
         estimate = predicted = None
+        if step_input.imu is not None:
+            self._skipped_imu.append(step_input.imu)
         if step_input.frame is not None:
-            tracked, more = self._govern(step_input.frame.t_ns, step_input)
+            tracked, more = self._govern(step_input.frame, step_input)
             events += more
             if tracked:
-                imu, self._skipped_imu = joined(self._skipped_imu), []
-                self.work.inertial_samples = 0 if imu is None else len(imu.t_ns)
-                estimate, more = self._process(step_input.frame, imu)
+                estimate, more = self._process_next(step_input.frame)
                 events += more
             elif self._full_config.governor.cpu_percent >= self._full_config.prediction.least_cpu_percent:
                 predicted = self.predict(step_input.frame.t_ns)
-        else:
-            if step_input.imu is not None:
-                self._skipped_imu.append(step_input.imu)
-            if step_input.predict_ns is not None:
-                predicted = self.predict(step_input.predict_ns)
+        elif step_input.predict_ns is not None:
+            predicted = self.predict(step_input.predict_ns)
         return StepOutput(estimate, tuple(self._channel.poll(now_ns)), tuple(events), predicted)
 
     def predict(self, t_ns: int) -> PredictedPose | None:
         """The pose at a time after the last processed frame; None before there is a map, and too long after it."""
-        return self._report.predict(t_ns, joined(self._skipped_imu), self._full_config.prediction.max_s)
+        waits = self._inertial_start is not None and len(self._inertial_start.waiting) > 0
+        return (
+            None if waits else self._report.predict(t_ns, joined(self._skipped_imu), self._full_config.prediction.max_s)
+        )
+
+    def _process_next(self, newest: Frame) -> tuple[Estimate | None, list[str]]:
+        """Process the newest frame, or what waits before it. Returns the newest frame's estimate, and events."""
+        start = self._inertial_start
+        if start is None or not len(start.waiting):
+            imu, self._skipped_imu = joined(self._skipped_imu), []
+            return self._process(newest, imu)
+        if start.solving:
+            ctx, outcome = self._loss.continue_start()
+            if ctx is not None:
+                self._finish(ctx, outcome)
+            return None, outcome.events
+        frame, imu = start.waiting.next_to_track() if self._camera.submaps.any else start.waiting.next()
+        estimate, events = self._process(frame, imu)
+        return estimate if frame is newest else None, events
 
     def _process(self, frame: Frame, imu: ImuBatch | None) -> tuple[Estimate, list[str]]:
         """The algorithm of one frame. Returns the estimate and events."""
+        self.work.inertial_samples = 0 if imu is None else len(imu.t_ns)
         camera, config, has_map = self._camera, self._config, self._camera.submaps.any
         # 1. Build the images' pyramids.
         first = config.pyramid.first if has_map and self._loss.failed_searches == 0 else 0
         images = frame_images(frame, self._rectifier, config.pyramid, first, self.map.offset_px)
-        self._count_images(frame)
+        self.work.frames = 1
+        self.work.pyramid_px += frame.left.size * (2 if frame.right is not None and config.stereo.points else 1)
         # 2. Predict the pose: from the IMU, else an odometer, else the last motion.
         dt_s = 0.0 if self._last_t_ns is None else (frame.t_ns - self._last_t_ns) * 1e-9
         T_m_c = camera.predict(frame.t_ns, dt_s, imu)
@@ -213,15 +233,19 @@ class Agent:
             outcome.events.extend(self.right_camera.share_rows())
         self.work.rectified_px += images.rectified_px
         # 9. Report the pose.
-        self._was_lost = not outcome.tracked or outcome.bridged
-        if not self._was_lost:
-            self._image_shift.remember(images.sampled, camera.pose.T_c_m)
-        self._last_t_ns = frame.t_ns
-        self._placed_ns = frame.t_ns if outcome.tracked else self._placed_ns
-        self._last_track = None if self._was_lost or self.submap != submap else track
-        return self._report.report(ctx, outcome), outcome.events
+        self._last_track = None if not outcome.tracked or outcome.bridged or self.submap != submap else track
+        return self._finish(ctx, outcome), outcome.events
 
     # stages of a frame
+
+    def _finish(self, ctx: FrameContext, outcome: FrameOutcome) -> Estimate:
+        """Note how a frame ended, and report its pose."""
+        self._was_lost = not outcome.tracked or outcome.bridged
+        if not self._was_lost:
+            self._image_shift.remember(ctx.images.sampled, self._camera.pose.T_c_m)
+        self._last_t_ns = ctx.t_ns
+        self._placed_ns = ctx.t_ns if outcome.tracked else self._placed_ns
+        return self._report.report(ctx, outcome)
 
     def _shutter(self, t_ns: int, dt_s: float) -> RollingShutter | None:
         """The rolling shutter's motion in a frame; None for a global shutter, and while the motion is unknown."""
@@ -246,10 +270,8 @@ class Agent:
             track = self._retry_with_image_shift(ctx, track)
         if not track.holds(config) and track.inliers >= config.min_inliers and self._governor.may(Extra.SEARCH):
             track = self._retry_with_descriptors(ctx, track)
-        submap = self._camera.submaps.active
-        if track.inliers < config.min_inliers or not self._camera.is_consistent(
-            ctx, track.T_c_m, submap, relocalised=False
-        ):
+        consistent, submap = self._camera.is_consistent, self._camera.submaps.active
+        if track.inliers < config.min_inliers or not consistent(ctx, track.T_c_m, submap, relocalised=False):
             return None
         return self._tracker.nearer(ctx, track) if by_imu and near is None else track
 
@@ -267,9 +289,6 @@ class Agent:
         if found is None or found.submap != self._camera.submaps.active or found.track.inliers < track.inliers:
             return track
         return found.track
-
-    def _is_consistent_place(self, ctx: FrameContext, T_c_m: F64, submap: SubmapId) -> bool:
-        return self._camera.is_consistent(ctx, T_c_m, submap, relocalised=True)
 
     def _align_gravity(self, ctx: FrameContext) -> list[str]:
         """Tell the base how the first submap is tilted, once that is known. Returns events."""
@@ -299,23 +318,26 @@ class Agent:
 
     def _forget_scans(self, ctx: FrameContext, outcome: FrameOutcome) -> None:
         """Forget the obstacles of scans once the motion of the vehicle has been unknown for too long."""
-        if outcome.bridged or self._placed_ns is None:
-            return
-        if ctx.t_ns - self._placed_ns > self._full_config.local_grid.lost_s * 1e9:
+        lost_ns = 0 if outcome.bridged or self._placed_ns is None else ctx.t_ns - self._placed_ns
+        if lost_ns > self._full_config.local_grid.lost_s * 1e9:
             self._local_grid.forget()
             if self._scans is not None:
                 self._scans.forget()
 
-    def _govern(self, t_ns: int, step_input: StepInput) -> tuple[bool, list[str]]:
-        """Set the effort that the governor chooses, and buffer the step's IMU samples.
+    def _govern(self, frame: Frame, step_input: StepInput) -> tuple[bool, list[str]]:
+        """Set the effort that the governor chooses. Returns whether to process a frame, and events.
 
-        Returns whether to track the frame, and events.
+        Under a budget, frames wait for the start of a monocular map.
         """
-        if step_input.imu is not None:
-            self._skipped_imu.append(step_input.imu)
-        decision = self._governor.frame(
-            t_ns, step_input.cpu_ns, lost=self._loss.failed_searches > 0, carried=self._camera.motion.running
-        )
+        t_ns, start = frame.t_ns, self._inertial_start
+        starting = start is not None and not self._camera.submaps.any and not self._camera.motion.odometer.has_samples
+        if start is not None and self._governor.on and (starting or len(start.waiting)):
+            start.waiting.add(frame, joined(self._skipped_imu))
+            self._skipped_imu = []
+            if starting:
+                return self._governor.start_frame(t_ns, step_input.cpu_ns, solving=start.solving, idle=start.idle), []
+        lost, carried = self._loss.failed_searches > 0, self._camera.motion.running
+        decision = self._governor.frame(t_ns, step_input.cpu_ns, lost=lost, carried=carried)
         if decision.effort != self._effort:
             self._effort, before = decision.effort, self._config
             self._config = governed(self._full_config, decision.effort)
@@ -335,11 +357,6 @@ class Agent:
             self._camera.follow_corrections(None if anchor is None else anchor.motion())
         self.work.posed_points += 0 if anchor is None else anchor.posed_points
         return events
-
-    def _count_images(self, frame: Frame) -> None:
-        self.work.frames = 1
-        pair = frame.right is not None and self._config.stereo.points
-        self.work.pyramid_px += frame.left.size * (2 if pair else 1)
 
     # what is known
 

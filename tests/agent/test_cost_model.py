@@ -9,7 +9,7 @@ from kiteline_agent.agent import Agent
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_agent.governor.cost_model import PRICES_NS, Work, cost_ns
-from kiteline_agent.governor.governor import CARRIED, governed
+from kiteline_agent.governor.effort import CARRIED, governed
 from kiteline_agent.governor.virtual_cpu import VirtualCpu
 from kiteline_agent.step import Identity, StepInput
 from kiteline_core.frame import Frame

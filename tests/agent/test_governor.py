@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from kiteline_agent.config import AgentConfig, GovernorConfig
-from kiteline_agent.governor.governor import ALONE, CARRIED, FULL, Effort, Extra, Governor, governed
+from kiteline_agent.governor.effort import ALONE, CARRIED, FULL, Effort, governed
+from kiteline_agent.governor.governor import Extra, Governor
 
 PERIOD_NS = 50_000_000
 FRAME_NS, KEYFRAME_NS = 3_500_000, 5_000_000

@@ -11,7 +11,7 @@ from kiteline_agent.inertial.sample_buffer import SampleBuffer
 from kiteline_agent.inertial_start_config import InertialBundleConfig
 from kiteline_agent.initialisation.corner_tracks import CornerObservations
 from kiteline_agent.initialisation.inertial_bundle import InertialBundle
-from kiteline_agent.initialisation.inertial_window import WarmStart, WindowSolution
+from kiteline_agent.initialisation.inertial_window import WarmStart, WindowSolution, finished
 from kiteline_agent.initialisation.lens_correction import TERMS, moved
 from kiteline_agent.initialisation.window_kernels import add_observations
 from kiteline_agent.initialisation.window_noise import NoiseEvidence, WindowNoise
@@ -199,7 +199,7 @@ def test_corners_that_walk_are_left_out(seed: int) -> None:
     assert found.scale_sigma < 1.2 * still.scale_sigma
     assert found.reprojection_px < 1.2 * still.reprojection_px
     # and they become no landmarks of the map
-    placed = bundle(crowd, samples).place_landmarks(found.state)
+    placed = finished(bundle(crowd, samples).placing_landmarks(found.state))
     newest = corners.seen[-1]
     assert (placed.depth_sigma[walks & newest] > 0.25).mean() > 0.9
     assert (placed.depth_sigma[~walks & newest] < 0.25).mean() > 0.7
@@ -254,7 +254,7 @@ def test_the_state_is_that_of_the_newest_keyframe() -> None:
 def test_landmarks_are_placed_with_known_poses() -> None:
     corners, samples, truth = window(2)
     few = bundle(corners.part(np.arange(min(60, len(corners.ids)))), samples).solve()
-    every = bundle(corners, samples).place_landmarks(few.state)
+    every = finished(bundle(corners, samples).placing_landmarks(few.state))
     known = (every.depth_sigma < 0.1) & corners.seen[-1]
     assert known.sum() > 10
     # true depths by the observations themselves: the ray through the newest pixel at that depth meets the others

@@ -4,21 +4,25 @@ from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.governor.cost_model import Work
-from kiteline_agent.imaging.features import DetectorConfig
+from kiteline_agent.imaging.features import DetectorConfig, build_pyramid
 from kiteline_agent.inertial_start_config import CornerTracksConfig
 from kiteline_agent.initialisation import inertial_start
-from kiteline_agent.initialisation.corner_tracks import CornerObservations, CornerTracks, TrackedKeyframe
-from kiteline_agent.initialisation.inertial_start import InertialStart, _with_found
-from kiteline_agent.initialisation.inertial_window import WindowSolution
+from kiteline_agent.initialisation.corner_tracks import CornerObservations, CornerTracks, TrackedKeyframe, with_found
+from kiteline_agent.initialisation.inertial_start import InertialStart
+from kiteline_agent.initialisation.inertial_window import WindowSolution, finished
 from kiteline_agent.initialisation.metric_restart import MetricPoints
 from kiteline_agent.initialisation.window_noise import WindowNoise
 from kiteline_agent.tracking.frame_context import FrameContext
-from kiteline_core.frame import ImuBatch
+from kiteline_agent.tracking.waiting_frames import WaitingFrames
+from kiteline_core.arrays import F64
+from kiteline_core.frame import Frame, ImuBatch
+from kiteline_core.geometry import se3
 from tests.agent.test_inertial_bundle import CALIBRATION, FOCAL, T_B_C, window
 
 CAMERA: Any = SimpleNamespace(fx=FOCAL, fy=FOCAL, cx=376.0, cy=240.0, width=752, height=480, T_b_c=T_B_C)
@@ -30,9 +34,11 @@ class Tracks:
     def __init__(self, corners: CornerObservations) -> None:
         self._corners, self.keyframes = corners, list[Any]()
 
-    def add(self, t_ns: int, _left: object) -> bool:
-        self.keyframes.append(SimpleNamespace(t_ns=t_ns))
+    def is_due(self, _t_ns: int) -> bool:
         return True
+
+    def add(self, t_ns: int, _left: object, _turn: object) -> None:
+        self.keyframes.append(SimpleNamespace(t_ns=t_ns))
 
     def drop_before(self, t_ns: int) -> None:
         pass
@@ -90,7 +96,7 @@ def test_corners_that_alignment_finds_again_count_where_flow_lost_them() -> None
     corners = CornerObservations(rng.normal(size=(4, 6, 2)), rng.random((4, 6)) < 0.5, np.arange(6))
     columns = np.array([0, 2, 5])
     aligned = replace(corners.part(columns), xy=rng.normal(size=(4, 3, 2)), seen=rng.random((4, 3)) < 0.7)
-    both = _with_found(corners, columns, aligned)
+    both = with_found(corners, columns, aligned)
     for k in range(4):
         for i in range(6):
             at = np.flatnonzero(columns == i)
@@ -117,6 +123,12 @@ def test_windows_whose_keyframes_coincide_confirm_no_scale() -> None:
         assert not start._agrees(at(apart), at(together))
 
 
+def at_once(result: Any) -> Any:
+    """A computation of one part."""
+    return result
+    yield
+
+
 def test_a_lower_cost_at_the_same_scale_confirms_it(monkeypatch: pytest.MonkeyPatch) -> None:
     def solved(scale: float, cost: float) -> inertial_start._Solved:
         state = SimpleNamespace(p=scale * np.arange(12.0).reshape(4, 3))
@@ -127,8 +139,8 @@ def test_a_lower_cost_at_the_same_scale_confirms_it(monkeypatch: pytest.MonkeyPa
         """Whether a solution with cost 1000 stands beside this one from nothing; scale of the next start."""
         found, start = solved(1.0, 1000.0), InertialStart(CAMERA, CALIBRATION, AgentConfig(), Work())
         start._before = inertial_start._Window((0, 1, 2, 3), np.zeros(0, np.int64), found.xyz, found.solution)
-        monkeypatch.setattr(start, "_solve", lambda *_: solved(scale, cost))
-        stands = start._is_lowest(found, None, [], None)  # type: ignore[arg-type]
+        monkeypatch.setattr(start, "_solve", lambda *_: at_once(solved(scale, cost)))
+        stands = finished(start._is_lowest(found, None, [], None))  # type: ignore[arg-type]
         return stands, float(start._before.xyz[0, 0])
 
     assert is_lowest(1.2, 1000.0) == (True, 1.0)
@@ -140,7 +152,8 @@ def test_a_window_begins_after_the_samples_that_are_missing(monkeypatch: pytest.
     """An IMU that starts after the camera: keyframes from its first sample on count, not only those of later frames."""
     start = InertialStart(CAMERA, CALIBRATION, AgentConfig(), Work())
     monkeypatch.setattr(start._tracks, "flow_px", lambda: 100.0)
-    monkeypatch.setattr(start._tracks, "add", lambda _t_ns, _left: True)
+    monkeypatch.setattr(start._tracks, "is_due", lambda _t_ns: True)
+    monkeypatch.setattr(start._tracks, "add", lambda *_: None)
     start._tracks.keyframes = [SimpleNamespace(t_ns=250_000_000 * k) for k in range(20)]  # type: ignore[misc]
     t_ns = np.arange(1_100_000_000, 4_800_000_000, 5_000_000)
     ctx: Any = SimpleNamespace(
@@ -149,7 +162,7 @@ def test_a_window_begins_after_the_samples_that_are_missing(monkeypatch: pytest.
     )  # fmt: skip
     start.add_samples(ctx)
     solved: list[int] = []
-    monkeypatch.setattr(start, "_attempt", lambda _ctx, keyframes, *_: solved.append(len(keyframes)))
+    monkeypatch.setattr(start, "_attempting", lambda _ctx, keyframes, *_: iter([solved.append(len(keyframes))]))
     start.add(ctx, None, 0.0)
     assert [k.t_ns for k in start._tracks.keyframes] == [250_000_000 * k for k in range(4, 20)]  # 0.2 s are bridged
     start.add(ctx, None, 0.0)
@@ -168,8 +181,9 @@ def test_of_a_long_rest_a_window_holds_the_end(monkeypatch: pytest.MonkeyPatch, 
         Work(),
     )
     monkeypatch.setattr(start._tracks, "flow_px", lambda: flow_px)
-    monkeypatch.setattr(start._tracks, "add", lambda _t_ns, _left: True)
-    monkeypatch.setattr(start, "_attempt", lambda *_: None)
+    monkeypatch.setattr(start._tracks, "is_due", lambda _t_ns: True)
+    monkeypatch.setattr(start._tracks, "add", lambda *_: None)
+    monkeypatch.setattr(start, "_attempting", lambda *_: None)
     monkeypatch.setattr(start, "_intervals", lambda *_: None)
     start._tracks.keyframes = [SimpleNamespace(t_ns=250_000_000 * k) for k in range(77)]  # type: ignore[misc]
     ctx: Any = SimpleNamespace(t_ns=19_000_000_000, images=SimpleNamespace(left=None))
@@ -204,3 +218,43 @@ def test_a_window_that_is_thinned_out_ends_before_its_oldest_keyframes() -> None
     assert len(longest) == 20 and longest[-1] == 30.0 and 8.5 < np.ptp(longest) <= 9.5
     assert np.diff(longest).max() == 0.5
     assert kept_s(7.0, config, oldest_s=3.0)[0] == 3.0
+
+
+def test_corners_are_followed_over_a_turn_that_the_gyro_tells() -> None:
+    rng = np.random.default_rng(3)
+    image = cv2.GaussianBlur(rng.integers(0, 256, (480, 752)).astype(np.uint8), (0, 0), 2.0)
+    image = cv2.normalize(image, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)  # type: ignore[call-overload]
+    turn = se3.so3_exp(np.array([0.0, 0.2, 0.0]))  # of the camera, in a quarter of a second
+    matrix = np.array([[FOCAL, 0.0, CAMERA.cx], [0.0, FOCAL, CAMERA.cy], [0.0, 0.0, 1.0]])
+    turned = cv2.warpPerspective(image, matrix @ turn.T @ np.linalg.inv(matrix), (752, 480))
+    config = AgentConfig()
+
+    def followed(told: F64 | None) -> int:
+        tracks = CornerTracks(CAMERA, config.detector, config.inertial_start.corner_tracks)
+        tracks.add(0, build_pyramid(image, 4))
+        tracks.add(SECOND // 4, build_pyramid(np.asarray(turned, np.uint8), 4), told)
+        return len(np.intersect1d(tracks.keyframes[0].ids, tracks.keyframes[1].ids))
+
+    assert followed(turn) > 80 and followed(None) < 40
+
+
+def test_frames_that_wait_are_some_time_apart_and_lose_no_samples() -> None:
+    waiting, taken, samples = WaitingFrames(0.24), list[float](), 0
+
+    def take(found: tuple[Frame, ImuBatch | None]) -> None:
+        nonlocal samples
+        taken.append(found[0].t_ns / SECOND)
+        assert found[1] is not None
+        samples += len(found[1].t_ns)
+
+    for k in range(41):
+        t_ns = k * SECOND // 20
+        imu = ImuBatch(np.array([t_ns - 5_000_000, t_ns]), np.zeros((2, 3)), np.zeros((2, 3)))
+        waiting.add(Frame(t_ns, np.zeros((4, 4), np.uint8)), imu)
+        if k in (20, 22):
+            take(waiting.next())
+    assert taken == [0.0, 0.25] and waiting.span_s == pytest.approx(1.5)
+    while len(waiting):
+        take(waiting.next_to_track())
+    assert samples == 2 * 41 and taken[-1] == 2.0  # the newest frame is among them
+    assert min(np.diff(taken)) > 0.24 and max(np.diff(taken)) <= 0.5

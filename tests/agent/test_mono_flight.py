@@ -12,7 +12,7 @@ import pytest
 from kiteline_agent.agent import Agent
 from kiteline_agent.config import AgentConfig, LocalMapConfig
 from kiteline_agent.exchange.no_base import NoBaseChannel
-from kiteline_agent.governor.cost_model import Work
+from kiteline_agent.governor.cost_model import Work, cost_ns
 from kiteline_agent.imaging.features import DetectorConfig, build_pyramid
 from kiteline_agent.initialisation.two_view_start import TwoViewStart
 from kiteline_agent.keyframes.depth_from_motion import triangulated_sigma
@@ -261,6 +261,37 @@ def test_an_imu_gives_metres_from_the_first_pose_on() -> None:
     assert np.degrees(np.arccos(np.clip((up * -true[:, 1, :3]).sum(axis=1), -1.0, 1.0))).max() < 2.0
     new_landmarks = [r for r in far.receive((), 0) if isinstance(r, NewLandmarks) and (r.inv_depth > 0).any()]
     assert {submap_of_keyframe(r.keyframe) for r in new_landmarks} == {e.submap for e in estimates[first:]}
+
+
+@pytest.mark.parametrize("percent", [8.0, 30.0])
+def test_a_budget_delays_the_first_pose_and_nothing_else(percent: float) -> None:
+    """The solution for the first map costs a tenth of a second and more: frames wait for it, and are tracked after."""
+
+    def fly(cpu_percent: float) -> tuple[list[str], list[int], list[Estimate | None]]:
+        config = AgentConfig()
+        config = replace(config, governor=replace(config.governor, cpu_percent=cpu_percent))
+        one = Agent(RIG, ImuCalibration(), config, Identity(AgentId(0), 0), NoBaseChannel())
+        words: list[str] = []
+        costs: list[int] = []
+        estimates: list[Estimate | None] = []
+        for k in range(4, 190):
+            t_s, haste = (k - 3) * 0.05, 1.7
+            image = Frame(round(t_s * 1e9), room(path(3.0 + haste * (k - 3)))[0])
+            imu = imu_at(t_s - np.arange(9, -1, -1) * 0.005, haste)
+            output = one.step(StepInput(image, imu, cpu_ns=costs[-1] if costs else 0), image.t_ns)
+            costs.append(cost_ns(one.work))
+            words += [word for word in output.events if word.startswith("mono")]
+            estimates.append(output.estimate)
+            if output.estimate is not None:
+                assert output.estimate.t_ns == image.t_ns  # none of a frame that waited
+        return words, costs, estimates
+
+    words, costs, estimates = fly(percent)
+    free, _, _ = fly(0.0)
+    assert words[0] == free[0] and words[0].startswith("mono: metric within")
+    assert max(sum(costs[k : k + 20]) for k in range(len(costs) - 20)) <= percent * 1e7
+    assert sum(e is not None and e.tracked for e in estimates[-20:]) > 3  # it has caught up
+    assert max(np.diff([k for k, e in enumerate(estimates) if e is not None and e.tracked])) < 10
 
 
 def test_a_still_camera_with_an_imu_has_no_pose() -> None:

@@ -24,6 +24,7 @@ class Work:
     bearings: int = 0
     searches: int = 0
     places: int = 0
+    followed: int = 0
     window_keyframes: int = 0
     matched_px: int = 0
     segmented_px: int = 0
@@ -57,7 +58,8 @@ PRICES_NS: dict[str, float] = {
     "bearings": 7_500,  # an epipolar segment searched for a landmark without depth
     "searches": 5_000_000,  # a relocalisation attempt
     "places": 650_000,  # a keyframe entered into the place index: the first searches enter all
-    "window_keyframes": 3_500_000,  # a keyframe of a solved window of the inertial start
+    "followed": 2_800_000,  # a frame into which the corners of the inertial start are followed
+    "window_keyframes": 190_000,  # a keyframe of its window in one iteration of the solver
     "matched_px": 75,  # semi-global matching, at the size of disparity images
     "segmented_px": 35,  # ground, labels and scan
     "coded_px": 9,  # a pixel reduced and coded for the base

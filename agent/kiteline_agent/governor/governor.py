@@ -8,50 +8,12 @@ second.
 """
 
 from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import Enum
 
-from kiteline_agent.config import AgentConfig, GovernorConfig
-
-
-@dataclass(frozen=True, slots=True)
-class Effort:
-    """Work allowed for a frame: factors on the configured numbers, except for levels and `every`."""
-
-    points: float  # of the fine and the coarse pass, and of the required inliers
-    corners: float  # new landmarks of a keyframe
-    stereo: float  # landmarks whose disparity is measured
-    fine_from: int  # template level at which the fine pass starts
-    first: int  # finest pyramid level that is built
-    keyframes: float  # motion until the next keyframe
-    slots: float  # keyframes whose landmarks are searched
-    every: int  # 1: every frame is tracked, 2: every other one
-    frame_cost: float  # of a tracked frame relative to the first row, measured
-    keyframe_cost: float  # the same of the extra cost of a keyframe
-
-
-FULL = Effort(1.00, 1.00, 1.0, 1, 0, 1.0, 1.0, 1, 1.00, 1.00)
-CARRIED = (
-    FULL,
-    Effort(1.00, 1.00, 1.0, 1, 0, 1.0, 1.0, 2, 1.00, 1.00),
-    Effort(1.00, 1.00, 1.0, 1, 0, 1.0, 1.0, 3, 1.00, 1.00),
-    Effort(1.00, 1.00, 1.0, 1, 0, 1.4, 1.0, 4, 1.00, 1.00),
-    Effort(1.00, 1.00, 1.0, 1, 0, 1.4, 1.0, 6, 1.00, 1.00),
-    Effort(1.00, 1.00, 1.0, 1, 0, 1.4, 1.0, 8, 1.00, 1.00),
-    Effort(0.65, 0.65, 0.5, 0, 0, 1.4, 0.5, 8, 0.81, 0.90),
-    Effort(0.45, 0.45, 0.3, 0, 0, 1.4, 0.5, 8, 0.72, 0.81),
-    Effort(0.45, 0.45, 0.3, 0, 1, 1.4, 0.5, 9, 0.72, 0.55),
-)  # with an IMU, which bridges skipped frames: skipping costs little accuracy
-ALONE = (
-    FULL,
-    Effort(1.00, 1.00, 1.0, 1, 0, 1.0, 1.0, 2, 1.00, 1.00),
-    Effort(1.00, 1.00, 0.5, 1, 1, 1.2, 1.0, 2, 0.89, 0.66),
-    Effort(0.80, 0.80, 0.5, 0, 1, 1.2, 1.0, 2, 0.74, 0.68),
-    Effort(0.65, 0.65, 0.5, 0, 1, 1.2, 1.0, 2, 0.68, 0.65),
-    Effort(0.65, 0.65, 0.5, 0, 1, 1.2, 1.0, 3, 0.68, 0.65),
-    Effort(0.65, 0.65, 0.5, 0, 1, 1.2, 1.0, 4, 0.68, 0.65),
-    Effort(0.45, 0.45, 0.3, 0, 1, 1.4, 0.5, 4, 0.56, 0.56),
-)  # images alone: rotation between frames must stay small, so resolution is reduced before frames are skipped
+from kiteline_agent.config import GovernorConfig
+from kiteline_agent.governor.effort import ALONE, CARRIED, FULL, Effort
+from kiteline_agent.governor.start_pacing import StartPacing
 
 
 class Extra(Enum):
@@ -80,39 +42,6 @@ class Decision:
     track: bool
     effort: Effort
     events: tuple[str, ...]
-
-
-def governed(config: AgentConfig, effort: Effort) -> AgentConfig:
-    """The configuration at an effort: with fewer points, cells are larger and fewer inliers are required.
-
-    Below full effort there are no scans.
-    """
-    align, keyframe = config.align, config.keyframe
-    points = max(round(align.points * effort.points), 2 * config.pose.min_inliers)
-    return replace(
-        config,
-        pyramid=replace(config.pyramid, first=effort.first),
-        align=replace(
-            align,
-            points=points,
-            coarse_points=max(round(align.coarse_points * effort.points), 2 * config.pose.min_inliers),
-            cell_px=round(align.cell_px / effort.points**0.5),
-            fine_from=min(align.fine_from, effort.fine_from),
-        ),
-        stereo=replace(config.stereo, points=round(config.stereo.points * effort.stereo)),
-        detector=replace(
-            config.detector, max_corners=round(config.detector.max_corners * effort.corners), first=effort.first
-        ),
-        keyframe=replace(
-            keyframe,
-            min_inliers=max(round(keyframe.min_inliers * effort.points), config.pose.min_inliers + 10),
-            min_cover=keyframe.min_cover * (0.5 + 0.5 * effort.points),
-            baseline_ratio=keyframe.baseline_ratio * effort.keyframes,
-            rotation_rad=keyframe.rotation_rad * min(effort.keyframes, 1.4),
-        ),
-        local_map=replace(config.local_map, searched=max(round(config.local_map.searched * effort.slots), 8)),
-        scan=replace(config.scan, on=config.scan.on and effort == FULL),
-    )
 
 
 class Governor:
@@ -146,6 +75,9 @@ class Governor:
         self._level_since_ns = 0
         self._gap_s = config.max_gap_s  # longest time between two tracked frames
         self._measured = False  # False: the expected cost is the configured one
+        self._pacing = StartPacing(self._budget_ns, config.first_frame_ms * 1e6)
+        self._starting = False  # the last frame was of the start of a monocular map
+        self._grace_ns = config.grace_s * 1e9
         if self.on:  # a map starts with expensive frames: choose an effort that fits
             self._frame_ns = config.first_frame_ms * 1e6
             self._change_row(self._ladder, self._best_affordable(0))
@@ -171,6 +103,7 @@ class Governor:
         if not self.on:
             return Decision(True, FULL, ())
         self._learn(last_cpu_ns)
+        self._starting = False
         self._advance(t_ns)
         before, load = self.level, self._load(self.level)
         events: list[str] = []
@@ -192,6 +125,25 @@ class Governor:
             events.append("governor: frame skipped")
         self._last_t_ns, self._last_tracked, self._last_extra = t_ns, track, None
         return Decision(track, self._row, tuple(events))
+
+    def start_frame(self, t_ns: int, last_cpu_ns: int, *, solving: bool, idle: bool) -> bool:
+        """True if there is CPU time, at a frame before a monocular map with an IMU. `frame` decides about all others.
+
+        solving: its solution is under way. idle: there is nothing to do.
+        """
+        if not self.on:
+            return True
+        self._learn(last_cpu_ns)
+        self._grace_ns = 0.0  # the start is paced from the first frame on
+        self._advance(t_ns)
+        track = not idle and self._pacing.may_step(self._window_ns, solving=solving)
+        self._last_t_ns, self._last_tracked, self._last_extra, self._starting = t_ns, track, None, True
+        self._tracked_t_ns = t_ns
+        return track
+
+    def may_solve(self) -> bool:
+        """True if a further part of the solution with which a monocular map begins fits in this step."""
+        return not self._starting or self._pacing.may_solve(self._window_ns)
 
     def may(self, extra: Extra, *, urgent: bool = False) -> bool:
         """True if there is CPU time for an extra in this frame, which is then booked for the frame.
@@ -236,6 +188,10 @@ class Governor:
             self._window_ns += cpu_ns
         if not self._last_tracked:
             self._idle_ns += (cpu_ns - self._idle_ns) * (_LEARNING if self._idle_ns else 1.0)
+            return
+        if self._starting:
+            if self._last_extra is None:  # it opened no map
+                self._pacing.learn(cpu_ns)
             return
         self._scatter += (self._relative_error(cpu_ns) - self._scatter) * _LEARNING
         if self._last_extra is not None:
@@ -323,7 +279,7 @@ class Governor:
 
     def _early(self, t_ns: int) -> bool:
         """True at the start of a map: nothing is booked, and the IMU initialisation needs frames."""
-        return t_ns < self._first_t_ns + self._config.grace_s * 1e9
+        return t_ns < self._first_t_ns + self._grace_ns
 
     def _is_due(self, *, lost: bool) -> bool:
         """True if the frame is due, with tracked frames spread evenly."""

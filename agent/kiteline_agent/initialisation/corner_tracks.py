@@ -11,6 +11,7 @@ from kiteline_agent.inertial_start_config import CornerTracksConfig
 from kiteline_core.arrays import F64, I64, U8, Bool
 from kiteline_core.geometry.cameras import RectifiedCamera
 
+_LEVELS = 3  # of the flow above the finest one
 _BORDER_PX = 8.0  # a window of the flow and its gradients lie inside
 
 
@@ -40,7 +41,7 @@ class CornerObservations:
 
 
 class CornerTracks:
-    """Follows corners from frame to frame, and from keyframe to keyframe, which drifts less."""
+    """Follows corners from keyframe to keyframe. By the gyro it is known how the image turned in between."""
 
     def __init__(self, camera: RectifiedCamera, detector: DetectorConfig, config: CornerTracksConfig) -> None:
         self._camera = camera
@@ -52,27 +53,25 @@ class CornerTracks:
     def clear(self) -> None:
         """Forget all."""
         self.keyframes = []
-        self._last: U8 | None = None
         self._next_id = 0
         self._ids: I64 = np.zeros(0, np.int64)
         self._uv = np.zeros((0, 2))
-        self._keyframe_uv = np.zeros((0, 2))  # of the same corners in the last keyframe
 
-    def add(self, t_ns: int, left: Pyramid) -> bool:
-        """Follow the corners into a frame. True if it became a keyframe."""
-        if self._last is not None and len(self._uv):
-            self._keep(*self._followed(self._last, left[0], self._uv, None, 3))
-        self._last = left[0]
-        if self.keyframes and (t_ns - self.keyframes[-1].t_ns) * 1e-9 < self._config.keyframe_s:
-            return False
+    def is_due(self, t_ns: int) -> bool:
+        """True if a frame is to become a keyframe."""
+        return not self.keyframes or (t_ns - self.keyframes[-1].t_ns) * 1e-9 >= self._config.keyframe_s
+
+    def add(self, t_ns: int, left: Pyramid, turn: F64 | None = None) -> None:
+        """Follow the corners from the last keyframe into a new one, and find more.
+
+        turn: (3,3) rotation of this camera in that of the last keyframe; None: unknown.
+        """
         if self.keyframes and len(self._uv):
-            uv, good = self._followed(self.keyframes[-1].left[0], left[0], self._keyframe_uv, self._uv, 1)
-            good &= np.linalg.norm(uv - self._uv, axis=1) < self._config.drift_px
-            self._keep(uv, good)
+            guess = None if turn is None else self._turned(turn)
+            uv, good = self._followed(self.keyframes[-1].left[0], left[0], self._uv, guess)
+            self._uv, self._ids = uv[good], self._ids[good]
         self._replenish(left)
-        self._keyframe_uv = self._uv.copy()
         self.keyframes.append(TrackedKeyframe(t_ns, left, self._ids.copy(), self._uv.copy()))
-        return True
 
     def drop_before(self, t_ns: int) -> None:
         """Forget keyframes that are older than this; of too many, the oldest that lie close to their neighbours."""
@@ -105,9 +104,9 @@ class CornerTracks:
         order = np.argsort(-length, kind="stable")
         return CornerObservations(xy, seen, ids).part(order[length[order] >= 3])
 
-    def _followed(self, before: U8, after: U8, uv: F64, guess: F64 | None, levels: int) -> tuple[F64, Bool]:
+    def _followed(self, before: U8, after: U8, uv: F64, guess: F64 | None) -> tuple[F64, Bool]:
         """Pixels (n,2) of corners in the next image, and which of them are found, forward and backward."""
-        size = {"winSize": (self._config.window_px, self._config.window_px), "maxLevel": levels}
+        size = {"winSize": (self._config.window_px, self._config.window_px), "maxLevel": _LEVELS}
         flags = 0 if guess is None else cv2.OPTFLOW_USE_INITIAL_FLOW
         start = uv.astype(np.float32)
         there = None if guess is None else guess.astype(np.float32)
@@ -118,8 +117,11 @@ class CornerTracks:
         same = np.linalg.norm(back - start, axis=1) < self._config.backward_px
         return found.astype(np.float64), (ok.ravel() == 1) & (ok_back.ravel() == 1) & inside & same
 
-    def _keep(self, uv: F64, good: Bool) -> None:
-        self._uv, self._ids, self._keyframe_uv = uv[good], self._ids[good], self._keyframe_uv[good]
+    def _turned(self, turn: F64) -> F64:
+        """Pixels (n,2) of the corners after a rotation of the camera alone."""
+        focal, centre = np.array([self._camera.fx, self._camera.fy]), np.array([self._camera.cx, self._camera.cy])
+        ray = np.column_stack([(self._uv - centre) / focal, np.ones(len(self._uv))]) @ turn
+        return np.asarray(ray[:, :2] / np.maximum(ray[:, 2:], 0.1) * focal + centre)
 
     def _replenish(self, left: Pyramid) -> None:
         """Find new corners where none is followed."""
@@ -130,3 +132,20 @@ class CornerTracks:
         self._uv = np.concatenate([self._uv, found])
         self._ids = np.concatenate([self._ids, self._next_id + np.arange(len(found))])
         self._next_id += len(found)
+
+
+def covering(corners: CornerObservations, longest: int, each: int) -> I64:
+    """Columns of the longest tracks, and of the `each` longest ones of every keyframe."""
+    chosen = np.arange(len(corners.ids)) < longest
+    for seen in corners.seen:
+        chosen[np.flatnonzero(seen)[:each]] = True
+    return np.flatnonzero(chosen)
+
+
+def with_found(corners: CornerObservations, columns: I64, aligned: CornerObservations) -> CornerObservations:
+    """The corners, and where alignment found those in `columns` in keyframes in which they were not followed."""
+    xy, seen = corners.xy.copy(), corners.seen.copy()
+    found = aligned.seen & ~seen[:, columns]
+    row, column = np.nonzero(found)
+    xy[row, columns[column]], seen[row, columns[column]] = aligned.xy[found], True
+    return CornerObservations(xy, seen, corners.ids)

@@ -16,7 +16,14 @@ from kiteline_agent.inertial_start_config import InertialBundleConfig
 from kiteline_agent.initialisation import lens_correction
 from kiteline_agent.initialisation.corner_tracks import CornerObservations
 from kiteline_agent.initialisation.inertial_terms import SHARED, STATE, InertialTerms
-from kiteline_agent.initialisation.inertial_window import WarmStart, WindowSolution, WindowState, tangent
+from kiteline_agent.initialisation.inertial_window import (
+    InParts,
+    WarmStart,
+    WindowSolution,
+    WindowState,
+    finished,
+    tangent,
+)
 from kiteline_agent.initialisation.lens_correction import TERMS
 from kiteline_agent.initialisation.window_kernels import add_observations
 from kiteline_agent.initialisation.window_noise import WindowNoise
@@ -44,7 +51,7 @@ class _System:
 
 
 class InertialBundle:
-    """One window. Call `solve`."""
+    """One window. Call `solve`, or `solving`, which pauses after each iteration."""
 
     def __init__(
         self,
@@ -81,24 +88,25 @@ class InertialBundle:
 
     def solve(self, warm: WarmStart | None = None) -> WindowSolution | None:
         """The window's states; None if it is degenerate. warm: states to start from."""
-        with np.errstate(all="ignore"):  # where images and IMU contradict each other it diverges, and is refused
-            return self._solve(warm)
+        with np.errstate(all="ignore"):
+            return finished(self.solving(warm))
 
-    def _solve(self, warm: WarmStart | None) -> WindowSolution | None:
+    def solving(self, warm: WarmStart | None) -> InParts[WindowSolution | None]:
+        """`solve` in parts. Where images and IMU contradict each other it diverges, which numpy must not warn of."""
         try:
-            state = self._first_state() if warm is None else self._warm_state(warm)
+            state = (yield from self._first_state()) if warm is None else self._warm_state(warm)
             if state is None:
                 return None
             self._terms.integrate(state)
             every = np.arange(6, STATE * self._keyframes + SHARED + TERMS)
             if warm is None:  # what moves is left out before the lens may bend to it
-                state, _ = self._consistent(state, every[:-TERMS], self._config.iterations, inertial=True)
-            state, system = self._consistent(state, every, self._config.iterations, inertial=True)
+                state, _ = yield from self._consistent(state, every[:-TERMS], self._config.iterations, inertial=True)
+            state, system = yield from self._consistent(state, every, self._config.iterations, inertial=True)
             return self._solution(state, system, every)
         except np.linalg.LinAlgError:
             return None
 
-    def place_landmarks(self, state: WindowState) -> WindowSolution | None:
+    def placing_landmarks(self, state: WindowState) -> InParts[WindowSolution | None]:
         """The solution with these poses (rho of any length is replaced) and every landmark of the observations."""
         rho = np.full(self._landmarks, float(np.median(state.rho)))
         state = self._anchored(replace(state, rho=rho, m=np.zeros((self._landmarks, 2))))
@@ -108,6 +116,7 @@ class InertialBundle:
         for _ in range(_PLACE_ITERATIONS):
             moved = self._moved(state, still, system)
             state = replace(state, m=moved.m, rho=moved.rho)
+            yield
             system = self._linearise(state, inertial=True)
         if self._leave_out(state):
             system = self._linearise(state, inertial=True)
@@ -124,14 +133,14 @@ class InertialBundle:
 
     # stages
 
-    def _first_state(self) -> WindowState | None:
+    def _first_state(self) -> InParts[WindowState | None]:
         """The state in metres from nothing; None if it is degenerate."""
-        state = self._structure()
+        state = yield from self._structure()
         error = np.linalg.norm(self._project(state)[3][self._obs.seen], axis=-1)
         self.structure_px = float(np.median(error)) * self._config.sigma_px
         return self._align(state)
 
-    def _structure(self) -> WindowState:
+    def _structure(self) -> InParts[WindowState]:
         """Poses and landmarks up to scale: from one depth for all, no translation, and the gyro's rotations."""
         n = self._keyframes
         state = WindowState(
@@ -148,7 +157,8 @@ class InertialBundle:
         state = self._anchored(replace(state, R=R, p=self._t_bc - R @ self._t_bc, rho=rho))
         unknown = (STATE * np.arange(1, n)[:, None] + np.arange(6)).ravel()
         unknown = np.concatenate([unknown, STATE * n + np.arange(3)])
-        return self._consistent(state, unknown, self._config.structure_iterations, inertial=False)[0]
+        found, _ = yield from self._consistent(state, unknown, self._config.structure_iterations, inertial=False)
+        return found
 
     def _warm_state(self, warm: WarmStart) -> WindowState:
         """The state of an earlier solution, carried to the newest keyframes by the IMU. NaN: unknown landmarks."""
@@ -191,13 +201,13 @@ class InertialBundle:
 
     def _consistent(
         self, state: WindowState, unknown: I64, iterations: int, *, inertial: bool
-    ) -> tuple[WindowState, _System]:
+    ) -> InParts[tuple[WindowState, _System]]:
         """`_iterate`, and again without the corners that do not fit: a robust weight does not end their pull."""
-        state, system = self._iterate(state, unknown, iterations, inertial=inertial)
+        state, system = yield from self._iterate(state, unknown, iterations, inertial=inertial)
         for _ in range(_ROUNDS):
             if not self._leave_out(state):
                 break
-            state, system = self._iterate(state, unknown, iterations, inertial=inertial)
+            state, system = yield from self._iterate(state, unknown, iterations, inertial=inertial)
         return state, system
 
     def _leave_out(self, state: WindowState) -> bool:
@@ -216,11 +226,12 @@ class InertialBundle:
 
     def _iterate(
         self, state: WindowState, unknown: I64, iterations: int, *, inertial: bool
-    ) -> tuple[WindowState, _System]:
+    ) -> InParts[tuple[WindowState, _System]]:
         """Levenberg-Marquardt over the unknowns with these columns."""
         self._converged, damping = False, 1e-4 if inertial else 1e-3
         system = self._linearise(state, inertial=inertial)
         for _ in range(iterations):
+            yield
             h = system.h[np.ix_(unknown, unknown)]
             step = np.zeros(len(system.b))
             step[unknown] = -np.linalg.solve(h + np.diag(damping * np.diag(h) + 1e-9), system.b[unknown])

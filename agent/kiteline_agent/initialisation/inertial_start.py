@@ -1,5 +1,6 @@
 """Starts a monocular map in metres from corners and IMU, once the scale is known; until then there is no pose."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -7,20 +8,23 @@ import numpy as np
 
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.governor.cost_model import Work
-from kiteline_agent.inertial.preintegration import BiasPrior, Samples
+from kiteline_agent.inertial.preintegration import BiasPrior, Samples, preintegrate
 from kiteline_agent.inertial.sample_buffer import SampleBuffer
-from kiteline_agent.initialisation import lens_correction
+from kiteline_agent.initialisation import corner_tracks, lens_correction
 from kiteline_agent.initialisation.contradiction import ContradictionWatch, contradicts
 from kiteline_agent.initialisation.corner_tracks import CornerObservations, CornerTracks, TrackedKeyframe
 from kiteline_agent.initialisation.inertial_bundle import InertialBundle, lens_prior
-from kiteline_agent.initialisation.inertial_window import WarmStart, WindowSolution
+from kiteline_agent.initialisation.inertial_window import InParts, WarmStart, WindowSolution, lengths_apart
 from kiteline_agent.initialisation.landmark_realignment import realigned
 from kiteline_agent.initialisation.metric_restart import MetricPoints, metric_points_at
 from kiteline_agent.initialisation.window_noise import LEAST, MOST, Vibration, WindowNoise, vibration
 from kiteline_agent.tracking.frame_context import FrameContext
+from kiteline_agent.tracking.waiting_frames import WaitingFrames
 from kiteline_core.arrays import F64, I64
 from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry.cameras import RectifiedCamera
+
+Solving = InParts[WindowSolution | None]
 
 _NEARLY = 1.3  # times the deviation of a known scale: below it the landmarks are aligned again, to know it sooner
 _MIN_VIEWS = 3  # keyframes in which a landmark is aligned again, to be kept
@@ -28,18 +32,21 @@ _STILL_FLOW = 0.25  # share of `min_flow` below which the vehicle stands
 _LOWER_COST = 1.0  # by which a solution from nothing must be better: a deviation of the scale is worth 0.5
 _SAME_SCALE = 0.5  # deviations of the scale: solutions that differ by less left out other corners
 _MIN_COMMON = 3  # keyframes of two windows whose distances are compared
+_BEHIND_SHARE = 0.25  # of the time by which tracking is behind: then fewer windows are solved
 _MIN_DEPTH_M = 0.1  # m of a landmark in the newest camera
 
 
 @dataclass(frozen=True, slots=True)
 class InertialMap:
-    """The first keyframe of a map in metres, which is this frame, and the state there.
+    """The first keyframe of a map in metres, and the state there.
 
-    points: new landmarks. solution: its window. cov: (17,17) of the state, as in InertialState. scale_sigma: relative
-    deviation of the scale. duration_s: length of the window. accel_noise: factor on the accelerometer's noise. lens:
-    (8,) found of the camera (lens_correction), with which the landmarks' pixels are corrected.
+    frame: the newest keyframe of the window. points: new landmarks. solution: its window. cov: (17,17) of the state, as
+    in InertialState. scale_sigma: relative deviation of the scale. duration_s: length of the window. accel_noise:
+    factor on the accelerometer's noise. lens: (8,) found of the camera (lens_correction), with which the landmarks'
+    pixels are corrected.
     """
 
+    frame: FrameContext
     points: MetricPoints
     solution: WindowSolution
     cov: F64
@@ -69,18 +76,28 @@ class _Solved:
 
 
 class InertialStart:
-    """Follows corners and solves their window about twice a second. Call `add` with every frame that has no map."""
+    """Follows corners and solves their window about twice a second. Call `add` with every frame that has no map.
 
-    def __init__(self, camera: RectifiedCamera, calibration: ImuCalibration, config: AgentConfig, work: Work) -> None:
+    Where CPU time is short, later frames wait for a solution: the map is the same, and begins later. waiting: these.
+    """
+
+    def __init__(
+        self, camera: RectifiedCamera, calibration: ImuCalibration, config: AgentConfig, work: Work,
+        may_go_on: Callable[[], bool] = lambda: True,
+    ) -> None:  # fmt: skip
+        """may_go_on: asked before each part of a solution; False: there is no CPU time left for it in this step."""
         self._camera = camera
         self._calibration = calibration
         self._config = config
         self._work = work
+        self._may_go_on = may_go_on
+        self._attempt: InParts[InertialMap | None] | None = None  # that has begun
         start = config.inertial_start
         detector = replace(
             config.detector, cell_px=start.corner_tracks.cell_px, max_corners=start.corner_tracks.corners
         )
         self._tracks = CornerTracks(camera, detector, start.corner_tracks)
+        self.waiting = WaitingFrames(start.corner_tracks.keyframe_s)
         self._buffer = SampleBuffer(start.max_span_s + 1.0, config.inertial.max_gap_s)
         self._before: _Window | None = None
         self._noise: WindowNoise | None = None  # as the windows so far show it
@@ -103,7 +120,7 @@ class InertialStart:
     def clear(self) -> None:
         """A map is tracked: begin anew after it."""
         self._tracks.clear()
-        self._before = self._tried_ns = None
+        self._attempt = self._before = self._tried_ns = None
         self._noise = self._vibration = None
 
     def take_warnings(self) -> list[str]:
@@ -111,21 +128,63 @@ class InertialStart:
         warnings, self._warnings = self._warnings, []
         return warnings
 
+    @property
+    def solving(self) -> bool:
+        """True if a solution has begun and is not at its end."""
+        return self._attempt is not None
+
+    @property
+    def idle(self) -> bool:
+        """True if there is nothing to do before the next frame comes."""
+        first_ns = self.waiting.first_t_ns
+        return not self.solving and (first_ns is None or not self._tracks.is_due(first_ns))
+
     def add(self, ctx: FrameContext, prior: BiasPrior | None, offset_s: float) -> InertialMap | None:
         """Follow the corners into a frame whose samples were taken in. Returns a map once its scale is known.
 
         prior: biases of earlier tracking. offset_s: frame stamp + offset = IMU time.
         """
-        self._work.searches += 1
-        if not self._tracks.add(ctx.t_ns, ctx.images.left):
+        if self._tracks.is_due(ctx.t_ns):
+            self._work.followed += 1
+            self._tracks.add(ctx.t_ns, ctx.images.left, self._turn(ctx.t_ns, prior, offset_s))
+            self._bound_window(ctx.t_ns)
+            if self._attempt is None:
+                self._attempt = self._begin(ctx, prior, offset_s)
+        return self.go_on()
+
+    def go_on(self) -> InertialMap | None:
+        """Go on with the solution, as CPU time allows. Returns a map once its scale is known."""
+        while self._attempt is not None and self._may_go_on():
+            try:
+                with np.errstate(all="ignore"):  # see InertialBundle.solving
+                    next(self._attempt)
+            except StopIteration as end:
+                self._attempt = None
+                return end.value  # type: ignore[no-any-return]
+        return None
+
+    def _turn(self, t_ns: int, prior: BiasPrior | None, offset_s: float) -> F64 | None:
+        """(3,3) rotation of the camera since the last keyframe, by the gyro; None without samples."""
+        keyframes, offset_ns = self._tracks.keyframes, round(offset_s * 1e9)
+        samples = self._buffer.between(keyframes[-1].t_ns + offset_ns, t_ns + offset_ns) if keyframes else None
+        if samples is None:
             return None
+        bias = np.zeros(6) if prior is None else prior.bias
+        R_b_c = self._camera.T_b_c[:3, :3]
+        return np.asarray(R_b_c.T @ preintegrate(samples, bias, self._calibration).turn @ R_b_c)
+
+    def _bound_window(self, t_ns: int) -> None:
+        """Forget keyframes that the newest window no longer holds."""
         config = self._config.inertial_start
-        self._tracks.drop_before(ctx.t_ns - round(config.max_span_s * 1e9))
+        self._tracks.drop_before(t_ns - round(config.max_span_s * 1e9))
         if self._tracks.flow_px() < _STILL_FLOW * config.min_flow * self._camera.fx:
-            self._tracks.drop_before(ctx.t_ns - round(config.rest_s * 1e9))
-        keyframes = self._tracks.keyframes
+            self._tracks.drop_before(t_ns - round(config.rest_s * 1e9))
+
+    def _begin(self, ctx: FrameContext, prior: BiasPrior | None, offset_s: float) -> InParts[InertialMap | None] | None:
+        """An attempt with the window that ends with this keyframe; None while none is due."""
+        config, keyframes = self._config.inertial_start, list(self._tracks.keyframes)
         span_s = (ctx.t_ns - keyframes[0].t_ns) * 1e-9
-        wait_s = max(config.attempt_s, config.attempt_share * span_s)
+        wait_s = max(config.attempt_s, config.attempt_share * span_s, _BEHIND_SHARE * self.waiting.span_s)
         waited = self._tried_ns is None or (ctx.t_ns - self._tried_ns) * 1e-9 >= wait_s
         if span_s < config.min_span_s or not waited or self._tracks.flow_px() < config.min_flow * self._camera.fx:
             return None
@@ -133,25 +192,25 @@ class InertialStart:
         intervals = self._intervals(keyframes, round(offset_s * 1e9))
         if intervals is None:
             return None
-        return self._attempt(ctx, keyframes, intervals, self._default_prior() if prior is None else prior)
+        return self._attempting(ctx, keyframes, intervals, self._default_prior() if prior is None else prior)
 
-    def _attempt(
+    def _attempting(
         self, ctx: FrameContext, keyframes: list[TrackedKeyframe], intervals: list[Samples], prior: BiasPrior
-    ) -> InertialMap | None:
+    ) -> InParts[InertialMap | None]:
         """Solve the window; align its landmarks again and solve it once more when the scale seems to be known."""
         config = self._config.inertial_start
         all_corners = self._tracks.observations()
         if len(all_corners.ids) < self._config.local_map.first_points:
             return None
-        columns = _covering(all_corners, config.landmarks, config.landmarks_each)
+        columns = corner_tracks.covering(all_corners, config.landmarks, config.landmarks_each)
         observations = all_corners.part(columns)
         before, stamps = self._before, tuple(k.t_ns for k in keyframes)
         self._measure_vibration(intervals)
         assert self._noise is not None
         warm = None if before is None else _warm(before, stamps, observations)
-        found = None if warm is None else self._solve(observations, intervals, prior, warm)
+        found = None if warm is None else (yield from self._solve(observations, intervals, prior, warm))
         if found is None or not self._fits(found.solution):
-            warm, found = None, self._solve(observations, intervals, prior, None)
+            warm, found = None, (yield from self._solve(observations, intervals, prior, None))
         if found is None:
             self._before = None
             wrong_turns = self._structure_px > config.contradiction.structure_px
@@ -160,14 +219,17 @@ class InertialStart:
         solution, modelled = found.solution, self._noise
         noise, sigma = self._seen_noise(solution)
         if sigma < _NEARLY * config.scale_sigma:
+            self._work.alignments += int(np.count_nonzero(observations.seen))
             aligned = realigned(
                 keyframes, observations, solution.state, found.xyz, found.first, self._camera, self._config.align
             )
-            all_corners = _with_found(all_corners, columns, aligned)
+            all_corners = corner_tracks.with_found(all_corners, columns, aligned)
+            yield
             keep = aligned.seen.sum(axis=0) >= _MIN_VIEWS
             self._noise = noise
             again = self._bundle(aligned.part(keep), intervals, prior)
-            solution = again.solve(WarmStart(solution.state, found.xyz[keep])) or solution
+            warmer = WarmStart(solution.state, found.xyz[keep])
+            solution = (yield from self._counted(again.solving(warmer), intervals)) or solution
             noise, sigma = self._seen_noise(solution)
         self._before = _Window(stamps, observations.ids, found.xyz, solution)
         wrong, fits = self._contradicts(solution, noise), solution.converged and self._fits(solution)
@@ -175,12 +237,14 @@ class InertialStart:
         known = fits and sigma < config.scale_sigma and not wrong
         agrees = before is not None and self._agrees(before, self._before)
         self._noise = modelled
-        if known and agrees and warm is not None and not self._is_lowest(found, observations, intervals, prior):
-            return None
+        if known and agrees and warm is not None:
+            if not (yield from self._is_lowest(found, observations, intervals, prior)):
+                return None
         self._noise = noise
         if not known or not agrees:
             return None
-        placed = self._bundle(all_corners, intervals, prior).place_landmarks(solution.state)
+        bundle = self._bundle(all_corners, intervals, prior)
+        placed = yield from self._counted(bundle.placing_landmarks(solution.state), intervals)
         points = None if placed is None else self._points(ctx, all_corners, placed)
         if points is None or len(points.sigma_rho) < self._config.local_map.first_points:
             self._tried_ns = None  # the next keyframe may see more of the landmarks
@@ -191,27 +255,37 @@ class InertialStart:
         lens = solution.state.lens
         assert self._vibration is not None
         accel_noise = noise.accel * max(self._vibration.level_now, 1.0)
-        return InertialMap(points, solution, cov, solution.scale_sigma, duration_s, accel_noise, lens)
+        return InertialMap(ctx, points, solution, cov, solution.scale_sigma, duration_s, accel_noise, lens)
 
     def _solve(
         self, corners: CornerObservations, intervals: list[Samples], prior: BiasPrior, warm: WarmStart | None
-    ) -> _Solved | None:
+    ) -> InParts[_Solved | None]:
         bundle = self._bundle(corners, intervals, prior)
-        solution = bundle.solve(warm)
+        solution = yield from self._counted(bundle.solving(warm), intervals)
         self._structure_px = bundle.structure_px
         return None if solution is None else _Solved(solution, *bundle.landmarks_of(solution.state))
 
+    def _counted(self, parts: Solving, intervals: list[Samples]) -> Solving:
+        """The parts of a solution, each counted as work of the frame in which it is done."""
+        while True:
+            self._work.window_keyframes += len(intervals) + 1
+            try:
+                next(parts)
+            except StopIteration as end:
+                return end.value  # type: ignore[no-any-return]
+            yield
+
     def _is_lowest(
         self, found: _Solved, corners: CornerObservations, intervals: list[Samples], prior: BiasPrior
-    ) -> bool:
+    ) -> InParts[bool]:
         """True if a solution from nothing has no lower cost, or the same scale.
 
         A warm start may stay in a wrong minimum. If so, the other solution is the one to start from.
         """
-        cold = self._solve(corners, intervals, prior, None)
+        cold = yield from self._solve(corners, intervals, prior, None)
         if cold is None or cold.solution.cost > found.solution.cost - _LOWER_COST:
             return True
-        apart = _lengths_apart(found.solution.state.p, cold.solution.state.p)
+        apart = lengths_apart(found.solution.state.p, cold.solution.state.p)
         if apart < _SAME_SCALE * found.solution.scale_sigma:
             return True
         assert self._before is not None
@@ -267,7 +341,7 @@ class InertialStart:
         if len(common) < _MIN_COMMON:
             return False
         a, b = (w.solution.state.p[[w.t_ns.index(t) for t in common]] for w in (before, now))
-        return _lengths_apart(a, b) < self._config.inertial_start.agreement
+        return lengths_apart(a, b) < self._config.inertial_start.agreement
 
     def _points(self, ctx: FrameContext, corners: CornerObservations, solution: WindowSolution) -> MetricPoints | None:
         """The corners of the newest keyframe whose depth is known."""
@@ -285,7 +359,6 @@ class InertialStart:
         return replace(found, points=replace(found.points, uv=true * focal + centre))
 
     def _bundle(self, corners: CornerObservations, intervals: list[Samples], prior: BiasPrior) -> InertialBundle:
-        self._work.window_keyframes += len(intervals) + 1
         return InertialBundle(
             corners, intervals, self._calibration, self._camera.T_b_c, self._camera.fx,
             self._config.inertial.gravity_m_s2, prior, self._config.inertial_start.bundle,
@@ -306,31 +379,6 @@ class InertialStart:
         self._tracks.drop_before(keyframes[last_missing + 1].t_ns)
         self._tried_ns = None
         return None
-
-
-def _lengths_apart(a: F64, b: F64) -> float:
-    """Relative difference of the lengths of two paths (n,3) of the same keyframes; infinite if either has none."""
-    length_a, length_b = (float(np.linalg.norm(p - p.mean(axis=0))) for p in (a, b))
-    if min(length_a, length_b) <= 0.0:  # keyframes that coincide tell no scale
-        return np.inf
-    return abs(float(np.log(length_b / length_a)))
-
-
-def _covering(corners: CornerObservations, longest: int, each: int) -> I64:
-    """Columns of the longest tracks, and of the `each` longest ones of every keyframe."""
-    chosen = np.arange(len(corners.ids)) < longest
-    for seen in corners.seen:
-        chosen[np.flatnonzero(seen)[:each]] = True
-    return np.flatnonzero(chosen)
-
-
-def _with_found(corners: CornerObservations, columns: I64, aligned: CornerObservations) -> CornerObservations:
-    """The corners, and where alignment found those in `columns` in keyframes in which they were not followed."""
-    xy, seen = corners.xy.copy(), corners.seen.copy()
-    found = aligned.seen & ~seen[:, columns]
-    row, column = np.nonzero(found)
-    xy[row, columns[column]], seen[row, columns[column]] = aligned.xy[found], True
-    return CornerObservations(xy, seen, corners.ids)
 
 
 def _warm(before: _Window, t_ns: tuple[int, ...], corners: CornerObservations) -> WarmStart | None:

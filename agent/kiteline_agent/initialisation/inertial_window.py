@@ -1,12 +1,17 @@
-"""States of a window of monocular keyframes with an IMU, and its solution."""
+"""States of a window of monocular keyframes with an IMU, and its solution, which is computed in parts."""
 
+from collections.abc import Generator
 from dataclasses import dataclass, field
+from typing import TypeVar
 
 import numpy as np
 
 from kiteline_agent.initialisation.lens_correction import TERMS
 from kiteline_agent.initialisation.window_noise import NoiseEvidence
 from kiteline_core.arrays import F64
+
+T = TypeVar("T")
+InParts = Generator[None, None, T]  # a computation that pauses where an agent with little CPU time goes on later
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,3 +76,20 @@ def tangent(direction: F64) -> F64:
     if length == 0.0:
         return np.zeros((3, 2))
     return np.asarray(np.linalg.svd(direction[None, :] / length)[2][1:].T)
+
+
+def finished(parts: InParts[T]) -> T:
+    """Compute all parts at once, and return the result."""
+    while True:
+        try:
+            next(parts)
+        except StopIteration as end:
+            return end.value  # type: ignore[no-any-return]
+
+
+def lengths_apart(a: F64, b: F64) -> float:
+    """Relative difference of the lengths of two paths (n,3) of the same keyframes; infinite if either has none."""
+    length_a, length_b = (float(np.linalg.norm(p - p.mean(axis=0))) for p in (a, b))
+    if min(length_a, length_b) <= 0.0:  # keyframes that coincide tell no scale
+        return np.inf
+    return abs(float(np.log(length_b / length_a)))

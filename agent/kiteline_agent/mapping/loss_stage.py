@@ -79,6 +79,15 @@ class LossStage:
             bridged = False
         return FrameOutcome(placed or bridged, bridged, 0 if track is None else track.inliers, events, T_o_n)
 
+    def continue_start(self) -> tuple[FrameContext | None, FrameOutcome]:
+        """Go on with the solution with which a monocular map begins, at the last frame; None while it does not."""
+        opened, warnings = self._submaps.continue_start(), self._submaps.take_warnings()
+        if opened is None:
+            return None, FrameOutcome(False, False, 0, warnings)
+        ctx, submap = opened
+        self._camera.motion.restart(ctx.t_ns)
+        return ctx, FrameOutcome(submap.placed, False, 0, submap.events + warnings)
+
     def _relocalise(self, ctx: FrameContext) -> tuple[Track | None, list[str]]:
         """Search the stored submaps; if the frame is found, continue there, with a keyframe. And events."""
         camera = self._camera

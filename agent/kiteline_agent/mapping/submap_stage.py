@@ -7,7 +7,7 @@ import numpy as np
 from kiteline_agent.governor.governor import Extra, Governor
 from kiteline_agent.inertial.imu_initialisation import InertialStartState
 from kiteline_agent.initialisation import lens_correction
-from kiteline_agent.initialisation.inertial_start import InertialStart
+from kiteline_agent.initialisation.inertial_start import InertialMap, InertialStart
 from kiteline_agent.initialisation.metric_restart import MetricPoints, metric_points
 from kiteline_agent.initialisation.two_view_start import TwoViewStart
 from kiteline_agent.keyframes.depth_from_motion import DepthFromMotion
@@ -131,13 +131,21 @@ class SubmapStage:
 
     def _open_from_inertial_window(self, ctx: FrameContext, start: InertialStart) -> OpenedSubmap | None:
         """Begin a monocular submap in metres at this frame; None until its scale is known."""
-        camera = self._camera
-        assert camera.motion.tracker is not None
-        found = start.add(ctx, camera.motion.tracker.bias_prior, camera.motion.tracker.applied_offset_s)
-        if found is None:
+        tracker = self._camera.motion.tracker
+        assert tracker is not None
+        found = start.add(ctx, tracker.bias_prior, tracker.applied_offset_s)
+        return None if found is None else self._open_in_metres(found, start)
+
+    def continue_start(self) -> tuple[FrameContext, OpenedSubmap] | None:
+        """Go on with the solution that was begun. Returns the frame in which a submap begins by it, the last one."""
+        start = self._inertial_start
+        found = None if start is None else start.go_on()
+        if start is None or found is None:
             return None
-        solution = found.solution
-        ctx = self._corrected(ctx, found.lens)
+        return found.frame, self._open_in_metres(found, start)
+
+    def _open_in_metres(self, found: InertialMap, start: InertialStart) -> OpenedSubmap:
+        camera, solution, ctx = self._camera, found.solution, self._corrected(found.frame, found.lens)
         if camera.submaps.any:
             camera.leave_submap()
         else:

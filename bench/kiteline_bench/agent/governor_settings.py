@@ -13,7 +13,7 @@ import numpy as np
 
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.governor.cost_model import PRICES_NS, cost_ns
-from kiteline_agent.governor.governor import FULL, governed
+from kiteline_agent.governor.effort import FULL, governed
 from kiteline_bench.harness.bars import Bar, Bench, at_most
 from kiteline_bench.harness.limited_cpu import fly_limited
 from kiteline_bench.harness.recording import Recording, load
