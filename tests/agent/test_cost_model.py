@@ -9,7 +9,7 @@ from kiteline_agent.agent import Agent
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_agent.governor.cost_model import PRICES_NS, Work, cost_ns
-from kiteline_agent.governor.effort import CARRIED, governed
+from kiteline_agent.governor.effort import CARRIED, FULL, governed
 from kiteline_agent.governor.virtual_cpu import VirtualCpu
 from kiteline_agent.step import Identity, StepInput
 from kiteline_core.frame import Frame
@@ -86,7 +86,7 @@ def test_a_search_enters_a_few_keyframes_the_newest_first(recording: Path) -> No
 def test_less_effort_is_counted_as_less(recording: Path) -> None:
     """Frames and keyframes apart: how many keyframes there are depends on what is seen, too."""
     frames, keyframes = [], []
-    for row in (CARRIED[0], CARRIED[6], CARRIED[-1]):
+    for row in (FULL, replace(CARRIED[-1], first=0), CARRIED[-1]):
         costs, works, _ = costs_of(recording, governed(AgentConfig(), row))
         frames.append(np.mean([cost for cost, work in zip(costs, works, strict=True) if not work.keyframes]))
         keyframes.append(np.mean([work.detected_px for work in works if work.keyframes]))

@@ -242,3 +242,29 @@ def test_where_costs_scatter_more_is_left_free() -> None:
 
     assert 0.85 < dearest(0.0) <= 1.0
     assert dearest(0.3) <= 1.0
+
+
+def test_the_first_keyframe_is_expected_to_cost_what_the_map_began_with() -> None:
+    governor, cost_ns, spent, made = Governor(GovernorConfig(cpu_percent=1.2, grace_s=0.0)), 0, list[int](), 0
+    for k in range(100):
+        decision = governor.frame(k * PERIOD_NS, cost_ns, carried=True)
+        cost_ns = 1_500_000 if decision.track else 20_000
+        if k == 0:
+            governor.note(Extra.SUBMAP)
+            cost_ns = 6_000_000
+        elif decision.track and k > 30 and governor.may(Extra.KEYFRAME):
+            cost_ns += 6_000_000
+            made += 1
+        spent.append(cost_ns)
+    assert made and max(sum(spent[k - 19 : k + 1]) for k in range(20, 100)) <= 12_000_000
+
+
+def test_the_first_search_costs_the_same_at_any_effort() -> None:
+    governor, cost_ns, spent = Governor(GovernorConfig(cpu_percent=1.6)), 0, list[int]()
+    for k in range(200):
+        decision = governor.frame(k * PERIOD_NS, cost_ns, lost=k > 60)
+        cost_ns = round(2_200_000 * decision.effort.frame_cost) if decision.track else 20_000
+        if decision.track and k > 60 and governor.may(Extra.SEARCH):
+            cost_ns += 7_000_000
+        spent.append(cost_ns)
+    assert max(spent) > 7_000_000 and max(sum(spent[k - 19 : k + 1]) for k in range(60, 200)) <= 16_000_000

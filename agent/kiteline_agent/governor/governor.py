@@ -27,7 +27,7 @@ class Extra(Enum):
 
 _LONGER = 1.03  # growth of the expected period per frame, if the camera is slower than assumed
 _FIRST_LONGER = 2.5  # the same between the first two frames; a longer gap is due to the first frame's processing
-_GUESS = {Extra.KEYFRAME: 1.7, Extra.SEARCH: 3.0, Extra.SUBMAP: 3.0, Extra.SCAN: 0.5}  # initial estimate, in frames
+_GUESS = {Extra.KEYFRAME: 1.7, Extra.SEARCH: 3.5, Extra.SUBMAP: 3.0, Extra.SCAN: 0.5}  # at first, in full frames
 _OUTLIER = 1.5  # cost of a frame, in usual frames, above which it is clipped
 _SPREAD = 2.0  # mean deviations that cover nine of ten frames
 _LEAST = 0.1  # least share of the budget for frames
@@ -169,7 +169,7 @@ class Governor:
         if self.on:
             if self._last_extra is not None:
                 return False
-            need_ns = self._frame_ns + (self._extra_ns[Extra.SCAN] or _GUESS[Extra.SCAN] * self._frame_ns)
+            need_ns = self._frame_ns + self._expected_ns(Extra.SCAN)
             if self._window_ns + need_ns > self._config.comfort * self._budget_ns:
                 return False
         self.note(Extra.SCAN)
@@ -196,7 +196,8 @@ class Governor:
         self._scatter += (self._relative_error(cpu_ns) - self._scatter) * _LEARNING
         if self._last_extra is not None:
             known_ns = self._extra_ns[self._last_extra]
-            more_ns = max(cpu_ns - self._frame_ns, 0.0)
+            first = self._last_extra is Extra.SUBMAP and not self._measured  # nothing is tracked in it
+            more_ns = max(cpu_ns - (0.0 if first else self._frame_ns), 0.0)
             self._extra_ns[self._last_extra] += (more_ns - known_ns) * (2.0 * _LEARNING if known_ns else 1.0)
             if self._last_extra not in (Extra.SEARCH, Extra.SCAN):
                 self._count_keyframe(self._last_t_ns)
@@ -266,9 +267,9 @@ class Governor:
 
         An extra that never fits is allowed when the window is nearly empty.
         """
-        need_ns = self._frame_ns + (self._extra_ns[extra] or _GUESS[extra] * self._frame_ns)
+        need_ns = self._frame_ns + self._expected_ns(extra)
         if self._last_extra is not None and self._last_extra is not extra:  # also done in this frame
-            need_ns += self._extra_ns[self._last_extra] or _GUESS[self._last_extra] * self._frame_ns
+            need_ns += self._expected_ns(self._last_extra)
         if self._window_ns + factor * need_ns <= self._budget_ns:
             return True
         if self._last_extra not in (None, extra):
@@ -276,6 +277,11 @@ class Governor:
         idle_ns = self._idle_ns * self._config.window_s * 1e9 / self._period_ns
         little = self._window_ns <= idle_ns + _LEAST * self._budget_ns
         return little and idle_ns + factor * need_ns > self._budget_ns
+
+    def _expected_ns(self, extra: Extra) -> float:
+        """Expected extra cost; before the first one of its kind that of the map's first keyframe, or a guess."""
+        first_ns = self._extra_ns[Extra.SUBMAP] if extra is Extra.KEYFRAME else 0.0
+        return self._extra_ns[extra] or first_ns or _GUESS[extra] * self._frame_ns / self._row.frame_cost
 
     def _early(self, t_ns: int) -> bool:
         """True at the start of a map: nothing is booked, and the IMU initialisation needs frames."""
