@@ -258,3 +258,15 @@ def test_frames_that_wait_are_some_time_apart_and_lose_no_samples() -> None:
         take(waiting.next_to_track())
     assert samples == 2 * 41 and taken[-1] == 2.0  # the newest frame is among them
     assert min(np.diff(taken)) > 0.24 and max(np.diff(taken)) <= 0.5
+
+
+def test_frames_do_not_wait_for_ever() -> None:
+    waiting = WaitingFrames(0.24)
+    for k in range(2000):
+        t_ns = k * SECOND // 20
+        waiting.add(
+            Frame(t_ns, np.zeros((4, 4), np.uint8)), ImuBatch(np.array([t_ns]), np.zeros((1, 3)), np.zeros((1, 3)))
+        )
+        assert len(waiting) <= 64
+    frame, imu = waiting.next()
+    assert imu is not None and imu.t_ns[0] == 0 and imu.t_ns[-1] == frame.t_ns  # samples of all frames before

@@ -4,6 +4,7 @@ from collections import deque
 
 from kiteline_core.frame import Frame, ImuBatch, joined
 
+_MOST = 64  # frames that wait, 23 MB at 752x480
 _STEP_NS = 500_000_000  # longest time between two frames by which tracking catches up: an IMU bridges it
 
 
@@ -35,9 +36,12 @@ class WaitingFrames:
             newest, samples = self._frames[-1]
             if self._before_ns is not None and newest.t_ns - self._before_ns < self._apart_ns:
                 self._frames.pop()
-                imu = joined([batch for batch in (samples, imu) if batch is not None])
+                imu = _joined([samples, imu])
             else:
                 self._before_ns = newest.t_ns
+        if len(self._frames) == _MOST:  # they would never be caught up with: go on from the newest
+            imu = _joined([*(samples for _, samples in self._frames), imu])
+            self._frames.clear()
         self._frames.append((frame, imu))
 
     def next(self) -> tuple[Frame, ImuBatch | None]:
@@ -54,9 +58,8 @@ class WaitingFrames:
         while self._frames and self._frames[0][0].t_ns <= end_ns:
             frame, imu = self.next()
             samples.append(imu)
-        return frame, joined([batch for batch in samples if batch is not None])
+        return frame, _joined(samples)
 
-    def clear(self) -> None:
-        """No frame has to wait."""
-        self._frames.clear()
-        self._before_ns = None
+
+def _joined(batches: list[ImuBatch | None]) -> ImuBatch | None:
+    return joined([batch for batch in batches if batch is not None])

@@ -20,7 +20,7 @@ TITLE = "The governor beside its simplest rivals"
 
 STARTS = tuple(range(0, 120, 12))  # first frames
 SHARES = (0.5, 0.25, 0.12)  # of the flight's own load
-_MONO_SHARES = (0.8,)  # of one camera with an IMU, whose start alone takes half of it: with less it never comes
+_MONO_SHARES = (0.8,)  # of one camera with an IMU, whose start alone takes half of it
 RIVALS = ("ladder", "every n-th frame", "newest frame", "newest frame, with scans")
 _EVERY = {0.8: 2, 0.5: 3, 0.25: 7, 0.12: 16}  # whose cost is the share, by docs/decisions/governor-ladder.md
 _AIR = "euroc_mh01_air"
