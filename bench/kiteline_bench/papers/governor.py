@@ -45,8 +45,9 @@ class Outcome:
 
     @property
     def failures(self) -> int:
-        """Starts in which frames were lost, a further submap began or none did."""
-        return sum(f.lost > free.lost or f.submaps != 1 for f, free in zip(self.flights, self.free, strict=True))
+        """Starts in which frames were lost, a further submap began or none did, or too few poses have an error."""
+        pairs = zip(self.flights, self.free, strict=True)
+        return sum(f.lost > free.lost or f.submaps != 1 or not np.isfinite(f.ate_m) for f, free in pairs)
 
     def mean(self, name: str) -> float:
         """Mean of a field over the starts."""
