@@ -1,7 +1,6 @@
 """Inertial tracking: initialisation, prediction, fusion with poses from images, and dead reckoning without them."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -56,7 +55,7 @@ class InertialTracker:
         self._buffer = SampleBuffer(3.0, config.max_gap_s)
         self._smoother = FixedLagSmoother(camera, calibration, config.smoother, config.gravity_m_s2)
         self._initialiser = ImuInitialiser(config, calibration, self._p_b_c, self._buffer)
-        self._self_calibration = SelfCalibration(
+        self.self_calibration = SelfCalibration(
             calibration, config.calibration, self._p_b_c, config.gravity_m_s2, metric=metric
         )
         self._reported_s = config.calibration.offset_s
@@ -94,7 +93,7 @@ class InertialTracker:
     @property
     def applied_offset_s(self) -> float:
         """Camera stamp + offset = IMU time, as applied now."""
-        return self._self_calibration.offset_s
+        return self.self_calibration.offset_s
 
     @property
     def image_loss_s(self) -> float:
@@ -115,51 +114,27 @@ class InertialTracker:
     @property
     def time_offset_s(self) -> tuple[float, float]:
         """Camera stamp + offset = IMU time, and its standard deviation, s."""
-        return self._self_calibration.gyro.offset_s, self._self_calibration.gyro.offset_sigma_s
+        return self.self_calibration.gyro.offset_s, self.self_calibration.gyro.offset_sigma_s
 
     def offset_report(self) -> dict[str, float]:
         """The time offset in ms: the estimate, its standard deviation, and the offset that is applied."""
         offset_s, sigma_s = self.time_offset_s
-        values = {"ms": offset_s, "sigma_ms": sigma_s, "applied_ms": self._self_calibration.offset_s}
+        values = {"ms": offset_s, "sigma_ms": sigma_s, "applied_ms": self.self_calibration.offset_s}
         return {name: round(1e3 * value, 2) for name, value in values.items()}
-
-    @property
-    def camera_rotation_rad(self) -> float:
-        """Expected angle, rms, by which the camera is rotated against the IMU; near 0 for a true rig."""
-        return self._self_calibration.camera_rotation_rad
-
-    def calibration_report(self) -> dict[str, Any]:
-        """SelfCalibration.report."""
-        return self._self_calibration.report()
 
     def take_calibration_events(self) -> list[str]:
         """Lines for the log: the applied offset has changed by a millisecond, a correction of axes began."""
-        events = self._self_calibration.take_events()
+        events = self.self_calibration.take_events()
         if abs(self.applied_offset_s - self._reported_s) >= 1e-3:
             self._reported_s = self.applied_offset_s
             found, sigma = (1e3 * value for value in self.time_offset_s)
             events.append(f"camera stamps + {found:.1f} ms are the IMU's time (deviation {sigma:.1f} ms)")
         return events
 
-    @property
-    def contradicts_images(self) -> bool:
-        """SelfCalibration.contradicts."""
-        return self._self_calibration.contradicts
-
-    @property
-    def is_proved(self) -> bool:
-        """SelfCalibration.is_proved."""
-        return self._self_calibration.is_proved
-
     def begin_with(self, known: KnownImuConfig) -> None:
         """Begin with what earlier flights found of the IMU."""
-        self._self_calibration.begin_with(known)
+        self.self_calibration.begin_with(known)
         self._reported_s = self.applied_offset_s
-
-    @property
-    def known(self) -> KnownImuConfig | None:
-        """SelfCalibration.known."""
-        return self._self_calibration.known()
 
     # per frame
 
@@ -189,7 +164,7 @@ class InertialTracker:
         samples = self._buffer.extended(imu).between(self._interval_end_ns, t_ns + self._offset_ns)
         if samples is None:
             return None
-        state, samples = self._smoother.state, self._self_calibration.correct(samples)
+        state, samples = self._smoother.state, self.self_calibration.correct(samples)
         motion = preintegrate(samples, state.bias, self._calibration, self._config.smoother.imu_inflation)
         T_m_b, velocity = motion.propagate(state.T_m_b, state.velocity, state.bias, self._smoother.gravity)
         T_m_b, rate = se3.orthonormalise(T_m_b), samples.gyro[-1] - state.bias[:3]
@@ -237,7 +212,7 @@ class InertialTracker:
         for too long.
         """
         samples = self._interval(t_ns)
-        self._self_calibration.clear()
+        self.self_calibration.clear()
         self._initialiser.clear()
         self._scale_from = None
         if self._last is not None:
@@ -259,7 +234,7 @@ class InertialTracker:
         self._initialiser.transform(lambda T_m_b: T_new_old @ T_m_b)
         if self._last is not None:
             self._last = (self._last[0], T_new_old @ self._last[1])
-        self._self_calibration.move_map(T_new_old)
+        self.self_calibration.move_map(T_new_old)
         if self._scale_from is not None:
             self._scale_from = (self._scale_from[0], T_new_old @ self._scale_from[1])
         self._scale.rotate_map(T_new_old[:3, :3])
@@ -281,7 +256,7 @@ class InertialTracker:
         """
         if self._smoother.running:
             self._smoother.begin_map(T_m_b)
-        self._self_calibration.begin_map()
+        self.self_calibration.begin_map()
         self._scale_from = None
         self._incomplete = None
         self._initialiser.clear()
@@ -304,7 +279,7 @@ class InertialTracker:
         self._smoother.stop()
         self._initialiser.clear()
         self._last = None
-        self._self_calibration.begin_map()
+        self.self_calibration.begin_map()
         self._incomplete = None
         self._image_loss_s = 0.0
 
@@ -346,12 +321,12 @@ class InertialTracker:
         key = (from_ns, to_ns, self._buffer.newest_t_ns)
         if self._cached is None or self._cached[0] != key:
             samples = self._buffer.between(from_ns, to_ns)
-            self._cached = key, None if samples is None else self._self_calibration.correct(samples)
+            self._cached = key, None if samples is None else self.self_calibration.correct(samples)
         return self._cached[1]
 
     @property
     def _offset_ns(self) -> int:
-        return int(self._self_calibration.offset_s * 1e9)
+        return int(self.self_calibration.offset_s * 1e9)
 
     def _set_last(self, t_ns: int, T_m_b: F64) -> None:
         self._last = (t_ns, T_m_b.copy())
@@ -399,8 +374,8 @@ class InertialTracker:
 
     def _calibrate(self, t_ns: int, T_m_b_visual: F64, dt_s: float) -> None:
         gravity = self._smoother.gravity if self._smoother.running and self._images_have_scale else None
-        self._self_calibration.add(t_ns, T_m_b_visual)
-        change = self._self_calibration.update(self._buffer, gravity, dt_s)
+        self.self_calibration.add(t_ns, T_m_b_visual)
+        change = self.self_calibration.update(self._buffer, gravity, dt_s)
         if change.any():
             self._bias = np.concatenate([self._bias[:3], self._bias[3:] + change])
             self._smoother.shift_accel_bias(change)

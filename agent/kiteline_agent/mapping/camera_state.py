@@ -75,7 +75,7 @@ class CameraState:
             self.gravity.forget()
         if self.motion.tracker is not None:
             self.covariance.update_imu_offset(track.T_c_m, fused.T_c_m)
-            self.covariance.set_camera_rotation(self.motion.tracker.camera_rotation_rad)
+            self.covariance.set_camera_rotation(self.motion.tracker.self_calibration.camera_rotation_rad)
         return fused, self.motion.take_events()
 
     def resume_after_loss(self, ctx: FrameContext, track: Track) -> None:

@@ -92,7 +92,7 @@ class MotionModel:
 
     def known_imu(self) -> KnownImuConfig | None:
         """What is known of the IMU, for the next flight; None before anything was measured."""
-        return None if self.tracker is None else self.tracker.known
+        return None if self.tracker is None else self.tracker.self_calibration.known()
 
     def add_odometry(self, odometry: OdometryBatch | None) -> None:
         """Buffer the odometer samples since the last step."""
@@ -140,7 +140,7 @@ class MotionModel:
             state = self.tracker.update(t_ns, T_m_b, points, velocity)
             if self._steps is not None and self.tracker.metric and state is not None:
                 self._steps.see(t_ns, T_m_b, self.tracker)
-            if self._metric and self.tracker.contradicts_images:
+            if self._metric and self.tracker.self_calibration.contradicts:
                 self._leave_imu(self.tracker)
                 state = None
         if state is not None:
@@ -150,7 +150,7 @@ class MotionModel:
 
     def _leave_imu(self, tracker: InertialTracker) -> None:
         """Fly on by images that measure distances themselves."""
-        self.has_false_vertical = not tracker.is_proved
+        self.has_false_vertical = not tracker.self_calibration.is_proved
         self.tracker = self.loss_motion = None
         self._events += [_CONTRADICTS, _NO_VERTICAL] if self.has_false_vertical else [_CONTRADICTS]
 
@@ -246,7 +246,7 @@ class MotionModel:
         tracker = self.tracker
         return {
             "time_offset": None if tracker is None else tracker.offset_report(),
-            "imu_calibration": None if tracker is None else tracker.calibration_report(),
+            "imu_calibration": None if tracker is None else tracker.self_calibration.report(),
             "odometer": self.odometer.report(),
         }
 
