@@ -111,7 +111,9 @@ class GroundHeight(Generic[Tag]):
         if self._is_above(foot, low, up) or self._too_high(foot, up):
             return Verdict([], [])
         self._held.append(place)
-        same = [other for other in self._held if self._is_level(other.foot, foot, up)]
+        same = [
+            other for other in self._held if self._is_level(other.foot, foot, up) and not self._too_high(other.foot, up)
+        ]
         ends = np.concatenate([other.ends for other in same])
         moved_m = max(float(np.linalg.norm(other.camera - camera)) for other in same)
         if len(same) < 2 or moved_m < config.agreeing_m or _width(ends, up) < config.ground_width_m:

@@ -76,6 +76,15 @@ def test_scans_of_a_large_table_are_withdrawn_when_something_lower_is_seen() -> 
     assert not any(v.withdrawn for v in floor)
 
 
+def test_a_box_top_is_not_believed_with_a_floor_that_is_a_little_lower_elsewhere() -> None:
+    """Ground may climb that much on the way, but points lower than the box were seen right beside it."""
+    ground: GroundHeight[int] = GroundHeight(GroundConfig())
+    box = seen(0.0, 1.6, 0.22, None)
+    beside = [seen(x, 1.6, None, -0.1) for x in (0.1, 0.2)]
+    floor = [seen(x, 1.6, 0.0, None) for x in (2.0, 2.3)]
+    assert [tag for v in fly(ground, box, *beside, *floor) for tag in v.believed] == [3, 4]
+
+
 def test_a_single_wrong_point_below_the_floor_changes_nothing() -> None:
     ground: GroundHeight[int] = GroundHeight(GroundConfig())
     views = [seen(0.2 * k, 1.2, 0.0, -2.0 if k == 5 else 0.1) for k in range(12)]
