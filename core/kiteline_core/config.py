@@ -21,6 +21,7 @@ T = TypeVar("T")
 _MAX_LENGTH = 1 << 20  # of a file of options: all of them with their comments are a twentieth
 _MAX_DEPTH = 16  # of tables in tables; sections are four deep
 _MAX_DOTS = 256  # in a name: tomllib takes the square of their number
+MOST_BYTES = _MAX_LENGTH + 1  # to be read of a file: `parse` refuses so many, and some files never end (/dev/zero)
 ROOTS = frozenset({"agent", "base"})  # tables that a configuration file may have
 
 

@@ -133,6 +133,19 @@ def test_other_sites_and_bent_names_are_refused(page: Handle) -> None:
     assert get(page, "/", host="localhost:80")[0] == 200
 
 
+def test_on_all_interfaces_addresses_and_the_name_of_the_machine_are_answered_alone(base: Base) -> None:
+    page = serve("0.0.0.0", 0, base.snapshot)
+    try:
+        own = socket.gethostname()
+        for host in ("10.0.0.1:8080", "[fe80::1]", "[fe80::1]:8080", "localhost", own, f"{own.upper()}.local:8080"):
+            assert get(page, "/", host=host)[0] == 200, host
+        for host in ("example.com", "10.0.0.1.example.com:8080", f"{own}.example.com"):
+            assert get(page, "/status.json", host=host)[0] == 403, host
+        assert get(page, "/live", host="example.com")[0] == 403
+    finally:
+        page.close()
+
+
 def test_noise_on_the_port_does_no_harm(page: Handle) -> None:
     port = int(page.url.rsplit(":", 1)[1].rstrip("/"))
     for noise in (b"\x00\xff" * 50, b"POST / HTTP/1.1\r\n\r\n", b"GET"):

@@ -1,4 +1,6 @@
+import resource
 import tomllib
+from collections.abc import Callable
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 
@@ -7,6 +9,7 @@ import pytest
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.runtime.options import agent_config
 from kiteline_basestation.config import BaseConfig
+from kiteline_basestation.runtime.options import base_config
 from kiteline_core.config import ConfigError, apply
 from kiteline_lab.tools import config as command
 from kiteline_lab.tools.options import as_markdown, as_toml, sections
@@ -35,6 +38,23 @@ def test_options_have_units_and_all_a_reason() -> None:
     assert all(s.purpose for s in sections())
     assert by_name["base.measurement.sigma_disparity_px"].reason.startswith("px at octave 0")  # in brackets
     assert [o.name for o in by_name.values() if not o.reason] == []
+
+
+@pytest.mark.skipif(not Path("/dev/zero").exists(), reason="needs /dev/zero")
+def test_a_file_that_never_ends_is_refused() -> None:
+    readers: list[Callable[[], object]] = [
+        lambda: agent_config("/dev/zero"), lambda: base_config("/dev/zero"),
+        lambda: agent_config("", rig="/dev/zero"), lambda: command.main(["--check", "/dev/zero"]),
+    ]  # fmt: skip
+    limit = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (8 << 30, limit[1]))  # else a reader without an end takes all memory
+    try:
+        for read in readers[:3]:
+            with pytest.raises(ConfigError, match="longer than 1 MiB"):
+                read()
+        assert readers[3]() == 2
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, limit)
 
 
 def test_the_reference_page_is_up_to_date() -> None:

@@ -94,7 +94,8 @@ def agent_config(
     """
     config = AgentConfig()
     if path:
-        config = configuration.load(config, Path(path).read_bytes(), "agent", path)
+        with open(path, "rb") as file:
+            config = configuration.load(config, file.read(configuration.MOST_BYTES), "agent", path)
     if rig:
         config = replace(config, known_rig=rig_file.load(rig))
     if grid == "off":

@@ -30,7 +30,8 @@ def text_of(known: KnownRigConfig) -> str:
 def load(path: str) -> KnownRigConfig:
     """What a rig file says; nothing if there is no such file yet. Raises ConfigError for any other content."""
     try:
-        table = configuration.parse(Path(path).read_bytes())
+        with open(path, "rb") as file:
+            table = configuration.parse(file.read(configuration.MOST_BYTES))
     except FileNotFoundError:
         return KnownRigConfig()
     except (OSError, ConfigError) as error:

@@ -3,7 +3,6 @@
 import argparse
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
 from kiteline_basestation.config import BaseConfig
 from kiteline_codec.channel import RecordChannel, coded_channel
@@ -56,7 +55,8 @@ def base_config(path: str) -> BaseConfig:
     """The configuration, with the [base] table of a TOML file in place of the defaults. Raises ConfigError."""
     if not path:
         return BaseConfig()
-    return configuration.load(BaseConfig(), Path(path).read_bytes(), "base", path)
+    with open(path, "rb") as file:
+        return configuration.load(BaseConfig(), file.read(configuration.MOST_BYTES), "base", path)
 
 
 def parser(link_forms: str = "") -> argparse.ArgumentParser:

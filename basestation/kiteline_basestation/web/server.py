@@ -1,14 +1,16 @@
 """The status page's server: static files, /status.json and a websocket, in a thread of its own.
 
 It listens on the loopback address by default, serves only the files beside this module, and refuses pages of other
-sites (Origin) and, on loopback, other host names (DNS rebinding). Who only opens connections takes up neither files of
-the process nor the places of viewers.
+sites (Origin) and names that are not this machine's (Host): whoever owns one can let it lead here, and read the page
+in a visitor's browser (DNS rebinding). An address cannot be taken so. Who only opens connections takes up neither files
+of the process nor the places of viewers.
 """
 
 import asyncio
 import ipaddress
 import json
 import logging
+import socket
 import threading
 import time
 from collections.abc import AsyncIterator, Callable
@@ -114,6 +116,7 @@ class _Page:
         self._loop: asyncio.AbstractEventLoop | None = None
         self._end: asyncio.Event | None = None
         self._local = True
+        self._names: frozenset[str] = frozenset()  # by which this machine is called
         self._viewers = 0
         self._recent: list[tuple[float, PageSnapshot]] = []  # the last RATE_SPAN_S of snapshots, shared by all viewers
 
@@ -130,6 +133,8 @@ class _Page:
         self._loop = asyncio.get_running_loop()
         self._end = asyncio.Event()
         self._local = host == "localhost" or _is_loopback(host)
+        own = socket.gethostname().lower()
+        self._names = frozenset({"localhost"} if self._local else {"localhost", own, f"{own}.local", host.lower()})
         log = logging.Logger("kiteline.web", logging.CRITICAL)  # no traceback for a port scan
         self._loop.set_exception_handler(lambda loop, context: None)  # nor one a connection, where files are used up
         connection: Any = partial(_Connection, {})
@@ -152,8 +157,10 @@ class _Page:
     def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
         host = request.headers.get("Host", "")
         name = host.rsplit(":", 1)[0].strip("[]") if not host.endswith("]") else host.strip("[]")
-        if self._local and name != "localhost" and not _is_loopback(name):
-            return _response(HTTPStatus.FORBIDDEN, b"this page answers to localhost only\n")
+        if not (name.lower() in self._names or (_is_loopback(name) if self._local else _is_address(name))):
+            names = f"its address, or to {' or '.join(sorted(self._names))}"
+            text = f"this page answers to {'localhost' if self._local else names} only\n"
+            return _response(HTTPStatus.FORBIDDEN, text.encode())
         path = request.path.split("?", 1)[0]
         if path == LIVE_PATH:
             origin = request.headers.get("Origin")
@@ -226,10 +233,15 @@ class _Page:
 
 
 def _is_loopback(host: str) -> bool:
+    return _is_address(host) and ipaddress.ip_address(host).is_loopback
+
+
+def _is_address(host: str) -> bool:
     try:
-        return ipaddress.ip_address(host).is_loopback
+        ipaddress.ip_address(host)
     except ValueError:
         return False
+    return True
 
 
 def _json(now: PageSnapshot, before: PageSnapshot | None) -> bytes:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from kiteline_core.config import ConfigError, UnknownKeyError, apply, in_range, parse, toml_value
+from kiteline_core.config import MOST_BYTES, ConfigError, UnknownKeyError, apply, in_range, parse, toml_value
 from kiteline_lab.tools.options import ROOTS, Option, as_markdown, as_toml, sections
 
 
@@ -122,7 +122,8 @@ def _plain(value: object) -> object:
 
 def _read(path: Path) -> str:
     try:
-        return path.read_text(encoding="utf-8")
+        with path.open("rb") as file:
+            return file.read(MOST_BYTES).decode()
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path}: not a text file: {error}") from error
 
