@@ -330,13 +330,14 @@ class Agent:
         Under a budget, frames wait for the start of a monocular map.
         """
         t_ns, start = frame.t_ns, self._inertial_start
-        starting = start is not None and not self._camera.submaps.any and not self._camera.motion.odometer.has_samples
+        camera, motion = self._camera, self._camera.motion
+        starting = not camera.submaps.any and motion.tracker is not None and not motion.odometer.has_samples
         if start is not None and self._governor.on and (starting or len(start.waiting)):
             start.waiting.add(frame, joined(self._skipped_imu))
             self._skipped_imu = []
             if starting:
                 return self._governor.start_frame(t_ns, step_input.cpu_ns, solving=start.solving, idle=start.idle), []
-        lost, carried = self._loss.failed_searches > 0, self._camera.motion.running
+        lost, carried = self._loss.failed_searches > 0, motion.running
         decision = self._governor.frame(t_ns, step_input.cpu_ns, lost=lost, carried=carried)
         if decision.effort != self._effort:
             self._effort, before = decision.effort, self._config

@@ -16,6 +16,7 @@ from kiteline_agent.governor.cost_model import Work, cost_ns
 from kiteline_agent.imaging.features import DetectorConfig, build_pyramid
 from kiteline_agent.initialisation.two_view_start import TwoViewStart
 from kiteline_agent.keyframes.depth_from_motion import triangulated_sigma
+from kiteline_agent.runtime.controller import pose_sample
 from kiteline_agent.runtime.frame_counts import live_line, odometry_line
 from kiteline_agent.step import Estimate, Identity, StepInput
 from kiteline_agent.tracking.frame_context import FrameContext
@@ -308,12 +309,46 @@ def test_a_still_camera_with_an_imu_has_no_pose() -> None:
         assert estimate.initialising and not estimate.tracked
 
 
+def test_images_alone_are_flown_where_the_imu_contradicts_them() -> None:
+    config = AgentConfig()
+    begin, end, haste, contradicts_s = 4, 240, 0.8, 1.5
+    start = config.inertial_start
+    start = replace(start, contradiction=replace(start.contradiction, lasts_s=contradicts_s))
+    one = Agent(RIG, ImuCalibration(), replace(config, inertial_start=start), Identity(AgentId(0), 0), NoBaseChannel())
+    estimates: list[Estimate] = []
+    words: list[str] = []
+    for k in range(begin, end):
+        t_s = (k - 3) * 0.05
+        image = Frame(round(t_s * 1e9), room(path(3.0 + haste * (k - 3)))[0])
+        imu = imu_at(t_s - np.arange(9, -1, -1) * 0.005, haste)
+        turned = replace(imu, gyro=imu.gyro * [1.0, -1.0, -1.0], accel=imu.accel * [1.0, -1.0, -1.0])
+        output = one.step(StepInput(image, turned), image.t_ns)
+        assert output.estimate is not None
+        estimates.append(output.estimate)
+        words += output.events
+        sample = pose_sample(one, output, image.t_ns, 0)
+        assert sample is None or not sample.tracked  # a flight controller would take its lengths for metres
+    assert sum(word.startswith("imu: images and IMU contradict") for word in words) == 1
+    assert sum(word.startswith("imu: not used from here on") for word in words) == 1
+    assert not one.metric and one.motion_reports()["time_offset"] is None
+    first = next(i for i, e in enumerate(estimates) if e.tracked)
+    assert all(e.initialising for e in estimates[:first])
+    assert all(e.tracked and not e.initialising for e in estimates[first:])
+    found = np.array([e.T_m_b[:3, 3] for e in estimates[first:] if e.T_m_b is not None])
+    true = np.array([path(3.0 + haste * (k - 3)) for k in range(begin + first, end)])
+    assert similar(found, true[:, :3, 3])[1] < 0.03
+    # as without an IMU, the camera counts as level where the flight began: z up in o is -y of the camera
+    assert np.degrees(np.arccos(-estimates[first].T_o_b[2, 1])) < 12.0
+
+
 def test_without_samples_a_monocular_map_keeps_its_own_unit() -> None:
     """An IMU that is calibrated but silent does not hold up tracking for ever."""
     one = Agent(RIG, ImuCalibration(), AgentConfig(), Identity(AgentId(0), 0), NoBaseChannel())
     estimates = [step(one, frame(k)) for k in range(4, 110)]
     assert estimates[-1].tracked and not one.metric
     assert estimates[40].initialising
+    first = next(e for e in estimates if e.tracked)
+    assert np.degrees(np.arccos(-first.T_o_b[2, 1])) < 12.0  # the camera counts as level where the flight began
 
 
 def test_deviation_of_a_meeting_is_that_of_moved_pixels() -> None:

@@ -75,6 +75,10 @@ class GravityAligner:
         """The vertical came from an IMU that contradicts the images: it is not known in this flight."""
         self._inertial, self._R_l_o = None, None
 
+    def ignore_imu(self) -> None:
+        """Go on as without an IMU, for a camera that was level when the flight began."""
+        self._inertial, self._R_l_o = None, np.eye(3)
+
     def first_pose(self, imu: ImuBatch | None) -> F64:
         """T_m_c of the first keyframe: body at the origin, z up by the accelerometer, else for a level camera."""
         if self._inertial is not None and imu is not None and len(imu.t_ns):

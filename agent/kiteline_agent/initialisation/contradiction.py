@@ -9,8 +9,7 @@ from kiteline_core.arrays import F64
 
 _WARNING = (
     "imu: images and IMU contradict each other, so that no scale is known: check the camera's place in the IMU's axes "
-    "(T_BS), the time offset, the intrinsics and the units (rad/s, m/s^2); without the IMU (--no-imu) the images alone "
-    "can be flown"
+    "(T_BS), the time offset, the intrinsics and the units (rad/s, m/s^2)"
 )
 
 
@@ -38,18 +37,18 @@ class ContradictionWatch:
     def __init__(self, config: ContradictionConfig) -> None:
         self._config = config
         self._since_ns: int | None = None  # first of the windows that contradict
-        self._told = False
+        self.certain = False  # all windows of `lasts_s` contradict
 
     def note(self, t_ns: int, *, contradicts: bool | None) -> list[str]:
         """Process a window that ends at t_ns; returns the events for the log. contradicts: None if it tells neither."""
         if contradicts is None:
             return []
         if not contradicts:
-            self._since_ns, self._told = None, False
+            self._since_ns, self.certain = None, False
             return []
         if self._since_ns is None:
             self._since_ns = t_ns
-        if self._told or (t_ns - self._since_ns) * 1e-9 < self._config.lasts_s:
+        if self.certain or (t_ns - self._since_ns) * 1e-9 < self._config.lasts_s:
             return []
-        self._told = True
+        self.certain = True
         return [_WARNING]

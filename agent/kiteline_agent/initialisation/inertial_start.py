@@ -123,6 +123,11 @@ class InertialStart:
         self._attempt = self._before = self._tried_ns = None
         self._noise = self._vibration = None
 
+    @property
+    def contradicted(self) -> bool:
+        """True if images and IMU certainly contradict each other, so that no scale will be known."""
+        return self._contradiction.certain
+
     def take_warnings(self) -> list[str]:
         """Events since the last call: what the user should check."""
         warnings, self._warnings = self._warnings, []

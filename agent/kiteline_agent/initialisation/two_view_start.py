@@ -75,6 +75,11 @@ class TwoViewStart:
         self._uv = np.zeros((0, 2))
         self._index = np.zeros(0, np.int64)  # template of each corner that is still followed
 
+    @property
+    def at_first_view(self) -> bool:
+        """True if the next frame will be the first view of a map."""
+        return self._first is None
+
     def note_depths(self, depth_m: F64) -> None:
         """A map is tracked, at these depths (n,): a later start takes on their scale, from a new first frame."""
         self._first = None

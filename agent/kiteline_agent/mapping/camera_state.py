@@ -154,6 +154,11 @@ class CameraState:
         """Set the camera where the flight begins: body at the origin, z up."""
         self.pose.T_m_c = self.gravity.first_pose(imu)
 
+    def ignore_imu(self) -> None:
+        """Go on as without an IMU: its samples contradict the images. Before there is a submap."""
+        self.motion.ignore_imu()
+        self.gravity.ignore_imu()
+
     def set_first_gravity(self, gravity_b: F64) -> None:
         """Set the camera where the flight begins: body at the origin, z up. gravity_b: (3,) in the body."""
         self.pose.T_m_c = se3.from_rt(level_rotation(-gravity_b), np.zeros(3)) @ se3.inverse(self.T_c_b)

@@ -6,6 +6,7 @@ import numpy as np
 
 from kiteline_agent.governor.governor import Extra, Governor
 from kiteline_agent.inertial.imu_initialisation import InertialStartState
+from kiteline_agent.inertial.inertial_tracker import InertialTracker
 from kiteline_agent.initialisation import lens_correction
 from kiteline_agent.initialisation.inertial_start import InertialMap, InertialStart
 from kiteline_agent.initialisation.metric_restart import MetricPoints, metric_points
@@ -28,6 +29,7 @@ from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import Rectifier
 from kiteline_core.ids import NO_KEYFRAME, KeyframeId, SubmapId
 
+_IGNORED = "imu: not used from here on: the images alone are flown, in a unit of length of their own, as with --no-imu"
 _FAILURES = 2  # failed searches in frames with texture before a new submap is opened
 
 
@@ -74,6 +76,7 @@ class SubmapStage:
         self._governor = governor
         self._channel = channel
         self._loss: _Loss | None = None
+        self._warnings: list[str] = []
 
     def may_open(self, failed_searches: int) -> bool:
         """True if there is no map yet, or the search for the old one failed and ids and CPU time are left."""
@@ -85,9 +88,10 @@ class SubmapStage:
 
     def open(self, ctx: FrameContext) -> OpenedSubmap | None:
         """Begin a submap with this frame; None if it shows too little."""
-        inertial = self._inertial_start
-        if inertial is not None and inertial.add_samples(ctx) and not self._camera.motion.odometer.has_samples:
-            return self._open_from_inertial_window(ctx, inertial)
+        inertial, motion = self._inertial_start, self._camera.motion
+        if inertial is not None and motion.tracker is not None:
+            if inertial.add_samples(ctx) and not motion.odometer.has_samples:
+                return self._open_from_inertial_window(ctx, inertial, motion.tracker)
         if self._two_view_start is not None:
             return self._open_from_two_views(ctx, self._two_view_start)
         points = self._maker.first_points(ctx)
@@ -112,7 +116,8 @@ class SubmapStage:
 
     def take_warnings(self) -> list[str]:
         """Events since the last call: what keeps a monocular map from its scale."""
-        return [] if self._inertial_start is None else self._inertial_start.take_warnings()
+        warnings, self._warnings = self._warnings, []
+        return warnings + ([] if self._inertial_start is None else self._inertial_start.take_warnings())
 
     def _measure_loss(self, ctx: FrameContext) -> None:
         """Share the motion over the loss again, once images in the new submap have shown the velocity."""
@@ -129,12 +134,20 @@ class SubmapStage:
         tie = SubmapTie(loss.submap, loss.since, se3.orthonormalise(T_k_f), motion.sigma_m, motion.sigma_rad)
         self._channel.put(tie)
 
-    def _open_from_inertial_window(self, ctx: FrameContext, start: InertialStart) -> OpenedSubmap | None:
-        """Begin a monocular submap in metres at this frame; None until its scale is known."""
-        tracker = self._camera.motion.tracker
-        assert tracker is not None
-        found = start.add(ctx, tracker.bias_prior, tracker.applied_offset_s)
-        return None if found is None else self._open_in_metres(found, start)
+    def _open_from_inertial_window(
+        self, ctx: FrameContext, start: InertialStart, inertial: InertialTracker
+    ) -> OpenedSubmap | None:
+        """Begin a monocular submap in metres at this frame; None until its scale is known.
+
+        An IMU that certainly contradicts the images is ignored from then on; not one that agreed with them before.
+        """
+        found = start.add(ctx, inertial.bias_prior, inertial.applied_offset_s)
+        if found is not None:
+            return self._open_in_metres(found, start)
+        if start.contradicted and not self._camera.submaps.any:
+            self._camera.ignore_imu()
+            self._warnings = [*start.take_warnings(), _IGNORED]
+        return None
 
     def continue_start(self) -> tuple[FrameContext, OpenedSubmap] | None:
         """Go on with the solution that was begun. Returns the frame in which a submap begins by it, the last one."""
@@ -177,7 +190,7 @@ class SubmapStage:
         It is not joined to older ones, since their scales differ.
         """
         camera = self._camera
-        if ctx.number == 1:
+        if start.at_first_view and not camera.submaps.any:
             camera.set_first_pose(ctx.imu)  # the camera moves from here on
         two_views = start.add(ctx)
         if two_views is None:

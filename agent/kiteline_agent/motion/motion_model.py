@@ -94,6 +94,10 @@ class MotionModel:
         """What is known of the IMU, for the next flight; None before anything was measured."""
         return None if self.tracker is None else self.tracker.self_calibration.known()
 
+    def ignore_imu(self) -> None:
+        """Go on as without an IMU: its samples contradict the images."""
+        self.tracker = self._steps = self.loss_motion = None
+
     def add_odometry(self, odometry: OdometryBatch | None) -> None:
         """Buffer the odometer samples since the last step."""
         self.odometer.add(odometry)
@@ -151,7 +155,7 @@ class MotionModel:
     def _leave_imu(self, tracker: InertialTracker) -> None:
         """Fly on by images that measure distances themselves."""
         self.has_false_vertical = not tracker.self_calibration.is_proved
-        self.tracker = self.loss_motion = None
+        self.ignore_imu()
         self._events += [_CONTRADICTS, _NO_VERTICAL] if self.has_false_vertical else [_CONTRADICTS]
 
     def take_steps(self, keyframe: KeyframeId, t_ns: int) -> InertialSteps | None:

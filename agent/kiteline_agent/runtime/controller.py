@@ -63,13 +63,17 @@ def with_controller_imu(options: AgentOptions, source: FrameSource) -> FrameSour
 
 
 def pose_sample(agent: OnboardAgent, output: StepOutput, t_ns: int, epoch: int) -> PoseSample | None:
-    """The pose of a step for a flight controller, as of t_ns of its clock; None without a gravity-aligned one."""
+    """The pose of a step for a flight controller, as of t_ns of its clock; None without a gravity-aligned one.
+
+    One whose lengths are not metres counts as not tracked: no flight controller can use it.
+    """
     pose: Estimate | PredictedPose | None = output.estimate or output.predicted
     if pose is None or pose.T_l_b is None:
         return None
+    tracked = pose.tracked and agent.metric
     if isinstance(pose, PredictedPose):
-        return PoseSample(t_ns, pose.T_l_b, pose.tracked, pose.quality, epoch, pose.cov_l, pose.velocity_l, pose.rate_b)
-    return PoseSample(t_ns, pose.T_l_b, pose.tracked, agent.odometry_quality(pose), epoch, pose.cov_l)
+        return PoseSample(t_ns, pose.T_l_b, tracked, pose.quality, epoch, pose.cov_l, pose.velocity_l, pose.rate_b)
+    return PoseSample(t_ns, pose.T_l_b, tracked, agent.odometry_quality(pose), epoch, pose.cov_l)
 
 
 def push_obstacles(
