@@ -1,6 +1,6 @@
 """The interfaces of sources, links, flight controllers and clocks, and the errors that they raise."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol, TypeGuard
 
@@ -123,6 +123,12 @@ class LinkHub(Protocol):
         ...
 
     def close(self) -> None: ...
+
+
+def link_messages(end: ByteLink | LinkHub) -> list[str]:
+    """What is to be told of an end of a link since the last call: a serial line that is gone, or back."""
+    take: Callable[[], list[str]] | None = getattr(end, "take_messages", None)
+    return [] if take is None else take()
 
 
 class Framer(Protocol):

@@ -26,6 +26,11 @@ class Wire:
 
     def __init__(self) -> None:
         self.inbox: list[bytes] = []
+        self.messages: list[str] = []
+
+    def take_messages(self) -> list[str]:
+        messages, self.messages = self.messages, []
+        return messages
 
     def send(self, packet: bytes) -> bool:
         return True
@@ -63,6 +68,12 @@ class Base:
 def base(tmp_path: Path) -> Base:
     pair(tmp_path / "keys", 3, new_code())
     return Base(tmp_path / "keys")
+
+
+def test_what_the_link_tells_is_told_once(base: Base) -> None:
+    base.wire.messages = ["the line is gone"]
+    assert base.lines() == ["the line is gone"]
+    assert base.lines() == []
 
 
 def test_a_key_that_is_replaced_or_removed_opens_nothing_more(base: Base) -> None:

@@ -33,7 +33,7 @@ from kiteline_core.frame import ImuBatch, OdometryBatch
 from kiteline_hw.links.kinds import link_traits
 from kiteline_hw.links.open import open_link
 from kiteline_hw.links.sealed_link import SealedLink
-from kiteline_hw.ports import ByteLink, ControllerLink, LinkError
+from kiteline_hw.ports import ByteLink, ControllerLink, LinkError, link_messages
 from kiteline_hw.system import kernel_cache, process
 from kiteline_hw.system.clock import MonotonicClock
 from kiteline_hw.system.cpu import CpuQuota
@@ -256,8 +256,8 @@ class _BaseEnd:
             self._link.send(packet)
 
     def lines(self) -> list[str]:
-        """Messages about seals, and about another agent with this number, each once."""
-        lines = list(self._watch.lines())
+        """Messages about the link and seals, and about another agent with this number, each once."""
+        lines = [*link_messages(self._end), *self._watch.lines()]
         if not self._doubled_told and getattr(self._end, "doubled", False):
             self._doubled_told = True
             lines.append(f"another agent has number {self._agent} too: give each its own --agent N")

@@ -8,7 +8,7 @@ from kiteline_codec.transport.seal_watch import SealWatch
 from kiteline_hw.links.kinds import link_traits
 from kiteline_hw.links.sealed_link import SealedHub, SealedLineHub, WatchedHub
 from kiteline_hw.links.zenoh_link import ZenohHub
-from kiteline_hw.ports import LinkError, LinkHub
+from kiteline_hw.ports import LinkError, LinkHub, link_messages
 from kiteline_hw.system.key_store import MAPS, WatchedKeys, login_of, read_file
 
 _LOOK_NS = 1_000_000_000  # between two looks at the file of keys
@@ -49,7 +49,7 @@ class BaseSeals:
 
     def lines(self, now_ns: int) -> list[str]:
         """Messages to the user since the last call. Takes new keys, too."""
-        lines = self._watch.lines()
+        lines = [*link_messages(self._link), *self._watch.lines()]
         if now_ns - self._looked_ns >= _LOOK_NS:
             self._looked_ns = now_ns
             lines += self._new_keys()

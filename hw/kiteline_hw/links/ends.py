@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
-from kiteline_hw.ports import ByteLink, Framer
+from kiteline_hw.ports import ByteLink, Framer, link_messages
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +36,10 @@ class OneLinkHub:
     def alive(self) -> frozenset[int]:
         """The agent at the other end: a silent one cannot be distinguished from one that is away."""
         return frozenset(self._links)
+
+    def take_messages(self) -> list[str]:
+        """What is to be told of the link since the last call."""
+        return [message for link in self._links.values() for message in link_messages(link)]
 
     def close(self) -> None:
         """Close the link."""

@@ -30,6 +30,10 @@ class SerialLink(QueuedLink):
         """True if the port is open; a radio without a peer looks the same."""
         return self._port.connected
 
+    def take_messages(self) -> list[str]:
+        """See SerialPort."""
+        return self._port.take_messages()
+
     def _on_data(self, data: bytes) -> None:
         for packet in self._framer.feed(data):
             self.deliver(packet)

@@ -68,6 +68,7 @@ class SerialPort:
         self.callback_errors = 0
         self.connected = False
         self.fault = ""  # why the port is not open
+        self._told_away = False
         port: serial.Serial | None = None
         try:
             port = self._open()
@@ -89,6 +90,18 @@ class SerialPort:
         self.fault = ""
         return port
 
+    def take_messages(self) -> list[str]:
+        """That the port is away, with the reason, or back, once each; from one thread."""
+        fault = "" if self.connected else self.fault
+        if bool(fault) == self._told_away:
+            return []
+        self._told_away = bool(fault)
+        return [
+            f"serial port {self._device}: {fault}; it is tried again"
+            if fault
+            else f"serial port {self._device} is back"
+        ]
+
     def wake(self) -> None:
         """Make the thread call `next_out`. Never blocks; from any thread."""
         with contextlib.suppress(OSError):  # a full pipe wakes the thread anyway; a closed one has no thread
@@ -109,8 +122,8 @@ class SerialPort:
             try:
                 self._exchange(port)
             except _ERRORS:
-                self._hang_up(port)
                 self.fault = _UNPLUGGED
+                self._hang_up(port)
                 port = None
                 self._closed.wait(retry_s)
         if port is not None:

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from cobs import cobs
 
+from kiteline_hw.links.ends import OneLinkHub
 from kiteline_hw.links.queued_link import OUTBOX_PACKETS
 from kiteline_hw.links.serial_link import SerialLink
 from kiteline_hw.ports import LinkError
@@ -118,12 +119,17 @@ def test_reopened_after_a_hang_up(tmp_path: Path) -> None:
     device.symlink_to(first.a)
     with SerialLink(str(device), 57600, CobsFramer()) as a, SerialLink(second.b, 57600, CobsFramer()) as b:
         assert a.send(b"lost")
+        assert a.take_messages() == []
         first.close()
         wait_for(lambda: not a.connected)
         assert not a.send(b"refused")
+        told = a.take_messages()
+        assert len(told) == 1 and str(device) in told[0] and "tried again" in told[0]
+        assert a.take_messages() == []
         device.unlink()
         device.symlink_to(second.a)
         wait_for(lambda: a.connected)
+        assert OneLinkHub(a, 3).take_messages() == [f"serial port {device} is back"]
         assert a.counters.reconnects == 2
         assert a.send(b"back")
         received: list[bytes] = []
@@ -144,6 +150,7 @@ def test_a_port_in_use_or_missing_is_named() -> None:
             SerialLink("/dev/ttyNONE", 57600, CobsFramer())
         with SerialLink("/dev/ttyNONE", 57600, CobsFramer(), required=False) as waiting:
             assert not waiting.connected and not waiting.send(b"x") and waiting.receive() == []
+            assert waiting.take_messages() == ["serial port /dev/ttyNONE: the device is missing; it is tried again"]
 
 
 def test_a_framer_that_raises_is_counted() -> None:

@@ -69,6 +69,10 @@ class MavlinkConnection:
         """Why the serial port is not open; "" if it is, or if there is none."""
         return "" if self._serial is None else self._serial.fault
 
+    def take_messages(self) -> list[str]:
+        """That the serial port is away or back, once each."""
+        return [] if self._serial is None else self._serial.take_messages()
+
     def _next_out(self) -> bytes:
         return self._outbox.popleft() if self._outbox else b""
 

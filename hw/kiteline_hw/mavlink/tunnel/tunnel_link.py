@@ -70,6 +70,10 @@ class MavlinkTunnelLink(TunnelQueue, Closing):
         """True if anything came from the other end lately."""
         return self._end.heard_within(_ALIVE_NS, self._clock())
 
+    def take_messages(self) -> list[str]:
+        """See MavlinkConnection."""
+        return self._connection.take_messages()
+
     def _on_data(self, data: bytes, datagram: bool, adopt: Adopt | None) -> None:
         with self._lock:
             messages = self._end.codec.receive(data, datagram=datagram)
@@ -103,6 +107,10 @@ class TunnelHub:
     def alive(self) -> frozenset[int]:
         """The agent, if anything of it came in the last ten seconds."""
         return frozenset((self._agent,) if self._link.alive else ())
+
+    def take_messages(self) -> list[str]:
+        """What is to be told of the link since the last call."""
+        return self._link.take_messages()
 
     def close(self) -> None:
         """Close the link."""
