@@ -88,7 +88,7 @@ class LoopConfig:
     scale_sigma: float = 0.02  # standard error of the scale's logarithm: the bundle corrects a few percent
     columns: int = 6  # cells across the image: a poster that hangs twice fills few of them
     rows: int = 4  # cells down the image
-    predecessors: int = 4  # keyframes before a matched one that are verified too: their views still overlap
+    predecessors: int = 4  # keyframes beside matched ones that are verified too: their views still overlap
     against: int = 3  # agreeing keyframes needed more for each one that contradicts
     agree_m: float = 0.10  # m; between two corrections that agree
     agree_depth: float = 0.04  # added share of the median depth

@@ -13,7 +13,7 @@ from kiteline_agent.governor.cost_model import Work
 from kiteline_agent.inertial.preintegration import Samples
 from kiteline_agent.inertial_start_config import ContradictionConfig
 from kiteline_agent.initialisation import inertial_start
-from kiteline_agent.initialisation.contradiction import ContradictionWatch, contradicts
+from kiteline_agent.initialisation.contradiction import ContradictionWatch, accuses_imu, contradicts
 from kiteline_agent.initialisation.corner_tracks import CornerObservations
 from kiteline_agent.initialisation.inertial_start import InertialStart
 from kiteline_agent.initialisation.window_noise import WindowNoise
@@ -114,6 +114,27 @@ def test_what_calibrated_and_worn_rigs_show_is_no_contradiction(
         state=SimpleNamespace(lens=lens), bias=np.array([0.0, 0.0, 0.0, 0.0, accel_bias_m_s2, 0.0])
     )
     assert contradicts(solution, gyro_noise, PRIOR, info, ContradictionConfig()) is wrong
+
+
+def test_the_imu_is_given_up_for_what_it_shows_and_for_a_lens_alone_much_later() -> None:
+    config = ContradictionConfig(lasts_s=5.0, lens_lasts_s=24.0)
+    watch = ContradictionWatch(config)
+    assert not any(watch.note(k * 10**9, contradicts=True, by_imu=k == 3) and watch.certain for k in range(9))
+    assert not watch.certain  # a lens may be off beside a true IMU
+    for k in range(9, 24):
+        watch.note(k * 10**9, contradicts=True, by_imu=False)
+    assert not watch.certain
+    watch.note(24 * 10**9, contradicts=True, by_imu=False)
+    assert watch.certain
+    watch.note(25 * 10**9, contradicts=False)
+    assert not watch.certain
+    for k in range(26, 32):
+        watch.note(k * 10**9, contradicts=True, by_imu=True)
+    assert watch.certain
+    # windows as starts show them: the real flight backward, whose lens is off; two axes negated; accelerations in g
+    for gyro_noise, bias_m_s2, imu in ((0.2, 0.16, False), (7.4, 0.1, True), (0.2, 8.3, True)):
+        solution: Any = SimpleNamespace(bias=np.array([0.0, 0.0, 0.0, 0.0, bias_m_s2, 0.0]))
+        assert accuses_imu(solution, gyro_noise, PRIOR, config) is imu
 
 
 def test_a_contradiction_is_told_once_it_lasts_and_again_after_an_end() -> None:

@@ -31,24 +31,39 @@ def contradicts(
     )
 
 
+def accuses_imu(solution: WindowSolution, gyro_noise: float, prior: BiasPrior, config: ContradictionConfig) -> bool:
+    """True if a window that contradicts does so by more than its lens: a lens may be off beside a true IMU."""
+    off = (solution.bias[3:] - prior.bias[3:]) / prior.sigma[3:]
+    return bool(gyro_noise > config.both_gyro_noise or np.abs(off).max() > config.accel_bias)
+
+
 class ContradictionWatch:
-    """Reports once that all windows of some seconds contradict, and again after one that does not."""
+    """Reports once that all windows of some seconds contradict, and again after one that does not.
+
+    certain: they do by the IMU, or for so long that no window will tell more.
+    """
 
     def __init__(self, config: ContradictionConfig) -> None:
         self._config = config
         self._since_ns: int | None = None  # first of the windows that contradict
-        self.certain = False  # all windows of `lasts_s` contradict
+        self._by_imu_since_ns: int | None = None  # first of those that do by more than the lens
+        self._told = False
+        self.certain = False
 
-    def note(self, t_ns: int, *, contradicts: bool | None) -> list[str]:
+    def note(self, t_ns: int, *, contradicts: bool | None, by_imu: bool = True) -> list[str]:
         """Process a window that ends at t_ns; returns the events for the log. contradicts: None if it tells neither."""
         if contradicts is None:
             return []
         if not contradicts:
-            self._since_ns, self.certain = None, False
+            self._since_ns = self._by_imu_since_ns = None
+            self._told = self.certain = False
             return []
-        if self._since_ns is None:
-            self._since_ns = t_ns
-        if self.certain or (t_ns - self._since_ns) * 1e-9 < self._config.lasts_s:
+        since_ns = self._since_ns = t_ns if self._since_ns is None else self._since_ns
+        by_imu_ns = t_ns if self._by_imu_since_ns is None else self._by_imu_since_ns
+        self._by_imu_since_ns = by_imu_ns if by_imu else None
+        lasts_ns, lens_lasts_ns = (round(1e9 * s) for s in (self._config.lasts_s, self._config.lens_lasts_s))
+        self.certain = (by_imu and t_ns - by_imu_ns >= lasts_ns) or t_ns - since_ns >= lens_lasts_ns
+        if self._told or t_ns - since_ns < lasts_ns:
             return []
-        self.certain = True
+        self._told = True
         return [_WARNING]

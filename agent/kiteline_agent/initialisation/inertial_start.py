@@ -11,7 +11,7 @@ from kiteline_agent.governor.cost_model import Work
 from kiteline_agent.inertial.preintegration import BiasPrior, Samples, preintegrate
 from kiteline_agent.inertial.sample_buffer import SampleBuffer
 from kiteline_agent.initialisation import corner_tracks, lens_correction
-from kiteline_agent.initialisation.contradiction import ContradictionWatch, contradicts
+from kiteline_agent.initialisation.contradiction import ContradictionWatch, accuses_imu, contradicts
 from kiteline_agent.initialisation.corner_tracks import CornerObservations, CornerTracks, TrackedKeyframe
 from kiteline_agent.initialisation.inertial_bundle import InertialBundle, lens_prior
 from kiteline_agent.initialisation.inertial_window import InParts, WarmStart, WindowSolution, lengths_apart
@@ -43,7 +43,7 @@ class InertialMap:
     frame: the newest keyframe of the window. points: new landmarks. solution: its window. cov: (17,17) of the state, as
     in InertialState. scale_sigma: relative deviation of the scale. duration_s: length of the window. accel_noise:
     factor on the accelerometer's noise. lens: (8,) found of the camera (lens_correction), with which the landmarks'
-    pixels are corrected.
+    pixels are corrected. keyframes (K), corners (K,P): of the window.
     """
 
     frame: FrameContext
@@ -54,6 +54,8 @@ class InertialMap:
     duration_s: float
     accel_noise: float
     lens: F64
+    keyframes: tuple[TrackedKeyframe, ...]
+    corners: CornerObservations
 
 
 @dataclass(frozen=True, slots=True)
@@ -238,7 +240,8 @@ class InertialStart:
             noise, sigma = self._seen_noise(solution)
         self._before = _Window(stamps, observations.ids, found.xyz, solution)
         wrong, fits = self._contradicts(solution, noise), solution.converged and self._fits(solution)
-        self._note_contradiction(ctx.t_ns, contradicts=wrong if wrong or fits else None)
+        by_imu = wrong and self._accuses_imu(solution, noise)
+        self._note_contradiction(ctx.t_ns, contradicts=wrong if wrong or fits else None, by_imu=by_imu)
         known = fits and sigma < config.scale_sigma and not wrong
         agrees = before is not None and self._agrees(before, self._before)
         self._noise = modelled
@@ -260,7 +263,10 @@ class InertialStart:
         lens = solution.state.lens
         assert self._vibration is not None
         accel_noise = noise.accel * max(self._vibration.level_now, 1.0)
-        return InertialMap(ctx, points, solution, cov, solution.scale_sigma, duration_s, accel_noise, lens)
+        return InertialMap(
+            ctx, points, solution, cov, solution.scale_sigma, duration_s, accel_noise, lens, tuple(keyframes),
+            all_corners,
+        )  # fmt: skip
 
     def _solve(
         self, corners: CornerObservations, intervals: list[Samples], prior: BiasPrior, warm: WarmStart | None
@@ -337,8 +343,12 @@ class InertialStart:
         gyro_noise, limits = noise.gyro / self._measured_noise().gyro, self._config.inertial_start.contradiction
         return contradicts(solution, gyro_noise, self._default_prior(), self._lens_prior, limits)
 
-    def _note_contradiction(self, t_ns: int, *, contradicts: bool | None) -> None:
-        self._warnings += self._contradiction.note(t_ns, contradicts=contradicts)
+    def _accuses_imu(self, solution: WindowSolution, noise: WindowNoise) -> bool:
+        gyro_noise, limits = noise.gyro / self._measured_noise().gyro, self._config.inertial_start.contradiction
+        return accuses_imu(solution, gyro_noise, self._default_prior(), limits)
+
+    def _note_contradiction(self, t_ns: int, *, contradicts: bool | None, by_imu: bool = True) -> None:
+        self._warnings += self._contradiction.note(t_ns, contradicts=contradicts, by_imu=by_imu)
 
     def _agrees(self, before: _Window, now: _Window) -> bool:
         """True if later frames confirm the scale: the keyframes of both solutions are as far apart in both."""
