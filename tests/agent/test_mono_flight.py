@@ -1,5 +1,6 @@
 """A monocular flight: it begins when two views give depth, keeps its own scale, and landmarks find their true depth."""
 
+from collections import Counter
 from dataclasses import replace
 from functools import cache
 from itertools import pairwise
@@ -17,18 +18,18 @@ from kiteline_agent.imaging.features import DetectorConfig, build_pyramid
 from kiteline_agent.initialisation.two_view_start import TwoViewStart
 from kiteline_agent.keyframes.depth_from_motion import triangulated_sigma
 from kiteline_agent.runtime.controller import pose_sample
-from kiteline_agent.runtime.frame_counts import live_line, odometry_line
+from kiteline_agent.runtime.frame_counts import FrameCounts, live_line, odometry_line
 from kiteline_agent.step import Estimate, Identity, StepInput
 from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_agent.tracking.frame_images import FrameImages
 from kiteline_agent.tracking.track import Track
 from kiteline_codec.channel import plain_pair
-from kiteline_codec.schema import NewLandmarks
+from kiteline_codec.schema import KeyframeHeader, NewLandmarks, Observations
 from kiteline_core.arrays import F64, U8
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraModel, CameraRig, Rectifier
-from kiteline_core.ids import NO_KEYFRAME, AgentId, submap_of_keyframe
+from kiteline_core.ids import KEYPOINT_BITS, NO_KEYFRAME, AgentId, submap_of_keyframe
 from kiteline_hw.sources.open import open_source
 
 W, H, FOCAL = 320, 240, 220.0
@@ -260,8 +261,32 @@ def test_an_imu_gives_metres_from_the_first_pose_on() -> None:
     # the map is gravity-aligned from its first pose on: the camera's y axis points down
     up = np.array([e.T_o_b[2, :3] for e in estimates[first:]])
     assert np.degrees(np.arccos(np.clip((up * -true[:, 1, :3]).sum(axis=1), -1.0, 1.0))).max() < 2.0
-    new_landmarks = [r for r in far.receive((), 0) if isinstance(r, NewLandmarks) and (r.inv_depth > 0).any()]
+    records = far.receive((), 0)
+    new_landmarks = [r for r in records if isinstance(r, NewLandmarks) and (r.inv_depth > 0).any()]
     assert {submap_of_keyframe(r.keyframe) for r in new_landmarks} == {e.submap for e in estimates[first:]}
+    counts = FrameCounts()
+    for e in estimates:
+        counts.count(e)
+    headers = {r.keyframe: r for r in records if isinstance(r, KeyframeHeader)}
+    assert counts.keyframes == len(headers)
+    # the base also gets what the camera saw before, from the first frame on
+    began_ns = estimates[first].t_ns
+    early = [k for k in sorted(headers) if headers[k].t_ns < began_ns]
+    assert len(early) >= 3 and headers[early[0]].t_ns == estimates[0].t_ns
+    T_m_k: dict[int, F64] = {NO_KEYFRAME: np.eye(4)}
+    for k in sorted(headers):
+        T_m_k[k] = T_m_k[headers[k].parent] @ headers[k].T_p_k
+    at = np.array([T_m_k[k][:3, 3] for k in early])
+    true_at = np.array([path(3.0 + haste * headers[k].t_ns / 5e7)[:3, 3] for k in early])
+    scale, error_m = similar(at, true_at)
+    assert scale == pytest.approx(1.0, abs=0.05) and error_m < 0.02
+    observed = np.concatenate([r.point for r in records if isinstance(r, Observations) and r.keyframe in early])
+    shared = Counter(dict.fromkeys(early, 0))
+    for r in records:
+        if isinstance(r, NewLandmarks) and r.keyframe in shared:
+            shared[r.keyframe] += len(r.index)
+    assert len(observed) > 50 and {int(p) >> KEYPOINT_BITS for p in observed} <= set(early)
+    assert min(shared.values()) > 30  # corners as any keyframe has them, not only those that were followed
 
 
 @pytest.mark.parametrize("percent", [8.0, 30.0])

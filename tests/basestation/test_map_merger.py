@@ -85,6 +85,20 @@ def test_predecessors_of_a_matched_keyframe_are_verified(
         assert np.sqrt(np.mean(joint_error_m(mapper, [first, second]) ** 2)) < 0.03
 
 
+@pytest.mark.parametrize("keyframes", [1, 2])
+def test_two_keyframes_suffice_where_two_of_the_other_map_match(
+    make_flight: MakeFlight, words: Any, keyframes: int
+) -> None:
+    first = make_flight(keyframes=24, turns=0.45, start=0.3, variant=1, agent=1)
+    second = make_flight(keyframes=keyframes, turns=0.02, start=0.4, T_w_m=ELSEWHERE)
+    mapper = Mapper(WITHOUT_GRID, words)
+    feed(mapper, [first, second], [0, 24])
+    assert mapper.merger is not None and mapper.merger.detector.verified >= 1
+    assert mapper.summary()["merges"] == keyframes - 1  # one view alone merges nothing
+    if keyframes == 2:
+        assert np.sqrt(np.mean(joint_error_m(mapper, [first, second]) ** 2)) < 0.03
+
+
 def test_agents_share_maps_within_groups(make_flight: MakeFlight, words: Any) -> None:
     flights = [
         make_flight(keyframes=16, turns=0.45, start=0.3 * n, variant=n, agent=n, T_w_m=se3.exp(np.full(6, 0.2 * n)))

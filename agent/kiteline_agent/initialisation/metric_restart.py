@@ -16,6 +16,7 @@ from kiteline_agent.tracking.track import Track
 from kiteline_core.arrays import F64, U8
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import KeyframeId
+from kiteline_core.order_statistics import median
 
 _MIN_SIGMA_PX = 0.06  # px of virtual disparity, of depths that many frames have sharpened
 
@@ -26,6 +27,10 @@ class MetricPoints:
 
     points: NewPoints
     sigma_rho: F64
+
+    def median_depth_m(self, camera: RectifiedCamera) -> float:
+        """Their median depth."""
+        return camera.bf / median(self.points.disparity)
 
     def set_sigma(self, local_map: LocalMap, keyframe: KeyframeId) -> None:
         """Write the deviations of their depths into the local map."""

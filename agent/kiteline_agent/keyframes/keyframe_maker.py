@@ -11,7 +11,7 @@ import numpy as np
 from kiteline_agent.governor.cost_model import Work
 from kiteline_agent.imaging import alignment_kernels
 from kiteline_agent.imaging.row_alignment import RowAlignment
-from kiteline_agent.keyframes.new_landmarks import NewPoints, moved_to_frame, new_points
+from kiteline_agent.keyframes.new_landmarks import EarlierView, NewPoints, moved_to_frame, new_points
 from kiteline_agent.local_map.keyframe_landmarks import KeyframeLandmarks
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.tracking.frame_context import FrameContext
@@ -21,7 +21,7 @@ from kiteline_codec.coding import quantise
 from kiteline_codec.schema import KeyframeHeader, NewLandmarks, Observations
 from kiteline_core.arrays import F32, F64, I64
 from kiteline_core.geometry import se3
-from kiteline_core.ids import NO_KEYFRAME, KeyframeId
+from kiteline_core.ids import NO_KEYFRAME, KeyframeId, point_id
 
 _MIN_RHO = 1e-4  # 1/m; farther counts as infinitely far
 _DEPTH_CAMERA_SIGMA_RHO = 2.85e-3  # 1/m, of a structured-light camera, constant (K. Khoshelham, S. Elberink, 2012)
@@ -89,12 +89,8 @@ class KeyframeMaker:
         shared = self._map.is_shared(rows)
         observations = self._observations(keyframe, rows[shared], seen[shared], min(len(order), profile.landmarks))
         sections = profile.choose(landmarks, strength, observations)
-        n_keypoints = sum(len(b.index) for b in sections[0]) + sum(len(s.index) for s in sections[1])
         self._count(ctx, len(landmarks.index), len(observations.index))
-        header = self._channel.put(KeyframeHeader(keyframe, ctx.t_ns, parent, T_p_k, n_keypoints, *(up or ())))
-        assert isinstance(header, KeyframeHeader)
-        for section in (*sections[0], *sections[1]):
-            self._channel.put(section)
+        header = self._put(keyframe, ctx.t_ns, parent, T_p_k, sections, up)
         seen_uv = self._store(ctx, header, T_m_k, points, order, landmarks)
         self._map.share(keyframe, sum(len(part.index) for part in sections[0]))
         self.new_uv = seen_uv[: min(len(order), profile.landmarks)]
@@ -109,6 +105,43 @@ class KeyframeMaker:
         self._count(ctx, len(order), 0)
         self._store(ctx, KeyframeHeader(keyframe, ctx.t_ns, parent, T_m_k, 0), T_m_k, points, order, landmarks)
         self._map.share(keyframe, 0)
+
+    def share(
+        self, ctx: FrameContext, view: EarlierView, keyframe: KeyframeId, parent: KeyframeId, T_p_k: F64,
+        landmarks: dict[int, int],
+    ) -> F64:  # fmt: skip
+        """Share a keyframe of an earlier frame with the base alone. Returns T_p_k (4,4) as the base holds it.
+
+        landmarks: ids by the number of a corner, of those that were shared before; these are observations here.
+        """
+        seen = np.array([corner in landmarks for corner in view.ids.tolist()], np.bool_)
+        points, profile = view.points.part(~seen), self._channel.profile
+        order = _in_order_of_rows(points, ctx.config.detector.cell_px, profile.landmarks)
+        new, strength = self._new_landmarks(keyframe, points, order)
+        at = np.array([landmarks[corner] for corner in view.ids[seen].tolist()], np.int64)
+        by_id, first = np.argsort(at), min(len(order), profile.landmarks)
+        old = view.points.part(seen)
+        observations = Observations(
+            keyframe, 0, np.arange(first, first + len(at), dtype=np.uint16), old.uv[by_id].astype(np.float32),
+            np.zeros(len(at), np.float32), old.octave[by_id], at[by_id],
+        )  # fmt: skip
+        for index, corner in enumerate(view.ids[~seen][order][:first].tolist()):
+            if corner >= 0:
+                landmarks[corner] = point_id(keyframe, index)
+        self._count(ctx, len(new.index), len(at))
+        return self._put(keyframe, view.t_ns, parent, T_p_k, profile.choose(new, strength, observations), None).T_p_k
+
+    def _put(
+        self, keyframe: KeyframeId, t_ns: int, parent: KeyframeId, T_p_k: F64,
+        sections: tuple[list[NewLandmarks], list[Observations]], up: tuple[F64, float] | None,
+    ) -> KeyframeHeader:  # fmt: skip
+        """Share a keyframe's records. Returns its header as the base holds it."""
+        n_keypoints = sum(len(b.index) for b in sections[0]) + sum(len(s.index) for s in sections[1])
+        header = self._channel.put(KeyframeHeader(keyframe, t_ns, parent, T_p_k, n_keypoints, *(up or ())))
+        assert isinstance(header, KeyframeHeader)
+        for section in (*sections[0], *sections[1]):
+            self._channel.put(section)
+        return header
 
     def _inliers(self, track: Track) -> tuple[I64, F64]:
         """Rows (n,) and observations (n,3) of the inliers, by landmark id."""

@@ -8,7 +8,7 @@ from kiteline_agent.config import AgentConfig
 from kiteline_agent.imaging import features, stereo_kernels
 from kiteline_agent.tracking.frame_images import NO_GRID, FrameImages, depth_at
 from kiteline_agent.tracking.rolling_shutter import RollingShutter
-from kiteline_core.arrays import F64, U8
+from kiteline_core.arrays import F64, I64, U8, Bool
 from kiteline_core.geometry.cameras import RectifiedCamera
 
 _SEARCH_PX = 2.5  # px of the level: range of sub-pixel stereo around the coarse search, whose step is 2 px
@@ -29,6 +29,27 @@ class NewPoints:
     angle: U8
     descriptor: U8
     roll_px: F64 | None = None
+
+    def part(self, keep: Bool) -> "NewPoints":
+        """Those where `keep` (n,) is True."""
+        roll_px = None if self.roll_px is None else self.roll_px[keep]
+        return NewPoints(
+            self.uv[keep], self.disparity[keep], self.octave[keep], self.angle[keep], self.descriptor[keep], roll_px
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class EarlierView:
+    """A keyframe of a frame before a map's first one, for the base alone.
+
+    T_n_k: (4,4) its camera in that of the map's first frame. points: its corners, without depths, as a true camera
+    shows them. ids: (n,) of those that other such keyframes show too, increasing; -1 of the others, which come last.
+    """
+
+    t_ns: int
+    T_n_k: F64
+    points: NewPoints
+    ids: I64
 
 
 def new_points(images: FrameImages, taken: F64, camera: RectifiedCamera, config: AgentConfig) -> NewPoints:

@@ -1,9 +1,14 @@
 """Makes keyframes of frames, and enters them in all that reads keyframes."""
 
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+
 from kiteline_agent.governor.cost_model import Work
 from kiteline_agent.governor.governor import Extra, Governor
 from kiteline_agent.keyframes.keyframe_maker import KeyframeMaker
-from kiteline_agent.keyframes.new_landmarks import NewPoints
+from kiteline_agent.keyframes.new_landmarks import EarlierView, NewPoints
 from kiteline_agent.mapping.camera_state import CameraState
 from kiteline_agent.relocalisation.relocaliser import Relocaliser
 from kiteline_agent.tracking.frame_context import FrameContext
@@ -99,6 +104,17 @@ class KeyframeStage:
         self._relocaliser.add_keyframe(keyframe)
         self._finish(ctx, keyframe, kind)
         return keyframe
+
+    def share_earlier(self, ctx: FrameContext, views: Sequence[EarlierView]) -> None:
+        """Share keyframes of what the camera saw before this frame, the first one of a map."""
+        reference, submap, T_m_c = self._camera.reference, self._camera.submaps.active, self._camera.pose.T_m_c
+        poses = [*(T_m_c @ view.T_n_k for view in views), T_m_c]
+        landmarks: dict[int, int] = {}
+        T_m_p = np.eye(4)
+        for view, (T_m_k, T_m_next) in zip(views, pairwise(poses), strict=True):
+            keyframe, parent, T_p_k = reference.next_keyframe(submap, T_m_k)
+            T_m_p = se3.orthonormalise(T_m_p @ self._maker.share(ctx, view, keyframe, parent, T_p_k, landmarks))
+            reference.set_new(keyframe, submap, T_m_next, T_m_p, view.t_ns, ctx.number)
 
     def _finish(self, ctx: FrameContext, keyframe: KeyframeId, kind: Extra) -> None:
         self._governor.note(kind)

@@ -15,6 +15,7 @@ from kiteline_agent.keyframes.depth_from_motion import DepthFromMotion
 from kiteline_agent.keyframes.keyframe_maker import KeyframeMaker
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.mapping.camera_state import CameraState
+from kiteline_agent.mapping.earlier_views import earlier_views
 from kiteline_agent.mapping.keyframe_stage import KeyframeStage
 from kiteline_agent.mapping.submaps import TRACKED_M, TRACKED_RAD
 from kiteline_agent.motion.loss_motion import LossMotion
@@ -165,6 +166,8 @@ class SubmapStage:
             camera.set_first_gravity(solution.T_w_b[:3, :3].T @ solution.gravity)
         submap = camera.open_submap()
         camera.pose.reset_motion()
+        gap_ns = self._channel.keyframe_gap_ns()
+        self._keyframes.share_earlier(ctx, earlier_views(found, self._map.camera, ctx.config, gap_ns))
         keyframe = self._keyframes.make(ctx, None, found.points.points, camera.pose.T_m_c, Extra.SUBMAP)
         found.points.set_sigma(self._map, keyframe)
         self._channel.put(SubmapScale(submap, 1.0))

@@ -9,7 +9,7 @@ from kiteline_agent.runtime.frame_reader import SAMPLES
 from kiteline_agent.step import Estimate, PredictedPose
 from kiteline_core.arrays import F64
 from kiteline_core.geometry import tum
-from kiteline_core.ids import NO_KEYFRAME, KeyframeId, SubmapId, submap_of_keyframe
+from kiteline_core.ids import SubmapId, keyframe_id, submap_of_keyframe
 
 
 @dataclass(slots=True)
@@ -30,7 +30,7 @@ class FrameCounts:
     bytes_down: int = 0
     keyframes: int = 0
     submaps: set[SubmapId] = field(default_factory=set)
-    _newest: dict[SubmapId, KeyframeId] = field(default_factory=dict)  # keyframe of each submap
+    _newest: dict[SubmapId, int] = field(default_factory=dict)  # keyframe of each submap
 
     @property
     def frames(self) -> int:
@@ -50,9 +50,10 @@ class FrameCounts:
             self.bridged += estimate.bridged
         if estimate is not None and estimate.keyframe >= 0:
             submap = submap_of_keyframe(estimate.keyframe)
-            if estimate.keyframe > self._newest.get(submap, NO_KEYFRAME):
+            newest = self._newest.get(submap, keyframe_id(submap, 0) - 1)
+            if estimate.keyframe > newest:  # several, where a map begins with what the camera saw before
                 self._newest[submap] = estimate.keyframe
-                self.keyframes += 1
+                self.keyframes += estimate.keyframe - newest
             self.submaps.add(estimate.submap)
 
     def as_report(self) -> dict[str, int | float]:

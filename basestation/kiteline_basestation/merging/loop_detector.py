@@ -5,6 +5,7 @@ accepted when enough keyframes agree on one correction and few or none contradic
 """
 
 from bisect import insort
+from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -135,7 +136,7 @@ class LoopDetector:
             if match is None:
                 continue
             self.verified += 1
-            found = found or self._weigh(match) or self._verify_predecessors(match)
+            found = found or self._weigh(match) or self._verify_neighbours(match)
         return found
 
     def rescale(self, factor: Mapping[KeyframeId, float]) -> None:
@@ -250,7 +251,8 @@ class LoopDetector:
         needed = _MIN_KEYFRAMES * (1 + 2 * self._contradicted.get(key, 0)) + config.against * len(against)
         if _pair(self._map.map_id(new), self._map.map_id(old)) in self.requested:
             needed = 1
-        if len(supporters) < needed or not (same_map or consistency.has_depth_relief(self._map, chosen, config)):
+        enough = len(supporters) >= needed if same_map else _is_supported(chosen, needed)
+        if not enough or not (same_map or consistency.has_depth_relief(self._map, chosen, config)):
             return None
         if not same_map and any(self._is_ambiguous(k) for m in chosen[-_MIN_KEYFRAMES:] for k in (m.old, m.new)):
             self.rejected += 1
@@ -259,24 +261,32 @@ class LoopDetector:
             self._matches[key] = []  # matches that merged maps stay, to be weighed against later ones
         return self._closure(best, chosen)
 
-    def _verify_predecessors(self, match: LoopMatch) -> LoopClosure | Contradiction | None:
-        """Verify the keyframes before a matched one too: where maps hardly overlap, few are found by the index."""
+    def _verify_neighbours(self, match: LoopMatch) -> LoopClosure | Contradiction | None:
+        """Verify the keyframes beside both matched ones too: where maps hardly overlap, few are found by the index.
+
+        Those before the new one are matched to the old one, and those around the old one to the new one.
+        """
         new, old = submap_of_keyframe(match.new), submap_of_keyframe(match.old)
         if self._map.map_id(new) == self._map.map_id(old):
             return None
-        same = self._map.submaps[new]
-        at = self._map.number_of(match.new)
-        for keyframe in reversed(same[max(0, at - self._config.predecessors) : at]):
+        count, correction = self._config.predecessors, correction_of(self._map, match)
+        same, other, at = self._map.submaps[new], self._map.submaps[old], self._map.number_of(match.old)
+        before = same[max(0, self._map.number_of(match.new) - count) : self._map.number_of(match.new)]
+        around = sorted(other[max(0, at - count) : at + count + 1], key=lambda k: abs(self._map.number_of(k) - at))
+        back = sim3.inverse(correction)
+        beside = [(k, match.old, correction) for k in reversed(before)] + [(k, match.new, back) for k in around]
+        for keyframe, place, guess in beside:
             if any(m.new == keyframe for m in self._matches[_pair(new, old)]):
                 continue
-            guess = guessed_pose(self._map, match, keyframe)
-            other = verify_loop(self._map, keyframe, match.old, self._config, guess=guess)
-            if other is None:
+            found = verify_loop(
+                self._map, keyframe, place, self._config, guess=guessed_pose(self._map, guess, keyframe)
+            )
+            if found is None:
                 continue
             self.verified += 1
-            found = self._weigh(other)
-            if found is not None:
-                return found
+            closure = self._weigh(found)
+            if closure is not None:
+                return closure
         return None
 
     def _closure(self, best: LoopMatch, chosen: Sequence[LoopMatch]) -> LoopClosure:
@@ -328,6 +338,17 @@ class LoopDetector:
             if float(np.linalg.norm(se3.transform(X, T[None, :3, 3])[0] - T[:3, 3])) > limit:
                 return True
         return False
+
+
+def _is_supported(matches: Sequence[LoopMatch], needed: int) -> bool:
+    """True if matches between two submaps are enough to merge them: as many as needed, with a keyframe more in both.
+
+    Two or more of either submap: one view alone may be of an object that stands in two places, from both of which other
+    views match it. Which of them were queried tells nothing but the order in which they came.
+    """
+    keyframes = {k for m in matches for k in (m.new, m.old)}
+    fewest = min(Counter(map(submap_of_keyframe, keyframes)).values())
+    return len(matches) >= needed and len(keyframes) > needed and fewest >= min(needed, 2)
 
 
 def known_matches(sparse_map: SparseMap, matches: Collection[LoopMatch]) -> list[LoopMatch]:

@@ -13,7 +13,7 @@ import numpy as np
 from kiteline_basestation.config import LoopConfig
 from kiteline_basestation.map.map_tables import LANDMARK
 from kiteline_basestation.map.sparse_map import SparseMap
-from kiteline_basestation.merging.loop_edges import LoopMatch, correction_of
+from kiteline_basestation.merging.loop_edges import LoopMatch
 from kiteline_basestation.merging.similarity import align_views
 from kiteline_basestation.refinement.landmark_matching import predict_projections
 from kiteline_core.arrays import F64, I32, U8, Bool
@@ -151,9 +151,11 @@ def verify_loop(
     )  # fmt: skip
 
 
-def guessed_pose(sparse_map: SparseMap, match: LoopMatch, keyframe: KeyframeId) -> tuple[F64, float]:
-    """T_c_w (4,4) of a keyframe in the old map, and the old map's scale over its own, by another keyframe's match."""
-    correction = correction_of(sparse_map, match)
+def guessed_pose(sparse_map: SparseMap, correction: F64, keyframe: KeyframeId) -> tuple[F64, float]:
+    """T_c_w (4,4) of a keyframe in another map, and that map's scale over its own.
+
+    correction: (4,4) by another match; it moves the keyframe's map in w onto the other one.
+    """
     moved = correction @ sim3.of(1.0, sparse_map.keyframes.T_w_k[sparse_map.rows[keyframe]])
     return se3.inverse(se3.orthonormalise(sim3.rigid(moved))), sim3.scale_of(correction)
 
