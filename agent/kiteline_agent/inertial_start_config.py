@@ -50,7 +50,7 @@ class ContradictionConfig:
     accel_bias: float = 5.0  # deviations of the accelerometer's bias: that of missing gravity is 40
     structure_px: float = 1.2  # median error of corners with the gyro's rotations: 0.3 if these are right, else 2
     lasts_s: float = 5.0  # time over which all windows contradict before it is said: people in view are gone by then
-    lens_lasts_s: float = 24.0  # before the IMU is given up where the lens alone is off: no window gets longer
+    unsure_s: float = 24.0  # before the IMU is given up where not every window accuses it: none gets longer
 
 
 @dataclass(frozen=True, slots=True)

@@ -117,7 +117,7 @@ def test_what_calibrated_and_worn_rigs_show_is_no_contradiction(
 
 
 def test_the_imu_is_given_up_for_what_it_shows_and_for_a_lens_alone_much_later() -> None:
-    config = ContradictionConfig(lasts_s=5.0, lens_lasts_s=24.0)
+    config = ContradictionConfig(lasts_s=5.0, unsure_s=24.0)
     watch = ContradictionWatch(config)
     assert not any(watch.note(k * 10**9, contradicts=True, by_imu=k == 3) and watch.certain for k in range(9))
     assert not watch.certain  # a lens may be off beside a true IMU
@@ -131,6 +131,10 @@ def test_the_imu_is_given_up_for_what_it_shows_and_for_a_lens_alone_much_later()
     for k in range(26, 32):
         watch.note(k * 10**9, contradicts=True, by_imu=True)
     assert watch.certain
+    assert not watch.note(32 * 10**9, contradicts=False) and not watch.certain
+    for k in range(33, 50):  # people in view: windows that fit nothing in between
+        watch.note(k * 10**9, contradicts=True if k % 3 else None, by_imu=True)
+        assert not watch.certain
     # windows as starts show them: the real flight backward, whose lens is off; two axes negated; accelerations in g
     for gyro_noise, bias_m_s2, imu in ((0.2, 0.16, False), (7.4, 0.1, True), (0.2, 8.3, True)):
         solution: Any = SimpleNamespace(bias=np.array([0.0, 0.0, 0.0, 0.0, bias_m_s2, 0.0]))

@@ -336,9 +336,9 @@ def test_a_still_camera_with_an_imu_has_no_pose() -> None:
 
 def test_images_alone_are_flown_where_the_imu_contradicts_them() -> None:
     config = AgentConfig()
-    begin, end, haste, contradicts_s = 4, 240, 0.8, 1.5
+    begin, end, haste = 4, 240, 0.8
     start = config.inertial_start
-    start = replace(start, contradiction=replace(start.contradiction, lasts_s=contradicts_s))
+    start = replace(start, contradiction=replace(start.contradiction, lasts_s=1.5, unsure_s=2.0))
     one = Agent(RIG, ImuCalibration(), replace(config, inertial_start=start), Identity(AgentId(0), 0), NoBaseChannel())
     estimates: list[Estimate] = []
     words: list[str] = []

@@ -40,19 +40,20 @@ def accuses_imu(solution: WindowSolution, gyro_noise: float, prior: BiasPrior, c
 class ContradictionWatch:
     """Reports once that all windows of some seconds contradict, and again after one that does not.
 
-    certain: they do by the IMU, or for so long that no window will tell more.
+    certain: they do by the IMU, every one, or for so long that no window will tell more.
     """
 
     def __init__(self, config: ContradictionConfig) -> None:
         self._config = config
         self._since_ns: int | None = None  # first of the windows that contradict
-        self._by_imu_since_ns: int | None = None  # first of those that do by more than the lens
+        self._by_imu_since_ns: int | None = None  # first of those in a row that do by more than the lens
         self._told = False
         self.certain = False
 
     def note(self, t_ns: int, *, contradicts: bool | None, by_imu: bool = True) -> list[str]:
         """Process a window that ends at t_ns; returns the events for the log. contradicts: None if it tells neither."""
         if contradicts is None:
+            self._by_imu_since_ns = None  # as with people all over the view, who shake it
             return []
         if not contradicts:
             self._since_ns = self._by_imu_since_ns = None
@@ -61,8 +62,8 @@ class ContradictionWatch:
         since_ns = self._since_ns = t_ns if self._since_ns is None else self._since_ns
         by_imu_ns = t_ns if self._by_imu_since_ns is None else self._by_imu_since_ns
         self._by_imu_since_ns = by_imu_ns if by_imu else None
-        lasts_ns, lens_lasts_ns = (round(1e9 * s) for s in (self._config.lasts_s, self._config.lens_lasts_s))
-        self.certain = (by_imu and t_ns - by_imu_ns >= lasts_ns) or t_ns - since_ns >= lens_lasts_ns
+        lasts_ns, unsure_ns = (round(1e9 * s) for s in (self._config.lasts_s, self._config.unsure_s))
+        self.certain = (by_imu and t_ns - by_imu_ns >= lasts_ns) or t_ns - since_ns >= unsure_ns
         if self._told or t_ns - since_ns < lasts_ns:
             return []
         self._told = True
