@@ -15,7 +15,7 @@ from kiteline_agent.inertial_start_config import CornerTracksConfig
 from kiteline_agent.initialisation import inertial_start
 from kiteline_agent.initialisation.corner_tracks import CornerObservations, CornerTracks, TrackedKeyframe, with_found
 from kiteline_agent.initialisation.inertial_start import InertialStart
-from kiteline_agent.initialisation.inertial_window import WindowSolution, finished
+from kiteline_agent.initialisation.inertial_window import SolvedWindow, WindowSolution, finished
 from kiteline_agent.initialisation.metric_restart import MetricPoints
 from kiteline_agent.initialisation.window_noise import WindowNoise
 from kiteline_agent.tracking.frame_context import FrameContext
@@ -111,7 +111,7 @@ def test_corners_that_alignment_finds_again_count_where_flow_lost_them() -> None
 def test_windows_whose_keyframes_coincide_confirm_no_scale() -> None:
     def at(places: np.ndarray[Any, Any]) -> Any:
         solution: Any = SimpleNamespace(state=SimpleNamespace(p=places))
-        return inertial_start._Window((0, 1, 2, 3), np.zeros(0, np.int64), np.zeros((0, 3)), solution)
+        return SolvedWindow((0, 1, 2, 3), np.zeros(0, np.int64), np.zeros((0, 3)), solution)
 
     start = InertialStart(CAMERA, CALIBRATION, AgentConfig(), Work())
     apart, together = np.arange(12.0).reshape(4, 3), np.ones((4, 3))
@@ -138,7 +138,7 @@ def test_a_lower_cost_at_the_same_scale_confirms_it(monkeypatch: pytest.MonkeyPa
     def is_lowest(scale: float, cost: float) -> tuple[bool, float]:
         """Whether a solution with cost 1000 stands beside this one from nothing; scale of the next start."""
         found, start = solved(1.0, 1000.0), InertialStart(CAMERA, CALIBRATION, AgentConfig(), Work())
-        start._before = inertial_start._Window((0, 1, 2, 3), np.zeros(0, np.int64), found.xyz, found.solution)
+        start._before = SolvedWindow((0, 1, 2, 3), np.zeros(0, np.int64), found.xyz, found.solution)
         monkeypatch.setattr(start, "_solve", lambda *_: at_once(solved(scale, cost)))
         stands = finished(start._is_lowest(found, None, [], None))  # type: ignore[arg-type]
         return stands, float(start._before.xyz[0, 0])

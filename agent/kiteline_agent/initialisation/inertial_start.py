@@ -14,7 +14,13 @@ from kiteline_agent.initialisation import corner_tracks, lens_correction
 from kiteline_agent.initialisation.contradiction import ContradictionWatch, accuses_imu, contradicts
 from kiteline_agent.initialisation.corner_tracks import CornerObservations, CornerTracks, TrackedKeyframe
 from kiteline_agent.initialisation.inertial_bundle import InertialBundle, lens_prior
-from kiteline_agent.initialisation.inertial_window import InParts, WarmStart, WindowSolution, lengths_apart
+from kiteline_agent.initialisation.inertial_window import (
+    InParts,
+    SolvedWindow,
+    WarmStart,
+    WindowSolution,
+    lengths_apart,
+)
 from kiteline_agent.initialisation.landmark_realignment import realigned
 from kiteline_agent.initialisation.metric_restart import MetricPoints, metric_points_at
 from kiteline_agent.initialisation.window_noise import LEAST, MOST, Vibration, WindowNoise, vibration
@@ -59,16 +65,6 @@ class InertialMap:
 
 
 @dataclass(frozen=True, slots=True)
-class _Window:
-    """A solution, stamps of its K keyframes, ids (P,) of its corners and their places (P,3) m."""
-
-    t_ns: tuple[int, ...]
-    ids: I64
-    xyz: F64
-    solution: WindowSolution
-
-
-@dataclass(frozen=True, slots=True)
 class _Solved:
     """A solution, its landmarks (P,3) m and the keyframe (P,) that saw each first."""
 
@@ -101,7 +97,7 @@ class InertialStart:
         self._tracks = CornerTracks(camera, detector, start.corner_tracks)
         self.waiting = WaitingFrames(start.corner_tracks.keyframe_s)
         self._buffer = SampleBuffer(start.max_span_s + 1.0, config.inertial.max_gap_s)
-        self._before: _Window | None = None
+        self._before: SolvedWindow | None = None
         self._noise: WindowNoise | None = None  # as the windows so far show it
         self._vibration: Vibration | None = None  # of the newest window
         self._lens_prior = lens_prior(start.bundle, camera.fx)
@@ -214,7 +210,7 @@ class InertialStart:
         before, stamps = self._before, tuple(k.t_ns for k in keyframes)
         self._measure_vibration(intervals)
         assert self._noise is not None
-        warm = None if before is None else _warm(before, stamps, observations)
+        warm = None if before is None else before.warm_start(stamps, observations.ids)
         found = None if warm is None else (yield from self._solve(observations, intervals, prior, warm))
         if found is None or not self._fits(found.solution):
             warm, found = None, (yield from self._solve(observations, intervals, prior, None))
@@ -238,7 +234,7 @@ class InertialStart:
             warmer = WarmStart(solution.state, found.xyz[keep])
             solution = (yield from self._counted(again.solving(warmer), intervals)) or solution
             noise, sigma = self._seen_noise(solution)
-        self._before = _Window(stamps, observations.ids, found.xyz, solution)
+        self._before = SolvedWindow(stamps, observations.ids, found.xyz, solution)
         wrong, fits = self._contradicts(solution, noise), solution.converged and self._fits(solution)
         by_imu = wrong and self._accuses_imu(solution, noise)
         self._note_contradiction(ctx.t_ns, contradicts=wrong if wrong or fits else None, by_imu=by_imu)
@@ -350,7 +346,7 @@ class InertialStart:
     def _note_contradiction(self, t_ns: int, *, contradicts: bool | None, by_imu: bool = True) -> None:
         self._warnings += self._contradiction.note(t_ns, contradicts=contradicts, by_imu=by_imu)
 
-    def _agrees(self, before: _Window, now: _Window) -> bool:
+    def _agrees(self, before: SolvedWindow, now: SolvedWindow) -> bool:
         """True if later frames confirm the scale: the keyframes of both solutions are as far apart in both."""
         common = [t for t in now.t_ns if t in set(before.t_ns)]
         if len(common) < _MIN_COMMON:
@@ -394,18 +390,3 @@ class InertialStart:
         self._tracks.drop_before(keyframes[last_missing + 1].t_ns)
         self._tried_ns = None
         return None
-
-
-def _warm(before: _Window, t_ns: tuple[int, ...], corners: CornerObservations) -> WarmStart | None:
-    """The solution before as a start for the window of these keyframes; None if they have none in common."""
-    rows = [before.t_ns.index(t) for t in t_ns if t in before.t_ns]
-    if not rows:
-        return None
-    state = before.solution.state
-    xyz = np.full((len(corners.ids), 3), np.nan)
-    _, new, old = np.intersect1d(corners.ids, before.ids, return_indices=True)
-    xyz[new] = before.xyz[old]
-    part = replace(
-        state, R=state.R[rows], p=state.p[rows], v=state.v[rows], accel_bias=state.accel_bias[rows]
-    )  # fmt: skip
-    return WarmStart(part, xyz)

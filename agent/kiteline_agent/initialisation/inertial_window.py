@@ -1,14 +1,14 @@
 """States of a window of monocular keyframes with an IMU, and its solution, which is computed in parts."""
 
 from collections.abc import Generator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
 import numpy as np
 
 from kiteline_agent.initialisation.lens_correction import TERMS
 from kiteline_agent.initialisation.window_noise import NoiseEvidence
-from kiteline_core.arrays import F64
+from kiteline_core.arrays import F64, I64
 
 T = TypeVar("T")
 InParts = Generator[None, None, T]  # a computation that pauses where an agent with little CPU time goes on later
@@ -68,6 +68,30 @@ class WindowSolution:
     evidence: NoiseEvidence
     depth_m: F64
     depth_sigma: F64
+
+
+@dataclass(frozen=True, slots=True)
+class SolvedWindow:
+    """A solution, stamps of its K keyframes, ids (P,) of its corners and their places (P,3) m."""
+
+    t_ns: tuple[int, ...]
+    ids: I64
+    xyz: F64
+    solution: WindowSolution
+
+    def warm_start(self, t_ns: tuple[int, ...], ids: I64) -> WarmStart | None:
+        """This solution as a start for a window of other keyframes and corners; None if no keyframe is in both."""
+        rows = [self.t_ns.index(t) for t in t_ns if t in self.t_ns]
+        if not rows:
+            return None
+        state = self.solution.state
+        xyz = np.full((len(ids), 3), np.nan)
+        _, new, old = np.intersect1d(ids, self.ids, return_indices=True)
+        xyz[new] = self.xyz[old]
+        part = replace(
+            state, R=state.R[rows], p=state.p[rows], v=state.v[rows], accel_bias=state.accel_bias[rows]
+        )  # fmt: skip
+        return WarmStart(part, xyz)
 
 
 def tangent(direction: F64) -> F64:

@@ -166,8 +166,9 @@ class SubmapStage:
             camera.set_first_gravity(solution.T_w_b[:3, :3].T @ solution.gravity)
         submap = camera.open_submap()
         camera.pose.reset_motion()
-        gap_ns = self._channel.keyframe_gap_ns()
-        self._keyframes.share_earlier(ctx, earlier_views(found, self._map.camera, ctx.config, gap_ns))
+        if not self._governor.on:  # corners of several images would take a second of a small budget at once
+            gap_ns = self._channel.keyframe_gap_ns()
+            self._keyframes.share_earlier(ctx, earlier_views(found, self._map.camera, ctx.config, gap_ns))
         keyframe = self._keyframes.make(ctx, None, found.points.points, camera.pose.T_m_c, Extra.SUBMAP)
         found.points.set_sigma(self._map, keyframe)
         self._channel.put(SubmapScale(submap, 1.0))
