@@ -12,6 +12,7 @@ class CornerTracksConfig:
     replenish: float = 0.85  # share of the corners below which a keyframe adds new ones
     window_px: int = 15  # px: window of the optical flow; the smallest that keeps hold of corners
     backward_px: float = 0.5  # px between a corner and its image followed back
+    drift_px: float = 2.0  # px between flow over frames and flow from the last keyframe
     keyframe_s: float = 0.24  # time between two keyframes: short enough for flow, long enough for parallax
     keyframes: int = 45  # of a window, whose cost grows with their square; of more, every second old one is left out
     thinned_s: float = 0.6  # longest time between two keyframes after one was left out

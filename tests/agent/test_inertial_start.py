@@ -37,6 +37,9 @@ class Tracks:
     def is_due(self, _t_ns: int) -> bool:
         return True
 
+    def follow(self, _left: object) -> None:
+        pass
+
     def add(self, t_ns: int, _left: object, _turn: object) -> None:
         self.keyframes.append(SimpleNamespace(t_ns=t_ns))
 
@@ -154,6 +157,7 @@ def test_a_window_begins_after_the_samples_that_are_missing(monkeypatch: pytest.
     monkeypatch.setattr(start._tracks, "flow_px", lambda: 100.0)
     monkeypatch.setattr(start._tracks, "is_due", lambda _t_ns: True)
     monkeypatch.setattr(start._tracks, "add", lambda *_: None)
+    monkeypatch.setattr(start._tracks, "follow", lambda _left: None)
     start._tracks.keyframes = [SimpleNamespace(t_ns=250_000_000 * k) for k in range(20)]  # type: ignore[misc]
     t_ns = np.arange(1_100_000_000, 4_800_000_000, 5_000_000)
     ctx: Any = SimpleNamespace(
@@ -183,6 +187,7 @@ def test_of_a_long_rest_a_window_holds_the_end(monkeypatch: pytest.MonkeyPatch, 
     monkeypatch.setattr(start._tracks, "flow_px", lambda: flow_px)
     monkeypatch.setattr(start._tracks, "is_due", lambda _t_ns: True)
     monkeypatch.setattr(start._tracks, "add", lambda *_: None)
+    monkeypatch.setattr(start._tracks, "follow", lambda _left: None)
     monkeypatch.setattr(start, "_attempting", lambda *_: None)
     monkeypatch.setattr(start, "_intervals", lambda *_: None)
     start._tracks.keyframes = [SimpleNamespace(t_ns=250_000_000 * k) for k in range(77)]  # type: ignore[misc]
@@ -236,6 +241,23 @@ def test_corners_are_followed_over_a_turn_that_the_gyro_tells() -> None:
         return len(np.intersect1d(tracks.keyframes[0].ids, tracks.keyframes[1].ids))
 
     assert followed(turn) > 80 and followed(None) < 40
+
+
+def test_frames_between_keyframes_tell_where_corners_went() -> None:
+    config, rng = AgentConfig(), np.random.default_rng(4)
+    scene = cv2.GaussianBlur(rng.normal(128.0, 80.0, (480, 1152)), (0, 0), 2.0).clip(0.0, 255.0).astype(np.uint8)
+    frames = [build_pyramid(np.ascontiguousarray(scene[:, 20 * k : 752 + 20 * k]), 4) for k in range(13)]
+
+    def followed(frame_by_frame: bool) -> int:
+        tracks = CornerTracks(CAMERA, config.detector, config.inertial_start.corner_tracks)
+        for k, frame in enumerate(frames):
+            if frame_by_frame:
+                tracks.follow(frame)
+            if k in (0, len(frames) - 1):
+                tracks.add(k * SECOND // 20, frame)
+        return len(np.intersect1d(tracks.keyframes[0].ids, tracks.keyframes[1].ids))
+
+    assert followed(frame_by_frame=True) > 80 and followed(frame_by_frame=False) < 40
 
 
 def test_frames_that_wait_are_some_time_apart_and_lose_no_samples() -> None:

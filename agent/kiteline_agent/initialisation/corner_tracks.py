@@ -11,7 +11,7 @@ from kiteline_agent.inertial_start_config import CornerTracksConfig
 from kiteline_core.arrays import F64, I64, U8, Bool
 from kiteline_core.geometry.cameras import RectifiedCamera
 
-_LEVELS = 3  # of the flow above the finest one
+_LEVELS, _NEAR_LEVELS = 3, 1  # of the flow above the finest one; where a corner is known to be near
 _BORDER_PX = 8.0  # a window of the flow and its gradients lie inside
 
 
@@ -41,7 +41,7 @@ class CornerObservations:
 
 
 class CornerTracks:
-    """Follows corners from keyframe to keyframe. By the gyro it is known how the image turned in between."""
+    """Follows corners from keyframe to keyframe. Frames between tell where to look or, with little CPU, the gyro."""
 
     def __init__(self, camera: RectifiedCamera, detector: DetectorConfig, config: CornerTracksConfig) -> None:
         self._camera = camera
@@ -55,22 +55,38 @@ class CornerTracks:
         self.keyframes = []
         self._next_id = 0
         self._ids: I64 = np.zeros(0, np.int64)
-        self._uv = np.zeros((0, 2))
+        self._uv = np.zeros((0, 2))  # in the last keyframe
+        self._last: U8 | None = None  # frame into which they were followed, and where they are there
+        self._last_uv = np.zeros((0, 2))
 
     def is_due(self, t_ns: int) -> bool:
         """True if a frame is to become a keyframe."""
         return not self.keyframes or (t_ns - self.keyframes[-1].t_ns) * 1e-9 >= self._config.keyframe_s
 
+    def follow(self, left: Pyramid) -> None:
+        """Follow the corners into the frame after the one before; the next keyframe looks for them where they are."""
+        if self._last is not None and len(self._last_uv):
+            uv, good = self._followed(self._last, left[0], self._last_uv, None, _LEVELS)
+            self._last_uv, self._uv, self._ids = uv[good], self._uv[good], self._ids[good]
+        self._last = left[0]
+
     def add(self, t_ns: int, left: Pyramid, turn: F64 | None = None) -> None:
         """Follow the corners from the last keyframe into a new one, and find more.
 
-        turn: (3,3) rotation of this camera in that of the last keyframe; None: unknown.
+        turn: (3,3) rotation of this camera in that of the last keyframe; None: unknown. It counts if the corners were
+        not followed into this frame.
         """
         if self.keyframes and len(self._uv):
-            guess = None if turn is None else self._turned(turn)
-            uv, good = self._followed(self.keyframes[-1].left[0], left[0], self._uv, guess)
+            before, near = self.keyframes[-1].left[0], self._last is left[0]
+            if near:
+                uv, good = self._followed(before, left[0], self._uv, self._last_uv, _NEAR_LEVELS)
+                good &= np.linalg.norm(uv - self._last_uv, axis=1) < self._config.drift_px
+            else:
+                guess = None if turn is None else self._turned(turn)
+                uv, good = self._followed(before, left[0], self._uv, guess, _LEVELS)
             self._uv, self._ids = uv[good], self._ids[good]
         self._replenish(left)
+        self._last_uv = self._uv
         self.keyframes.append(TrackedKeyframe(t_ns, left, self._ids.copy(), self._uv.copy()))
 
     def drop_before(self, t_ns: int) -> None:
@@ -104,9 +120,9 @@ class CornerTracks:
         order = np.argsort(-length, kind="stable")
         return CornerObservations(xy, seen, ids).part(order[length[order] >= 3])
 
-    def _followed(self, before: U8, after: U8, uv: F64, guess: F64 | None) -> tuple[F64, Bool]:
+    def _followed(self, before: U8, after: U8, uv: F64, guess: F64 | None, levels: int) -> tuple[F64, Bool]:
         """Pixels (n,2) of corners in the next image, and which of them are found, forward and backward."""
-        size = {"winSize": (self._config.window_px, self._config.window_px), "maxLevel": _LEVELS}
+        size = {"winSize": (self._config.window_px, self._config.window_px), "maxLevel": levels}
         flags = 0 if guess is None else cv2.OPTFLOW_USE_INITIAL_FLOW
         start = uv.astype(np.float32)
         there = None if guess is None else guess.astype(np.float32)

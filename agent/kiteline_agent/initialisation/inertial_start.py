@@ -147,6 +147,9 @@ class InertialStart:
 
         prior: biases of earlier tracking. offset_s: frame stamp + offset = IMU time.
         """
+        if self._config.governor.cpu_percent <= 0.0:  # else the frames between keyframes do not come here
+            self._work.followed += 1
+            self._tracks.follow(ctx.images.left)
         if self._tracks.is_due(ctx.t_ns):
             self._work.followed += 1
             self._tracks.add(ctx.t_ns, ctx.images.left, self._turn(ctx.t_ns, prior, offset_s))
