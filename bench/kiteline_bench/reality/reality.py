@@ -1,6 +1,7 @@
 """The bars of real and worn recordings."""
 
 from kiteline_bench.agent import rigs
+from kiteline_bench.base import real_places
 from kiteline_bench.reality import (
     base,
     cpu,
@@ -11,7 +12,6 @@ from kiteline_bench.reality import (
     motion,
     nees,
     people,
-    places,
     starts,
     street,
     worn,
@@ -31,6 +31,6 @@ PARTS = {
     "people": ("Reality: people who walk through", people.run),
     "rigs": ("Reality: rigs of many kinds", rigs.run),
     "difficult": ("Reality: difficult images", difficult.run),
-    "places": ("Reality: places on real images", places.run),
+    "places": ("Reality: places on real images", real_places.run),
     "cpu": ("Reality: CPU over a yardstick", cpu.run),
 }
