@@ -105,6 +105,7 @@ class KeyframeConfig:
     min_cover: float = 0.45  # share of coarse image cells that hold a tracked landmark
     baseline_ratio: float = 0.12  # translation over median depth: new views of the same scene
     rotation_rad: float = 0.30  # rad: a rotation that has replaced a quarter of the view
+    earlier: bool = False  # True: what one camera saw before its map began is shared, for other drones to be recognised
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from kiteline_agent.agent import Agent
-from kiteline_agent.config import AgentConfig, LocalMapConfig
+from kiteline_agent.config import AgentConfig, KeyframeConfig, LocalMapConfig
 from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_agent.governor.cost_model import Work, cost_ns
 from kiteline_agent.imaging.features import DetectorConfig, build_pyramid
@@ -236,7 +236,8 @@ def imu_at(t_s: F64, haste: float) -> ImuBatch:
 
 def test_an_imu_gives_metres_from_the_first_pose_on() -> None:
     near, far = plain_pair()
-    one = Agent(RIG, ImuCalibration(), AgentConfig(), Identity(AgentId(0), 0), near)
+    config = AgentConfig(keyframe=KeyframeConfig(earlier=True))
+    one = Agent(RIG, ImuCalibration(), config, Identity(AgentId(0), 0), near)
     estimates: list[Estimate] = []
     words: list[str] = []
     begin, end, haste = 4, 110, 1.7  # in full motion from the first frame on

@@ -166,7 +166,8 @@ class SubmapStage:
             camera.set_first_gravity(solution.T_w_b[:3, :3].T @ solution.gravity)
         submap = camera.open_submap()
         camera.pose.reset_motion()
-        if not self._governor.on:  # corners of several images would take a second of a small budget at once
+        # Corners of several images would take a second of a small budget at once.
+        if ctx.config.keyframe.earlier and not self._governor.on:
             gap_ns = self._channel.keyframe_gap_ns()
             self._keyframes.share_earlier(ctx, earlier_views(found, self._map.camera, ctx.config, gap_ns))
         keyframe = self._keyframes.make(ctx, None, found.points.points, camera.pose.T_m_c, Extra.SUBMAP)

@@ -72,6 +72,8 @@ class AgentRuntime:
         self.rss_mib = 0.0
         grid = "agent" if options.grid == "base" and isinstance(channel, NoBaseChannel) else options.grid
         config = config or agent_config(options.config, options.cpu_percent, options.rig, grid, options.tracker)
+        if options.with_others:
+            config = replace(config, keyframe=replace(config.keyframe, earlier=True))
         self._rig_file = RigFile(options.rig) if options.rig else None
         self._saving: threading.Thread | None = None  # what writes the rig file
         begin_ns = time.process_time_ns()

@@ -40,6 +40,7 @@ class AgentOptions:
     imu: bool = True
     config: str = ""  # a TOML file
     rig: str = ""  # a rig file; "": none
+    with_others: bool = False  # other agents are to be recognised: `keyframe.earlier`
     calibration: str = ""  # FILE[,FILE…] in place of the source's; "": none
     start_ns: int = 0  # the stamp that is flight time 0
     seconds: float = 0.0  # s of flight time to fly; 0: all

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from kiteline_agent.config import AgentConfig, KeyframeConfig
 from kiteline_bench.harness.bars import Bar, Bench, at_most, is_true, table
 from kiteline_bench.harness.placed import KeyframesInWorld
 from kiteline_bench.harness.result import AgentRun
@@ -31,6 +32,7 @@ _THIRD = 1.0 / 3.0
 _BLIND_S = 2.0  # more than the 20 lost frames after which the thesis begins a new map
 _AIR_OVERLAP = 100  # frames of euroc_mh01_air, 5 s: as long as one robot flies before its map begins
 _AIR_S = 2.0  # from the first true pose of euroc_mh01_air to its first frame
+_AGENT = AgentConfig(keyframe=KeyframeConfig(earlier=True))  # as of all flights of several agents
 _WRONG_M, _WRONG_SHARE = 0.25, 0.01  # of a map's place in the world beside the truth; the share is of the whole path
 
 
@@ -114,7 +116,7 @@ class Outcome:
 
 def fly(experiment: Experiment) -> Outcome:
     """Fly an experiment with a base, in lock-step in this process."""
-    return judge(experiment, KeyframesInWorld(fly_with_base(experiment.scenarios)))
+    return judge(experiment, KeyframesInWorld(fly_with_base(experiment.scenarios, _AGENT)))
 
 
 def judge(experiment: Experiment, flown: KeyframesInWorld) -> Outcome:
