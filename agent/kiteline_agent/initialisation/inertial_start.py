@@ -147,12 +147,14 @@ class InertialStart:
 
         prior: biases of earlier tracking. offset_s: frame stamp + offset = IMU time.
         """
-        if self._config.governor.cpu_percent <= 0.0:  # else the frames between keyframes do not come here
+        every = self._config.governor.cpu_percent <= 0.0  # else the frames between keyframes do not come here
+        if every:
             self._work.followed += 1
             self._tracks.follow(ctx.images.left)
         if self._tracks.is_due(ctx.t_ns):
             self._work.followed += 1
-            self._tracks.add(ctx.t_ns, ctx.images.left, self._turn(ctx.t_ns, prior, offset_s))
+            turn = None if every else self._turn(ctx.t_ns, prior, offset_s)
+            self._tracks.add(ctx.t_ns, ctx.images.left, turn)
             self._bound_window(ctx.t_ns)
             if self._attempt is None:
                 self._attempt = self._begin(ctx, prior, offset_s)
@@ -238,8 +240,7 @@ class InertialStart:
             solution = (yield from self._counted(again.solving(warmer), intervals)) or solution
             noise, sigma = self._seen_noise(solution)
         self._before = SolvedWindow(stamps, observations.ids, found.xyz, solution)
-        wrong, fits = self._contradicts(solution, noise), solution.converged and self._fits(solution)
-        by_imu = wrong and self._accuses_imu(solution, noise)
+        (wrong, by_imu), fits = self._contradicts(solution, noise), solution.converged and self._fits(solution)
         self._note_contradiction(ctx.t_ns, contradicts=wrong if wrong or fits else None, by_imu=by_imu)
         known = fits and sigma < config.scale_sigma and not wrong
         agrees = before is not None and self._agrees(before, self._before)
@@ -338,13 +339,12 @@ class InertialStart:
         config = self._config.inertial_start
         return solution.reprojection_px < config.max_reprojection_px and solution.imu_chi2 < config.max_imu_chi2
 
-    def _contradicts(self, solution: WindowSolution, noise: WindowNoise) -> bool:
+    def _contradicts(self, solution: WindowSolution, noise: WindowNoise) -> tuple[bool, bool]:
+        """Whether a window contradicts, and whether it does so by more than its lens."""
         gyro_noise, limits = noise.gyro / self._measured_noise().gyro, self._config.inertial_start.contradiction
-        return contradicts(solution, gyro_noise, self._default_prior(), self._lens_prior, limits)
-
-    def _accuses_imu(self, solution: WindowSolution, noise: WindowNoise) -> bool:
-        gyro_noise, limits = noise.gyro / self._measured_noise().gyro, self._config.inertial_start.contradiction
-        return accuses_imu(solution, gyro_noise, self._default_prior(), limits)
+        prior = self._default_prior()
+        wrong = contradicts(solution, gyro_noise, prior, self._lens_prior, limits)
+        return wrong, wrong and accuses_imu(solution, gyro_noise, prior, limits)
 
     def _note_contradiction(self, t_ns: int, *, contradicts: bool | None, by_imu: bool = True) -> None:
         self._warnings += self._contradiction.note(t_ns, contradicts=contradicts, by_imu=by_imu)
