@@ -22,7 +22,7 @@ class LinkUse:
 
     most_bytes_s: int  # in any one-second window, overhead included
     header_delays_s: list[float]  # from capture to arrival of each keyframe's header, before the flight's last second
-    pose_gaps_s: list[float]  # between arrivals of live poses
+    pose_gaps_s: list[float]  # between arrivals of live poses, until the last frame
 
 
 def most_in_a_second(log: Path, topic: str, overhead_bytes: int) -> int:
@@ -50,8 +50,17 @@ def live_shift_ns(agent_log_path: Path) -> int:
     return max(t_ns - now_ns for t_ns, now_ns in frames)
 
 
-def arrivals(base_folder: Path, shift_ns: int) -> tuple[list[float], list[float]]:
-    """Delays of headers of the first agent, and gaps between its live poses, in s. shift_ns: stamps less the clock."""
+def _last_frame_ns(agent_log_path: Path) -> int:
+    """When the last frame was taken in, on the clock of the flight: later poses are repeats of the last one."""
+    with LogReader(agent_log_path) as reader:
+        return max((int(s.head["now_ns"]) for s in steps(reader) if s.head["frame_ns"]), default=0)
+
+
+def arrivals(base_folder: Path, shift_ns: int, end_ns: int) -> tuple[list[float], list[float]]:
+    """Delays of headers of the first agent, and gaps between its live poses, in s.
+
+    shift_ns: stamps less the clock. end_ns: on the clock, when the flight's frames end; the last gap does, too.
+    """
     headers: dict[int, float] = {}
     poses_ns: list[int] = []
     with LogReader(base_folder / "log.mcap") as reader:
@@ -68,14 +77,15 @@ def arrivals(base_folder: Path, shift_ns: int) -> tuple[list[float], list[float]
                     record = messages.decode(item.key, item.data)
                     if isinstance(record, KeyframeHeader):
                         headers.setdefault(record.keyframe, (now_ns + shift_ns - record.t_ns) / 1e9)
-                    elif isinstance(record, LivePose):
+                    elif isinstance(record, LivePose) and now_ns < end_ns:
                         poses_ns.append(now_ns)
-    gaps = [(b - a) / 1e9 for a, b in pairwise(poses_ns)]
+    gaps = [(b - a) / 1e9 for a, b in pairwise([*poses_ns, end_ns])] if poses_ns else []
     return list(headers.values()), gaps
 
 
 def link_use(folder: Path, shift_ns: int, overhead_bytes: int) -> LinkUse:
     """The traffic of the first agent. shift_ns: stamps of frames less the clock of the flight."""
-    delays, gaps = arrivals(folder / "base", shift_ns)
-    most = most_in_a_second(folder / "agent0" / "log.mcap", agent_log.PACKETS_OUT, overhead_bytes)
+    log = folder / "agent0" / "log.mcap"
+    delays, gaps = arrivals(folder / "base", shift_ns, _last_frame_ns(log))
+    most = most_in_a_second(log, agent_log.PACKETS_OUT, overhead_bytes)
     return LinkUse(most, delays, gaps)
