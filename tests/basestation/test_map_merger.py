@@ -14,7 +14,7 @@ from kiteline_basestation.management import Command
 from kiteline_basestation.mapper import Mapper, MapperInput
 from kiteline_basestation.station import Station
 from kiteline_codec.channel import plain_pair
-from kiteline_codec.schema import CameraIntrinsics, Key, SubmapPlacement
+from kiteline_codec.schema import CameraIntrinsics, Key, NewLandmarks, Record, SubmapPlacement
 from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
 from kiteline_core.ids import SEQUENCE_BITS, submap_of_keyframe
@@ -55,6 +55,26 @@ def test_maps_are_merged_whose_keyframes_have_few_corners_in_common(make_flight:
     feed(mapper, [a, b])
     assert mapper.summary()["merges"] == 1
     assert np.sqrt(np.mean(joint_error_m(mapper, [a, b]) ** 2)) < 0.03
+
+
+def test_maps_are_merged_by_the_few_landmarks_that_a_thin_link_describes(make_flight: MakeFlight, words: Any) -> None:
+    flights = [
+        make_flight(keyframes=10, turns=0.2, points=1400),
+        make_flight(keyframes=10, turns=0.2, start=0.05, variant=1, agent=1, T_w_m=ELSEWHERE, points=1400),
+    ]
+    for flight in flights:
+        flight.records = [[few_described(record) for record in records] for records in flight.records]
+    mapper = Mapper(WITHOUT_GRID, words)
+    feed(mapper, flights)
+    assert mapper.summary()["merges"] == 1
+    assert np.sqrt(np.mean(joint_error_m(mapper, flights) ** 2)) < 0.03
+
+
+def few_described(record: Record) -> Record:
+    """The record, with descriptors of the same fifth of all corners, whichever agent sees them."""
+    if not isinstance(record, NewLandmarks):
+        return record
+    return replace(record, descriptor=np.where((record.angle < 51)[:, None], record.descriptor, np.uint8(0)))
 
 
 @pytest.mark.parametrize("rooms", ["papered", "half_papered"])

@@ -20,6 +20,7 @@ from kiteline_codec.schema import CACHED_KINDS, CachedKeyframe, CachedLandmarks,
 from kiteline_core.arrays import F64, I32, Bool
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import SUBMAP_BITS, AgentId, KeyframeId, SubmapId, agent_of_keyframe, submap_of_keyframe
+from kiteline_core.imaging.descriptors import is_described
 
 _MAX_CANDIDATES = 60  # keyframes whose landmarks are projected
 _MIN_LANDMARKS = 8  # landmarks of a keyframe that will be in view: fewer are not worth their bytes
@@ -135,7 +136,7 @@ class MapCachePlanner:
         """Root landmarks anchored in a keyframe that have a depth and a descriptor."""
         slots, table = self._map.slots_of(keyframe), self._map.keypoints
         live = (table.kind[slots] == LANDMARK) & (table.root[slots] == slots) & (table.flags[slots] & CULLED == 0)
-        live &= (self._map.inverse_depths(slots) > 0.0) & table.descriptor[slots].any(axis=1)
+        live &= (self._map.inverse_depths(slots) > 0.0) & is_described(table.descriptor[slots])
         return np.asarray(slots[live])
 
     def _in_view(self, agent: AgentId, T_w_c: F64, xyz: F64) -> Bool:

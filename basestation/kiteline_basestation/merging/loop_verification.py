@@ -20,7 +20,7 @@ from kiteline_core.arrays import F64, I32, U8, Bool
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import KeyframeId, agent_of_keyframe, submap_of_keyframe
 from kiteline_core.imaging import matching
-from kiteline_core.imaging.descriptors import comparable
+from kiteline_core.imaging.descriptors import comparable, is_described
 from kiteline_core.pose import pnp
 from kiteline_core.pose.pose_kernels import optimise_pose
 
@@ -91,6 +91,7 @@ def local_landmarks(sparse_map: SparseMap, keyframe: KeyframeId, neighbours: int
     around = [keyframe, *sparse_map.covisible_keyframes(keyframe, 1)[:neighbours]]
     points = sparse_map.sorted_by_id(np.concatenate([sparse_map.landmarks_of(k) for k in around]))
     xyz, known = sparse_map.positions(points)
+    known &= is_described(table.descriptor[points])
     points = points[known]
     angle = _rotated(sparse_map, sparse_map.rows[keyframe], points)
     return LocalLandmarks(points, xyz[known], angle, table.descriptor[points])
@@ -272,7 +273,7 @@ def _match_neighbours(
     around = [old, *sparse_map.covisible_keyframes(old, 1)[: config.max_neighbours]]
     points = sparse_map.sorted_by_id(np.concatenate([sparse_map.landmarks_of(k) for k in around]))
     _, known = sparse_map.positions(points)
-    points = points[known]
+    points = points[known & is_described(sparse_map.keypoints.descriptor[points])]
     size = sparse_map.cameras[agent_of_keyframe(new)]
     camera = sparse_map.keyframes.camera[sparse_map.rows[new]].copy()
     T = T_c_w
@@ -311,10 +312,10 @@ def _expected_in_view(
     new: KeyframeId,
     around: list[KeyframeId],
 ) -> int:
-    """Number of landmarks of the new keyframe that project into the image of one of the old keyframes."""
+    """Number of described landmarks of the new keyframe that project into the image of one of the old keyframes."""
     row = sparse_map.rows[new]
     local = se3.transform(se3.inverse(sparse_map.keyframes.T_w_k[row]), mine.xyz)
-    xyz = se3.transform(se3.inverse(T_c_w), scale * local)[mine.known]
+    xyz = se3.transform(se3.inverse(T_c_w), scale * local)[mine.known & is_described(mine.descriptor)]
     inside = np.zeros(len(xyz), np.bool_)
     for keyframe in around:
         other = sparse_map.rows[keyframe]

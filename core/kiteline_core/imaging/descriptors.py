@@ -29,6 +29,11 @@ def is_narrow(descriptors: U8) -> Bool:
     return np.asarray(~(descriptors & _OUTSIDE).any(axis=1))
 
 
+def is_described(descriptors: U8) -> Bool:
+    """Mask (n,) of descriptors (n,32) that were sent: a thin link leaves out most, which are all zero then."""
+    return np.asarray(descriptors.any(axis=1))
+
+
 def all_narrow(descriptors: U8) -> bool:
     """True if all descriptors (n,32) are narrow."""
     return not (descriptors & _OUTSIDE).any()
@@ -56,5 +61,5 @@ def comparable(a: U8, b: U8) -> tuple[U8, U8]:
     if not (is_narrow(a).any() or is_narrow(b).any()):
         return a, b
     left, right = np.tile(packed(a), 2), np.tile(packed(b), 2)
-    left[~a.any(axis=1)], right[~b.any(axis=1)] = 0x55, 0xAA
+    left[~is_described(a)], right[~is_described(b)] = 0x55, 0xAA
     return left, right
