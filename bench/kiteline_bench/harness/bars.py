@@ -68,11 +68,11 @@ class Bench:
         return [starts[k * n // few] for k in range(few)]
 
     def source(self, name: str) -> str:
-        """The path of a recording. Raises SourceError when it is not there."""
+        """The absolute path of a recording: other builds run elsewhere. Raises SourceError when it is not there."""
         path = self.data / name
         if not path.exists():
             raise SourceError(f"{path}: not there; set KITELINE_DATA to the folder that holds the recordings")
-        return str(path)
+        return str(path.resolve())
 
     def fly(
         self, sources: str | Path | Sequence[str | Path], folder: str, *, shown: bool = False, **options: Any
