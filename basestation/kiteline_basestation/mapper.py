@@ -60,7 +60,7 @@ class MapperInput:
 class MapperOutput:
     """Records for each agent, jobs to be run, answers to the commands, and keys of records that are void.
 
-    unfinished: agents whose batch of corrections goes on with the next step.
+    unfinished: agents whose batch of corrections goes on with the next step. urgent: placements that wait for no batch.
     """
 
     publish: Published
@@ -68,6 +68,7 @@ class MapperOutput:
     answers: tuple[Answer, ...] = ()
     withdrawn: tuple[tuple[AgentId, Key], ...] = ()
     unfinished: frozenset[AgentId] = frozenset()
+    urgent: tuple[tuple[AgentId, SubmapPlacement], ...] = ()
 
 
 class Mapper:
@@ -148,8 +149,8 @@ class Mapper:
         if self.merger is not None:
             jobs += self.merger.jobs(now_ns)
         # 7. Publish the values that changed and for which there is room.
-        published = self._publisher.collect(dict(given.room_bytes))
-        return MapperOutput(published, tuple(jobs), tuple(answers), withdrawn, self._publisher.unfinished)
+        urgent, published = self._publisher.take_urgent(), self._publisher.collect(dict(given.room_bytes))
+        return MapperOutput(published, tuple(jobs), tuple(answers), withdrawn, self._publisher.unfinished, urgent)
 
     def adopt(self, record: Record) -> None:
         """Replace a published value by its quantised code, as the agent will hold it, unless it changed meanwhile."""

@@ -98,7 +98,11 @@ class Station:
         for agent, keyframes in self.mapper.take_confirmed().items():
             if isinstance(end := self.channels.get(agent), CodedChannel):
                 end.endpoint.claims.earned += KEYFRAME_BYTES * keyframes
-        self.published = sum(len(records) for _, records in output.publish)
+        self.published = len(output.urgent) + sum(len(records) for _, records in output.publish)
+        for agent, placement in output.urgent:
+            self.join(agent)
+            overtaken = self._batches[agent].without(messages.key(placement))
+            self._put(agent, [placement] if overtaken is None else [placement, overtaken])
         published = dict(output.publish)
         for agent in sorted(published.keys() | {a for a, batches in self._batches.items() if batches.is_open}):
             self.join(agent)

@@ -55,6 +55,7 @@ def _step(
     for n, arrivals in enumerate(steps):
         output = mapper.step(MapperInput(arrivals, done), n * STEP_NS)
         done = tuple(run(job) for job in output.jobs)
+        published += [record for _, record in output.urgent]
         published += [record for _, records in output.publish for record in records]
     return published
 

@@ -7,17 +7,18 @@ from typing import Any
 import numpy as np
 import pytest
 
+from kiteline_agent.exchange.correction_batches import CorrectionBatches
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.job_kinds import run_job
 from kiteline_basestation.jobs import JobDone
 from kiteline_basestation.management import Command
 from kiteline_basestation.mapper import Mapper, MapperInput
 from kiteline_basestation.station import Station
-from kiteline_codec.channel import plain_pair
-from kiteline_codec.schema import CameraIntrinsics, Key, NewLandmarks, Record, SubmapPlacement
+from kiteline_codec.channel import PlainChannel, plain_pair
+from kiteline_codec.schema import CameraIntrinsics, Key, KeyframePose, NewLandmarks, Record, SubmapPlacement
 from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
-from kiteline_core.ids import SEQUENCE_BITS, submap_of_keyframe
+from kiteline_core.ids import SEQUENCE_BITS, SubmapId, submap_of_keyframe
 from tests.basestation.feeding import STEP_NS, WITHOUT_GRID, feed
 
 MakeFlight = Callable[..., Any]
@@ -154,6 +155,27 @@ def test_submap_after_a_loss_is_merged_and_split_again(make_flight: MakeFlight, 
 
 
 def test_placement_of_a_split_map_is_withdrawn(make_flight: MakeFlight, words: Any) -> None:
+    station, theirs, young = joined_flights(make_flight, words, 50)
+    assert any(isinstance(r, SubmapPlacement) and r.submap == young for r in theirs.receive((), 0))
+    (answer,) = station.step({}, (), 100 * STEP_NS, [Command(1, "split", '{"map": "1.1.0"}')]).answers
+    assert answer.ok
+    assert theirs.take_removed() == [Key(SubmapPlacement.KIND, young, 0)]
+    assert not any(isinstance(r, SubmapPlacement) for r in theirs.receive((), 0))
+
+
+def test_the_place_of_a_merged_map_waits_for_no_corrections(make_flight: MakeFlight, words: Any) -> None:
+    """Over a radio they take seconds, in which the vehicle would lie metres off."""
+    station, theirs, young = joined_flights(make_flight, words, 36)  # too early to give up the first batch
+    assert station.mapper.summary()["merges"] == 1
+    records = theirs.receive((), 0)  # the first time: until now nothing had arrived
+    placed = [r for r in records if isinstance(r, SubmapPlacement) and r.recognised]
+    assert placed and {(r.submap, r.batch) for r in placed} == {(young, 0)}
+    applied = CorrectionBatches().take(records, ())
+    assert placed[0] in applied and all(r in applied for r in records if isinstance(r, KeyframePose))
+
+
+def joined_flights(make_flight: MakeFlight, words: Any, steps: int) -> tuple[Station, PlainChannel, SubmapId]:
+    """Two agents in one room, to none of which anything arrives; the second one's end, and its submap."""
     a = make_flight(keyframes=20, turns=0.6)
     b = make_flight(keyframes=20, turns=0.6, start=0.3, variant=1, agent=1, T_w_m=ELSEWHERE)
     ours, theirs = {}, {}
@@ -161,16 +183,11 @@ def test_placement_of_a_split_map_is_withdrawn(make_flight: MakeFlight, words: A
         theirs[flight.agent], ours[flight.agent] = plain_pair()
     station = Station(WITHOUT_GRID, ours.__getitem__, words)
     done: tuple[JobDone, ...] = ()
-    young = submap_of_keyframe(b.keyframes[0])
-    for n in range(50):
+    for n in range(steps):
         for flight in (a, b):
             if n == 0:
                 theirs[flight.agent].put(CameraIntrinsics(flight.agent, flight.camera))
             for record in flight.records[n] if n < len(flight.records) else []:
                 theirs[flight.agent].put(record)
         done = tuple(run_job(job) for job in station.step({a.agent: (), b.agent: ()}, done, n * STEP_NS).jobs)
-    assert any(isinstance(r, SubmapPlacement) and r.submap == young for r in theirs[b.agent].receive((), 0))
-    (answer,) = station.step({}, (), 100 * STEP_NS, [Command(1, "split", '{"map": "1.1.0"}')]).answers
-    assert answer.ok
-    assert theirs[b.agent].take_removed() == [Key(SubmapPlacement.KIND, young, 0)]
-    assert not any(isinstance(r, SubmapPlacement) for r in theirs[b.agent].receive((), 0))
+    return station, theirs[b.agent], submap_of_keyframe(b.keyframes[0])

@@ -76,6 +76,7 @@ class Publisher:
         self._whole = False  # all of them are sent in the next call of `collect`
         self._moves: dict[AgentId, _Moves] = {}
         self._records: list[tuple[AgentId, Record]] = []
+        self._urgent: list[tuple[AgentId, SubmapPlacement]] = []
 
     def mark_changed(self, kind: int, keyframe: KeyframeId) -> None:
         """Mark a value of a keyframe as changed. kind: KIND of a record class."""
@@ -97,16 +98,31 @@ class Publisher:
         for keyframe in np.unique(self._map.keyframes.id[self._map.keypoints.row[slots]]).tolist():
             self.mark_changed(kind, KeyframeId(keyframe))
 
-    def publish_placement(self, submap: SubmapId, S_w_m: F64, *, recognised: bool, scale_sigma: float) -> None:
-        """Send where a submap lies in w, as a similarity (4,4), and how certain lengths there are; see the record."""
+    def publish_placement(
+        self, submap: SubmapId, S_w_m: F64, *, recognised: bool, scale_sigma: float, urgent: bool
+    ) -> None:
+        """Send where a submap lies in w, as a similarity (4,4), and how certain lengths there are; see the record.
+
+        urgent: before corrections that wait, which move the agent's map by less.
+        """
         record = SubmapPlacement(submap, S_w_m, recognised, scale_sigma=scale_sigma)
-        self._records.append((agent_of_submap(submap), record))
+        if urgent:
+            self.withdraw_placement(submap)
+            self._urgent.append((agent_of_submap(submap), record))
+        else:
+            self._records.append((agent_of_submap(submap), record))
 
     def withdraw_placement(self, submap: SubmapId) -> None:
         """Drop placements of a submap that have not been sent yet."""
         self._records = [
             (a, r) for a, r in self._records if not (isinstance(r, SubmapPlacement) and r.submap == submap)
         ]  # fmt: skip
+        self._urgent = [(agent, record) for agent, record in self._urgent if record.submap != submap]
+
+    def take_urgent(self) -> tuple[tuple[AgentId, SubmapPlacement], ...]:
+        """Placements that go before all else."""
+        urgent, self._urgent = self._urgent, []
+        return tuple(urgent)
 
     def send(self, agent: AgentId, record: Record) -> None:
         """Send any other record."""
@@ -129,7 +145,7 @@ class Publisher:
     @property
     def waiting(self) -> bool:
         """True if changes wait for room."""
-        return bool(self._dirty or self._records or any(self._moves.values()))
+        return bool(self._dirty or self._records or self._urgent or any(self._moves.values()))
 
     @property
     def unfinished(self) -> frozenset[AgentId]:

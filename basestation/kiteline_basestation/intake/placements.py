@@ -204,7 +204,7 @@ class SubmapPlacements:
             if newly:
                 self._recognised.add(submap)
             if newly or held is None or not np.allclose(held, S_w_m, rtol=0.0, atol=1e-5):
-                self._set(submap, S_w_m)
+                self._set(submap, S_w_m, urgent=newly)
 
     def state(self) -> PlacementState:
         """State to be saved."""
@@ -222,10 +222,10 @@ class SubmapPlacements:
             self._scale_sigma[record.submap] = record.scale_sigma
             self._map.scaled_submaps.add(record.submap)
 
-    def _set(self, submap: SubmapId, S_w_m: F64) -> None:
+    def _set(self, submap: SubmapId, S_w_m: F64, *, urgent: bool = False) -> None:
         self.S_w_m[submap] = S_w_m
-        sigma = self._scale_sigma.get(submap, 0.0)
-        self._publisher.publish_placement(submap, S_w_m, recognised=submap in self._recognised, scale_sigma=sigma)
+        recognised, sigma = submap in self._recognised, self._scale_sigma.get(submap, 0.0)
+        self._publisher.publish_placement(submap, S_w_m, recognised=recognised, scale_sigma=sigma, urgent=urgent)
 
     def _move_world(self, S_new_old: F64, but: Collection[SubmapId] = ()) -> None:
         """Move all placements, except some, to a rotated or rescaled world; submaps in metres keep their scale."""

@@ -67,7 +67,10 @@ class Pacer:
         room = rate * self._interval_ns // _SECOND_NS - p.observations_room_bytes
         described = max(_MIN_DESCRIBED, min(room // (3 * p.landmark_bytes), p.described))
         undescribed = max(0, room - described * p.landmark_bytes) // p.undescribed_bytes
-        return replace(p, described=described, landmarks=min(described + undescribed, p.landmarks))
+        landmarks = min(described + undescribed, p.landmarks)
+        left = room - described * p.landmark_bytes - (landmarks - described) * p.undescribed_bytes
+        described += max(0, left) // (p.landmark_bytes - p.undescribed_bytes)
+        return replace(p, described=min(described, landmarks, p.described), landmarks=landmarks)
 
     @property
     def live_gap_ns(self) -> int:

@@ -156,6 +156,19 @@ def test_landmarks_follow_the_rate_of_keyframes() -> None:
     assert Pacer(WIFI, 1000).share(None) is WIFI
 
 
+@given(st.integers(300, 5900), st.integers(200, 5000))
+def test_a_keyframe_fills_the_room_that_the_link_has(rate: int, interval_ms: int) -> None:
+    pacer = Pacer(RADIO, rate)
+    for i in range(60):
+        pacer.keyframe(i * interval_ms * 1_000_000)
+    p = pacer.share(None)
+    room = rate * interval_ms / 1000 - p.observations_room_bytes
+    took = p.described * p.landmark_bytes + (p.landmarks - p.described) * p.undescribed_bytes
+    assert took <= max(room, 7 * p.landmark_bytes) + 1
+    # Nothing is left that another landmark, or another descriptor, would fit into.
+    assert room - took < p.landmark_bytes or (p.landmarks, p.described) == (RADIO.landmarks, RADIO.described)
+
+
 def test_poses_take_no_more_than_a_fifth_of_a_budget() -> None:
     assert Pacer(RADIO, None).live_gap_ns == Pacer(RADIO, 1000).live_gap_ns == RADIO.live_gap_ns
     assert Pacer(RADIO, 500).live_gap_ns == SECOND * 38 // 100
