@@ -231,6 +231,11 @@ class SparseMap(RigValues):
         slots = np.flatnonzero(linked).astype(np.int32)
         self._link_observations(slots[np.isin(self.find_landmarks(table.landmark[slots]), landmarks)])
 
+    def unlink(self, observations: I32) -> None:
+        """Let observations (n,) be of no landmark."""
+        table = self.keypoints
+        kernels.link(observations, np.full(len(observations), -1, np.int32), table.root, table.first, table.next)
+
     def forget(self, submaps: Collection[SubmapId]) -> None:
         """Forget submaps. Their rows and slots, which nothing may name any more, are free for the next keyframes."""
         table, keyframes = self.keypoints, [k for s in submaps for k in self.submaps.get(s, [])]

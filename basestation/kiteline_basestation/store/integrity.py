@@ -1,6 +1,6 @@
 """Checks a saved map: inconsistent values are left out and reported, values still to come are counted.
 
-`check` works on the saved values, `contradictions` on the map that was restored from them.
+`check` works on the saved values, `separated` and `contradictions` on the map that was restored from them.
 """
 
 from collections.abc import Mapping
@@ -9,11 +9,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from kiteline_basestation.map.map_tables import EMPTY, LANDMARK, NO_POSE, OBSERVATION
+from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.mapper import Mapper
 from kiteline_basestation.mapper_state import MapperState
 from kiteline_basestation.store.saved_map import SavedMap, SavedValues, value_name
 from kiteline_basestation.store.state_texts import state_of, texts_of
 from kiteline_codec.schema import (
+    CameraIntrinsics,
     CulledLandmarks,
     FusedLandmarks,
     GravityAlignment,
@@ -31,6 +33,7 @@ from kiteline_codec.schema import (
     WireError,
     messages,
 )
+from kiteline_core.arrays import I32
 from kiteline_core.ids import (
     KEYPOINT_BITS,
     NO_KEYFRAME,
@@ -65,6 +68,12 @@ def check(saved: SavedMap) -> Checked:
         agent: (_decoded(agent, codes.received, faults), _decoded(agent, codes.own, faults))
         for agent, codes in sorted(saved.agents.items())
     }
+    for agent, (received, own) in decoded.items():
+        keyframes = sum(isinstance(record, KeyframeHeader) for record in received.values())
+        if keyframes and own and not any(isinstance(record, CameraIntrinsics) for record in received.values()):
+            faults.append(f"agent {agent} has {keyframes} keyframes and no camera: left out until it sends them again")
+            received.clear()
+            own.clear()
     headers: dict[KeyframeId, KeyframeHeader] = {}
     for agent, (received, _) in decoded.items():
         for key, record in list(received.items()):
@@ -175,11 +184,36 @@ def _sound_state(state: MapperState, submaps: set[SubmapId], faults: list[str]) 
     )
 
 
+def linked_across(sparse_map: SparseMap) -> I32:
+    """Slots (n,) of keypoints that are linked to landmarks of another map."""
+    table, root = sparse_map.keypoints, sparse_map.keypoints.root[: sparse_map.slots]
+    linked = np.flatnonzero(root >= 0).astype(np.int32)
+    submaps, of_slot = np.unique(
+        sparse_map.keyframes.id[table.row[: sparse_map.slots]] >> SEQUENCE_BITS, return_inverse=True
+    )
+    maps = np.array([sparse_map.map_id(SubmapId(s)) for s in submaps.tolist()], np.int64)
+    across: I32 = linked[maps[of_slot[linked]] != maps[of_slot[root[linked]]]]
+    return across
+
+
+def separated(mapper: Mapper) -> list[str]:
+    """Unlink keypoints from landmarks of other maps: a damaged store lost what joined the maps. A line if any were."""
+    sparse_map = mapper.map
+    across = linked_across(sparse_map)
+    if not len(across):
+        return []
+    fused = across[sparse_map.keypoints.kind[across] == LANDMARK]
+    sparse_map.unfuse(fused)
+    sparse_map.unlink(linked_across(sparse_map))  # observations that name a landmark of the other map themselves
+    mapper.tell_fused(fused)
+    return [f"{len(across)} keypoints were linked to landmarks of another map: maps are apart there"]
+
+
 def contradictions(mapper: Mapper) -> list[str]:
     """Inconsistencies of a map, a line each."""
     sparse_map = mapper.map
     keyframes, table, n = sparse_map.keyframes, sparse_map.keypoints, sparse_map.slots
-    out = []
+    out: list[str] = []
     for keyframe, row in sparse_map.rows.items():
         parent = KeyframeId(int(keyframes.parent[row]))
         if keyframes.pose_source[row] == NO_POSE:
@@ -212,11 +246,7 @@ def contradictions(mapper: Mapper) -> list[str]:
             at, steps = int(table.next[at]), steps + 1
     if np.any(listed[linked] != 1) or listed.sum() != len(linked):
         out.append("the lists of observations do not hold every observation once")
-    submap = keyframes.id[table.row[:n]] >> SEQUENCE_BITS
-    map_id = {s: int(sparse_map.map_id(SubmapId(s))) for s in np.unique(submap).tolist()}
-    across = linked[submap[linked] != submap[on]]
-    apart = sum(map_id[a] != map_id[b] for a, b in zip(submap[across].tolist(), submap[root[across]].tolist()))
-    if apart:
+    if apart := len(linked_across(sparse_map)):
         out.append(f"{apart} keypoints are linked to landmarks of another map")
     for merged, root_submap in sparse_map.root_submaps.items():
         known = root_submap in sparse_map.submaps and merged in sparse_map.submaps
