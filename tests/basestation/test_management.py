@@ -14,6 +14,7 @@ from kiteline_basestation.jobs import JobDone
 from kiteline_basestation.management import VERBS, Answer, Command, submap_name
 from kiteline_basestation.mapper import Mapper, MapperInput
 from kiteline_basestation.store.integrity import contradictions
+from kiteline_basestation.store.state_texts import state_of, texts_of
 from kiteline_codec.schema import CameraIntrinsics, CulledLandmarks, LivePose, Record, SubmapPlacement
 from kiteline_core.geometry import se3
 from kiteline_core.ids import KeyframeId, SubmapId, submap_id, submap_of_keyframe
@@ -112,6 +113,8 @@ def test_map_can_be_addressed_by_name(pair: Base) -> None:
 def test_split_maps_are_not_merged_again(pair: Base, make_flight: MakeFlight) -> None:
     assert ids(pair.ask("split", map="1.1.0")) == ["0.1.0", "1.1.0"]
     assert ids(pair.ask("list")) == ["0.1.0", "1.1.0"]
+    kept = texts_of(pair.mapper.state())  # a set, which JSON has not, ended a base with a store
+    assert state_of(kept).merger.detector.kept_apart == tuple(pair.mapper.merger.detector.kept_apart)
     more = make_flight(keyframes=30, turns=0.9, start=0.3, variant=1, agent=1, T_w_m=ELSEWHERE)
     for records in more.records[20:]:
         pair.step([(more.agent, tuple(records))])

@@ -201,7 +201,7 @@ class MapMerger:
         merge = next((m for m in reversed(self.merges) if submap in m.moved), None)
         if merge is None:
             return None
-        rest = frozenset(self._map.submaps_of_map(merge.into)) - merge.moved.keys()
+        rest = frozenset(self._map.submaps_of_map(merge.into)).difference(merge.moved)  # `-` of its keys is a set
         self.detector.kept_apart.append((frozenset(merge.moved), rest))
         return self.undo(merge)
 
