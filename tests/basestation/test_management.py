@@ -140,6 +140,27 @@ def test_user_merges_maps_by_a_transform(make_flight: MakeFlight, words: Any) ->
     assert "one map already" in base.ask("merge", map="1.1.0", into="0.1.0")["error"]
 
 
+def test_a_map_whose_camera_never_came_is_merged_without_harm(make_flight: MakeFlight, words: Any) -> None:
+    """An agent that means harm holds it back: a keyframe of another one beside its keyframes ended the base."""
+    base = Base(words)
+    a = make_flight(keyframes=14, turns=0.3)
+    b = make_flight(keyframes=14, turns=0.3, variant=1, agent=1, T_w_m=ELSEWHERE)
+    for records in (b.records[:4], b.records[4:]):
+        base.step([(b.agent, tuple(record for group in records for record in group))])
+    base.step([(a.agent, (CameraIntrinsics(a.agent, a.camera), *a.records[0]))])
+    base.rest(4)
+    T = ELSEWHERE.ravel().tolist()
+    assert base.ask("merge", map="1.1.0", into="0.1.0", T_into_map=T)["merged"] is True
+    for records in a.records[1:]:
+        base.step([(a.agent, tuple(records))])
+    base.rest(10)
+    assert not base.mapper.map.keypoints.usable[base.mapper.map.slots_of(b.keyframes[-1])].any()
+    base.step([(b.agent, (CameraIntrinsics(b.agent, b.camera),))])
+    assert base.mapper.map.keypoints.usable[base.mapper.map.slots_of(b.keyframes[-1])].any()
+    base.rest(10)
+    assert contradictions(base.mapper) == []
+
+
 def test_user_requests_a_search_for_loops(make_flight: MakeFlight, words: Any) -> None:
     base = Base(words)
     a = make_flight(keyframes=16, turns=0.5)

@@ -28,12 +28,14 @@ from kiteline_basestation.map.rig_values import RigValues, parameters
 from kiteline_basestation.map.world_poses import in_submap, place_in_world
 from kiteline_core.arrays import F32, F64, I32, I64, U8, U16, Bool
 from kiteline_core.geometry import se3, sim3
+from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import (
     KEYPOINT_BITS,
     MAX_KEYPOINTS,
     NO_KEYFRAME,
     NO_LANDMARK,
     SEQUENCE_BITS,
+    AgentId,
     KeyframeId,
     SubmapId,
     agent_of_keyframe,
@@ -148,6 +150,13 @@ class SparseMap(RigValues):
         self._link_observations(slots)
         self._refresh_usable(self.rows[keyframe])
 
+    def set_camera(self, agent: AgentId, camera: RectifiedCamera) -> None:
+        """Set the rectified camera of an agent; see `RigValues`. Observations are usable from the first one on."""
+        is_first = agent not in self.cameras
+        super().set_camera(agent, camera)
+        for row in [row for k, row in self.rows.items() if is_first and agent_of_keyframe(k) == agent]:
+            self._refresh_usable(row)
+
     # -- values of the base ------------------------------------------------------------------------------------------
 
     def set_pose(self, keyframe: KeyframeId, T_m_k: F64, *, carry: bool = True) -> None:
@@ -230,11 +239,6 @@ class SparseMap(RigValues):
         linked = (table.kind[: self.slots] == OBSERVATION) & (table.root[: self.slots] >= 0)
         slots = np.flatnonzero(linked).astype(np.int32)
         self._link_observations(slots[np.isin(self.find_landmarks(table.landmark[slots]), landmarks)])
-
-    def unlink(self, observations: I32) -> None:
-        """Let observations (n,) be of no landmark."""
-        table = self.keypoints
-        kernels.link(observations, np.full(len(observations), -1, np.int32), table.root, table.first, table.next)
 
     def forget(self, submaps: Collection[SubmapId]) -> None:
         """Forget submaps. Their rows and slots, which nothing may name any more, are free for the next keyframes."""
@@ -336,6 +340,7 @@ class SparseMap(RigValues):
         start = int(self.keyframes.start[row])
         mine = slice(start, start + int(self.keyframes.count[row]))
         open_ = self.keyframes.culled[row] == 0 and self.keyframes.pose_source[row] != NO_POSE
+        open_ &= self.keyframes.camera[row, 0] > 0.0  # else its camera is still to come
         here = table.kind[mine] != EMPTY
         table.usable[mine] = here & (table.flags[mine] & REMOVED == 0) & open_
         self.keyframes.usable[row] = np.count_nonzero(table.usable[mine])
