@@ -1,6 +1,6 @@
 """Checks a saved map: inconsistent values are left out and reported, values still to come are counted.
 
-`check` works on the saved values, `separated` and `contradictions` on the map that was restored from them.
+`check` works on the saved values, `relinked` and `contradictions` on the map that was restored from them.
 """
 
 from collections.abc import Mapping
@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from kiteline_basestation.map import sparse_map_kernels as kernels
 from kiteline_basestation.map.map_tables import EMPTY, LANDMARK, NO_POSE, OBSERVATION
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.mapper import Mapper
@@ -15,7 +16,6 @@ from kiteline_basestation.mapper_state import MapperState
 from kiteline_basestation.store.saved_map import SavedMap, SavedValues, value_name
 from kiteline_basestation.store.state_texts import state_of, texts_of
 from kiteline_codec.schema import (
-    CameraIntrinsics,
     CulledLandmarks,
     FusedLandmarks,
     GravityAlignment,
@@ -68,12 +68,6 @@ def check(saved: SavedMap) -> Checked:
         agent: (_decoded(agent, codes.received, faults), _decoded(agent, codes.own, faults))
         for agent, codes in sorted(saved.agents.items())
     }
-    for agent, (received, own) in decoded.items():
-        keyframes = sum(isinstance(record, KeyframeHeader) for record in received.values())
-        if keyframes and own and not any(isinstance(record, CameraIntrinsics) for record in received.values()):
-            faults.append(f"agent {agent} has {keyframes} keyframes and no camera: left out until it sends them again")
-            received.clear()
-            own.clear()
     headers: dict[KeyframeId, KeyframeHeader] = {}
     for agent, (received, _) in decoded.items():
         for key, record in list(received.items()):
@@ -196,17 +190,32 @@ def linked_across(sparse_map: SparseMap) -> I32:
     return across
 
 
-def separated(mapper: Mapper) -> list[str]:
-    """Unlink keypoints from landmarks of other maps: a damaged store lost what joined the maps. A line if any were."""
-    sparse_map = mapper.map
-    across = linked_across(sparse_map)
-    if not len(across):
+def relinked(mapper: Mapper) -> list[str]:
+    """Unlink keypoints from landmarks of other maps, and from what is none: a damaged store lost what joined the maps,
+    or an agent sent other values under old keys. A line if any were.
+    """
+    sparse_map, table = mapper.map, mapper.map.keypoints
+    wrong = _linked_wrongly(sparse_map)
+    if not len(wrong):
         return []
-    fused = across[sparse_map.keypoints.kind[across] == LANDMARK]
-    sparse_map.unfuse(fused)
-    sparse_map.unlink(linked_across(sparse_map))  # observations that name a landmark of the other map themselves
+    fused = wrong[table.kind[wrong] == LANDMARK]
+    sparse_map.unfuse(fused)  # observations of them follow
+    left = _linked_wrongly(sparse_map)
+    to = np.where(table.kind[left] == LANDMARK, left, -1).astype(np.int32)
+    kernels.link(left, to, table.root, table.first, table.next)
     mapper.tell_fused(fused)
-    return [f"{len(across)} keypoints were linked to landmarks of another map: maps are apart there"]
+    return [f"{len(wrong)} keypoints were linked to landmarks of another map, or to none: maps are apart there"]
+
+
+def _linked_wrongly(sparse_map: SparseMap) -> I32:
+    """Slots (n,) of keypoints that are linked to landmarks of another map, to fused ones, or to what is none."""
+    table, root = sparse_map.keypoints, sparse_map.keypoints.root[: sparse_map.slots]
+    linked = np.flatnonzero(root >= 0).astype(np.int32)
+    on = root[linked]
+    wrong = (table.kind[linked] == EMPTY) | (table.kind[on] == OBSERVATION)
+    wrong |= (root[on] != on) & (table.kind[on] != EMPTY)
+    slots: I32 = np.union1d(linked[wrong], linked_across(sparse_map)).astype(np.int32)
+    return slots
 
 
 def contradictions(mapper: Mapper) -> list[str]:
