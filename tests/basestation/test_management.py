@@ -3,6 +3,7 @@
 import copy
 import json
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,14 @@ from kiteline_basestation.management import VERBS, Answer, Command, submap_name
 from kiteline_basestation.mapper import Mapper, MapperInput
 from kiteline_basestation.store.integrity import contradictions
 from kiteline_basestation.store.state_texts import state_of, texts_of
-from kiteline_codec.schema import CameraIntrinsics, CulledLandmarks, LivePose, Record, SubmapPlacement
+from kiteline_codec.schema import (
+    CameraIntrinsics,
+    CulledLandmarks,
+    KeyframeHeader,
+    LivePose,
+    Record,
+    SubmapPlacement,
+)
 from kiteline_core.geometry import se3
 from kiteline_core.ids import KeyframeId, SubmapId, submap_id, submap_of_keyframe
 
@@ -172,6 +180,22 @@ def test_user_requests_a_search_for_loops(make_flight: MakeFlight, words: Any) -
     assert base.ask("merge", map="1.1.0", into="0.1.0") == {"merged": False, "looking": 16}
     base.rest()
     assert ids(base.ask("list")) == ["0.1.0"]
+
+
+def test_a_merge_leaves_out_keyframes_whose_parents_never_came(make_flight: MakeFlight, words: Any) -> None:
+    """Of one whose frame is a keyframe in another map, too, it ended the base."""
+    base = Base(words)
+    a = make_flight(keyframes=8, turns=0.2)
+    b = make_flight(keyframes=8, turns=0.2, seed=9, submap=1)
+    (seen,) = (record for record in a.records[5] if isinstance(record, KeyframeHeader))
+    (lost,) = (record for record in b.records[7] if isinstance(record, KeyframeHeader))
+    b.records[6] = []  # the parent of the last one
+    b.records[7] = [replace(lost, t_ns=seen.t_ns) if record is lost else record for record in b.records[7]]
+    base.fly([a, b, make_flight(keyframes=8, turns=0.2, seed=4, submap=2)])
+    assert base.mapper.map.pose(b.keyframes[7]) is None
+    assert len(ids(base.ask("list"))) == 3
+    assert base.ask("merge", map="0.1.1", into="0.1.2", T_into_map=np.eye(4).ravel().tolist())["merged"] is True
+    base.rest()
 
 
 def test_deleted_map_is_culled_and_later_records_ignored(make_flight: MakeFlight, words: Any) -> None:

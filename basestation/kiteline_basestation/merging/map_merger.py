@@ -119,6 +119,8 @@ class MapMerger:
         now, self._requery = self._requery[:_REQUERIES], self._requery[_REQUERIES:]
         result = MergeResult(requeried=tuple(now))
         for keyframe in now:
+            if self._map.pose(keyframe) is None:  # its parent is still to come
+                continue
             landmark_matching.match_landmarks(self._map, keyframe, self._config.landmark_matching, self._publisher)
             result += self._query(keyframe)
         if now and not self._requery:
