@@ -32,7 +32,7 @@ from kiteline_basestation.merging.merges import NOTHING, MergeResult
 from kiteline_basestation.refinement import culling, landmark_matching, triangulation
 from kiteline_basestation.refinement.bundle_job import FULL_BUNDLE, LOCAL_BUNDLE
 from kiteline_basestation.refinement.local_bundles import LocalBundles
-from kiteline_codec.schema import DisparityCalibration, Key, LivePose, Record, SubmapPlacement
+from kiteline_codec.schema import DisparityCalibration, FusedLandmarks, Key, LivePose, Record, SubmapPlacement
 from kiteline_core.arrays import F64, I32, U8
 from kiteline_core.geometry import sim3
 from kiteline_core.ids import AgentId, KeyframeId, SubmapId, agent_of_keyframe, agent_of_submap, submap_of_keyframe
@@ -235,6 +235,10 @@ class Mapper:
         self.grid_updates.rebuild()
         if self.merger is not None:
             self.merger.restore(state.merger)
+
+    def tell_fused(self, landmarks: I32) -> None:
+        """Send the roots of landmarks (n,) to their agents, which hold others."""
+        self._publisher.mark_changed_slots(FusedLandmarks.KIND, landmarks)
 
     def summary(self) -> dict[str, object]:
         """Sizes and counts for the status page, the terminal and reports, and the state of each agent."""

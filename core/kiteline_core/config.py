@@ -12,7 +12,7 @@ import types
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass, replace
 from enum import Enum
-from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal, TypeGuard, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from kiteline_core.errors import INPUT_FAULTS, KitelineError
 
@@ -215,14 +215,19 @@ def _convert(value: object, hint: Any, path: str) -> object:
         if value in [member.value for member in hint]:
             return hint(value)
     elif hint is float:
-        if isinstance(value, int | float) and not isinstance(value, bool):
+        if isinstance(value, float) or _is_whole(value):
             return float(value)
     elif hint is int:
-        if isinstance(value, int) and not isinstance(value, bool):
+        if _is_whole(value):
             return value
     elif isinstance(hint, type) and isinstance(value, hint):
         return value
     raise ConfigError(f"{path}: found {_shown(value)}, expected {type_name(hint)}")
+
+
+def _is_whole(value: object) -> TypeGuard[int]:
+    """True for an integer of 64 bits, as TOML's are; Python reads longer ones, too."""
+    return isinstance(value, int) and not isinstance(value, bool) and -(1 << 63) <= value < 1 << 63
 
 
 def type_name(hint: Any) -> str:

@@ -2,6 +2,9 @@
 
 from kiteline_agent.runtime.live import _BaseEnd
 from kiteline_agent.runtime.options import AgentOptions
+from kiteline_codec.transport.seal_watch import Trouble, notice
+
+S = 1_000_000_000
 
 
 class End:
@@ -10,6 +13,7 @@ class End:
     def __init__(self) -> None:
         self.doubled = False
         self.messages: list[str] = []
+        self.packets: list[bytes] = []
 
     def take_messages(self) -> list[str]:
         messages, self.messages = self.messages, []
@@ -19,7 +23,8 @@ class End:
         return True
 
     def receive(self) -> list[bytes]:
-        return []
+        packets, self.packets = self.packets, []
+        return packets
 
     def close(self) -> None:
         """Nothing to close."""
@@ -28,15 +33,44 @@ class End:
 def test_another_agent_with_this_number_is_told_once_with_the_mend() -> None:
     end = End()
     base = _BaseEnd(AgentOptions(source="", folder="", agent=3), end, None, None)
-    assert base.lines() == []
+    assert base.lines(0) == []
     end.doubled = True
-    assert base.lines() == ["another agent has number 3 too: give each its own --agent N"]
-    assert base.lines() == []
+    assert base.lines(0) == ["another agent has number 3 too: give each its own --agent N"]
+    assert base.lines(0) == []
 
 
 def test_what_the_link_tells_is_told_once() -> None:
     end = End()
     base = _BaseEnd(AgentOptions(source="", folder="", agent=3), end, None, None)
     end.messages = ["the line is gone"]
-    assert base.lines() == ["the line is gone"]
-    assert base.lines() == []
+    assert base.lines(0) == ["the line is gone"]
+    assert base.lines(0) == []
+
+
+def test_a_base_that_does_not_answer_is_named_once_and_so_is_its_return() -> None:
+    end = End()
+    base = _BaseEnd(AgentOptions(source="", folder="", link="zenoh:tcp/10.0.0.1:7447"), end, None, None)
+    assert [base.lines(t * S) for t in (0, 2)] == [[], []]
+    (line,) = base.lines(3 * S)
+    assert "no base answers at zenoh:tcp/10.0.0.1:7447" in line and "--paired-only" in line
+    assert base.lines(60 * S) == []
+    end.packets = [b"a packet"]
+    assert base.receive() == [b"a packet"]
+    assert base.lines(61 * S) == ["the base answers"]
+    assert [base.lines(t * S) for t in (62, 70)] == [[], []]
+    assert "no base answers" in base.lines(71 * S)[0]
+
+
+def test_a_flight_without_a_link_awaits_no_base() -> None:
+    base = _BaseEnd(AgentOptions(source="", folder="", link="none"), End(), None, None)
+    assert [base.lines(t * S) for t in (0, 60)] == [[], []]
+
+
+def test_a_base_that_is_not_understood_does_answer() -> None:
+    end = End()
+    base = _BaseEnd(AgentOptions(source="", folder="", link="zenoh:tcp/10.0.0.1:7447"), end, None, None)
+    base.lines(0)
+    end.packets = [notice(Trouble.UNSEALED)]
+    assert base.receive() == []
+    assert "seals" in base.lines(1 * S)[0]
+    assert base.lines(10 * S) == []

@@ -3,10 +3,12 @@
 import errno
 import io
 import os
+import signal
 import time
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,7 +16,7 @@ import pytest
 from kiteline_agent.__main__ import main
 from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_agent.local_map.held_corrections import HeldCorrections
-from kiteline_agent.runtime import agent_runtime
+from kiteline_agent.runtime import agent_runtime, live
 from kiteline_agent.runtime.agent_runtime import AgentRuntime
 from kiteline_agent.runtime.flight_record import FlightRecord
 from kiteline_agent.runtime.frame_counts import FrameCounts
@@ -29,6 +31,8 @@ from kiteline_hw.logs.mcap_log import LogReader
 from kiteline_hw.logs.mcap_write import McapWriter
 from kiteline_hw.ports import SourceError
 from kiteline_hw.sources.open import open_source
+from kiteline_hw.system import kernel_cache
+from kiteline_hw.system.process import StopSignal
 from tests.agent.test_flight_parts import estimate
 from tests.entries import entries_of
 
@@ -220,3 +224,25 @@ def test_an_agent_flies_without_a_log_that_cannot_begin(
     assert len(told) == 1 and "no log of this flight" in told[0]
     with pytest.raises((OSError, SourceError)):
         fly(AgentOptions(str(recording), str(tmp_path / "logs" / "agent0")), 99, 99, monkeypatch)
+
+
+@pytest.mark.parametrize("what", ["opened", "AgentRuntime"])
+def test_ctrl_c_ends_an_agent_that_opens_its_source_or_compiles(
+    what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A long recording without an index, and kernels that no folder keeps, took minutes in which it was not heard."""
+
+    def slow(*given: object, **named: object) -> None:
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(5.0)
+        raise AssertionError
+
+    monkeypatch.setattr(live, "opened", lambda _: SimpleNamespace(close=lambda: None))
+    monkeypatch.setattr(kernel_cache, "filled", lambda: True)
+    monkeypatch.setattr(live, what, slow)
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        live.fly_live(AgentOptions("any", str(tmp_path), log_name=""), None, StopSignal())
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -3,6 +3,7 @@
 import copy
 import json
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,15 @@ from kiteline_basestation.jobs import JobDone
 from kiteline_basestation.management import VERBS, Answer, Command, submap_name
 from kiteline_basestation.mapper import Mapper, MapperInput
 from kiteline_basestation.store.integrity import contradictions
-from kiteline_codec.schema import CameraIntrinsics, CulledLandmarks, LivePose, Record, SubmapPlacement
+from kiteline_basestation.store.state_texts import state_of, texts_of
+from kiteline_codec.schema import (
+    CameraIntrinsics,
+    CulledLandmarks,
+    KeyframeHeader,
+    LivePose,
+    Record,
+    SubmapPlacement,
+)
 from kiteline_core.geometry import se3
 from kiteline_core.ids import KeyframeId, SubmapId, submap_id, submap_of_keyframe
 
@@ -112,6 +121,8 @@ def test_map_can_be_addressed_by_name(pair: Base) -> None:
 def test_split_maps_are_not_merged_again(pair: Base, make_flight: MakeFlight) -> None:
     assert ids(pair.ask("split", map="1.1.0")) == ["0.1.0", "1.1.0"]
     assert ids(pair.ask("list")) == ["0.1.0", "1.1.0"]
+    kept = texts_of(pair.mapper.state())  # a set, which JSON has not, ended a base with a store
+    assert state_of(kept).merger.detector.kept_apart == tuple(pair.mapper.merger.detector.kept_apart)
     more = make_flight(keyframes=30, turns=0.9, start=0.3, variant=1, agent=1, T_w_m=ELSEWHERE)
     for records in more.records[20:]:
         pair.step([(more.agent, tuple(records))])
@@ -137,6 +148,27 @@ def test_user_merges_maps_by_a_transform(make_flight: MakeFlight, words: Any) ->
     assert "one map already" in base.ask("merge", map="1.1.0", into="0.1.0")["error"]
 
 
+def test_a_map_whose_camera_never_came_is_merged_without_harm(make_flight: MakeFlight, words: Any) -> None:
+    """An agent that means harm holds it back: a keyframe of another one beside its keyframes ended the base."""
+    base = Base(words)
+    a = make_flight(keyframes=14, turns=0.3)
+    b = make_flight(keyframes=14, turns=0.3, variant=1, agent=1, T_w_m=ELSEWHERE)
+    for records in (b.records[:4], b.records[4:]):
+        base.step([(b.agent, tuple(record for group in records for record in group))])
+    base.step([(a.agent, (CameraIntrinsics(a.agent, a.camera), *a.records[0]))])
+    base.rest(4)
+    T = ELSEWHERE.ravel().tolist()
+    assert base.ask("merge", map="1.1.0", into="0.1.0", T_into_map=T)["merged"] is True
+    for records in a.records[1:]:
+        base.step([(a.agent, tuple(records))])
+    base.rest(10)
+    assert not base.mapper.map.keypoints.usable[base.mapper.map.slots_of(b.keyframes[-1])].any()
+    base.step([(b.agent, (CameraIntrinsics(b.agent, b.camera),))])
+    assert base.mapper.map.keypoints.usable[base.mapper.map.slots_of(b.keyframes[-1])].any()
+    base.rest(10)
+    assert contradictions(base.mapper) == []
+
+
 def test_user_requests_a_search_for_loops(make_flight: MakeFlight, words: Any) -> None:
     base = Base(words)
     a = make_flight(keyframes=16, turns=0.5)
@@ -148,6 +180,22 @@ def test_user_requests_a_search_for_loops(make_flight: MakeFlight, words: Any) -
     assert base.ask("merge", map="1.1.0", into="0.1.0") == {"merged": False, "looking": 16}
     base.rest()
     assert ids(base.ask("list")) == ["0.1.0"]
+
+
+def test_a_merge_leaves_out_keyframes_whose_parents_never_came(make_flight: MakeFlight, words: Any) -> None:
+    """Of one whose frame is a keyframe in another map, too, it ended the base."""
+    base = Base(words)
+    a = make_flight(keyframes=8, turns=0.2)
+    b = make_flight(keyframes=8, turns=0.2, seed=9, submap=1)
+    (seen,) = (record for record in a.records[5] if isinstance(record, KeyframeHeader))
+    (lost,) = (record for record in b.records[7] if isinstance(record, KeyframeHeader))
+    b.records[6] = []  # the parent of the last one
+    b.records[7] = [replace(lost, t_ns=seen.t_ns) if record is lost else record for record in b.records[7]]
+    base.fly([a, b, make_flight(keyframes=8, turns=0.2, seed=4, submap=2)])
+    assert base.mapper.map.pose(b.keyframes[7]) is None
+    assert len(ids(base.ask("list"))) == 3
+    assert base.ask("merge", map="0.1.1", into="0.1.2", T_into_map=np.eye(4).ravel().tolist())["merged"] is True
+    base.rest()
 
 
 def test_deleted_map_is_culled_and_later_records_ignored(make_flight: MakeFlight, words: Any) -> None:

@@ -15,7 +15,15 @@ from kiteline_basestation.management import Command
 from kiteline_basestation.mapper import Mapper, MapperInput
 from kiteline_basestation.station import Station
 from kiteline_codec.channel import PlainChannel, plain_pair
-from kiteline_codec.schema import CameraIntrinsics, Key, KeyframePose, NewLandmarks, Record, SubmapPlacement
+from kiteline_codec.schema import (
+    CameraIntrinsics,
+    Key,
+    KeyframeHeader,
+    KeyframePose,
+    NewLandmarks,
+    Record,
+    SubmapPlacement,
+)
 from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
 from kiteline_core.ids import SEQUENCE_BITS, SubmapId, submap_of_keyframe
@@ -104,6 +112,28 @@ def test_predecessors_of_a_matched_keyframe_are_verified(
     assert mapper.summary()["merges"] == merges
     if merges:
         assert np.sqrt(np.mean(joint_error_m(mapper, [first, second]) ** 2)) < 0.03
+
+
+def test_predecessors_whose_parents_never_came_are_left_out(make_flight: MakeFlight, words: Any) -> None:
+    """They have no pose; where a lossy link or an agent that means harm left them so, the base ended."""
+    first = make_flight(keyframes=24, turns=0.45, start=0.3, variant=1, agent=1)
+    second = make_flight(keyframes=24, turns=0.45, T_w_m=ELSEWHERE)
+    headers: dict[int, KeyframeHeader] = {}
+    for n, group in enumerate(second.records):
+        (headers[n],) = (record for record in group if isinstance(record, KeyframeHeader))
+    missing, last = 2, 1
+    second.records[missing] = []
+    for n in range(3, 24):
+        lost = n % 3 == 2
+        parent = missing if lost else last
+        T_p_k = se3.inverse(second.agent_T_m_k[parent]) @ second.agent_T_m_k[n]
+        header = replace(headers[n], parent=second.keyframes[parent], T_p_k=T_p_k)
+        second.records[n] = [header if isinstance(r, KeyframeHeader) else r for r in second.records[n]]
+        last = last if lost else n
+    mapper = Mapper(WITHOUT_GRID, words)
+    feed(mapper, [first, second], [0, 24])
+    assert mapper.map.pose(second.keyframes[5]) is None and mapper.map.pose(second.keyframes[6]) is not None
+    assert mapper.merger is not None and mapper.merger.detector.verified > 0
 
 
 @pytest.mark.parametrize("keyframes", [1, 2])

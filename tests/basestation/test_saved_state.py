@@ -3,10 +3,13 @@
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
+from random import Random
 from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.job_kinds import run_job
@@ -27,13 +30,24 @@ from kiteline_codec.schema import (
     Key,
     KeyframeHeader,
     KeyframePose,
+    NewLandmarks,
+    Observations,
     SubmapPlacement,
     WireError,
     messages,
 )
 from kiteline_codec.sync.config import SyncConfig
 from kiteline_core.geometry import se3
-from kiteline_core.ids import AgentId, KeyframeId, agent_of_submap, keyframe_id, submap_id, submap_of_keyframe
+from kiteline_core.ids import (
+    KEYPOINT_BITS,
+    AgentId,
+    KeyframeId,
+    agent_of_keyframe,
+    agent_of_submap,
+    keyframe_id,
+    submap_id,
+    submap_of_keyframe,
+)
 from tests.basestation.feeding import WITHOUT_GRID
 
 STEP_NS = 100_000_000
@@ -189,6 +203,75 @@ def test_map_survives_six_restarts(make_flight: MakeFlight, words: Any, tmp_path
 
     refined = [station.mapper.map.pose(k) for k in flight.keyframes]
     assert error_m(refined) < 0.5 * error_m(flight.agent_T_m_k)  # six deaths, and still worth having
+
+
+@settings(max_examples=40, deadline=None)
+@given(seed=st.integers(0, 1 << 20), share=st.sampled_from([0.01, 0.1, 0.5]), texts=st.sampled_from([0.0, 0.3, 1.0]))
+def test_whatever_a_damaged_store_has_lost_the_rest_is_restored(
+    joined: tuple[Agents, Station], words: Any, seed: int, share: float, texts: float
+) -> None:
+    """A landmark whose section was gone ended the process, and what a merge had linked kept the map from beginning."""
+    kept, draw = snapshot(joined[1], SavedMap()), Random(seed)
+    agents = {
+        agent: SavedValues(
+            *(
+                {key: codes[key] for key in sorted(codes) if draw.random() >= share}
+                for codes in (all_.received, all_.own)
+            )
+        )
+        for agent, all_ in kept.agents.items()
+    }
+    left = {name: text for name, text in sorted(kept.texts.items()) if draw.random() >= texts}
+    station = new_station(words, session=3)
+    restored = restore(station, SavedMap(agents, left, ("values are gone",)), 0)
+    assert contradictions(station.mapper) == []
+    kinds = [key.kind for all_ in agents.values() for key in all_.received]
+    assert restored.keyframes == kinds.count(KeyframeHeader.KIND)
+    done: list[JobDone] = []
+    for n in range(4):
+        done = [run_job(job) for job in station.step({}, done, n * STEP_NS).jobs]
+    assert contradictions(station.mapper) == []
+
+
+def test_maps_whose_merge_was_lost_are_apart_and_their_agents_told(joined: tuple[Agents, Station], words: Any) -> None:
+    kept = snapshot(joined[1], SavedMap())
+    texts = {name: text for name, text in kept.texts.items() if name != "mapper.map"}
+    station = new_station(words, session=3)
+    restored = restore(station, replace(kept, texts=texts, faults=("state 'mapper.map' was altered",)), 0)
+    assert any("were linked to landmarks of another map, or to none" in fault for fault in restored.faults)
+    end, fused = station.channels[AgentId(1)], set[int]()
+    assert isinstance(end, CodedChannel)
+    for n in range(5):
+        station.step({}, [], n * STEP_NS)
+    for key, code in end.endpoint.own_values().items():
+        if key.kind == FusedLandmarks.KIND:
+            record = messages.decode(key, code)
+            assert isinstance(record, FusedLandmarks)
+            fused |= {int(agent_of_keyframe(KeyframeId(point >> KEYPOINT_BITS))) for point in record.point.tolist()}
+    assert fused <= {1}
+
+
+def test_values_of_another_kind_under_old_keys_do_not_keep_the_map_from_beginning(
+    joined: tuple[Agents, Station], words: Any
+) -> None:
+    """As of an agent that means harm: observations take the places of landmarks that others observe."""
+    agents, first = joined
+    kept = snapshot(first, SavedMap())
+    received = kept.agents[AgentId(0)].received
+    landmarks = [key for key in sorted(received) if key.kind == NewLandmarks.KIND][:4]
+    other = dict(received)
+    for key in landmarks:
+        record = messages.decode(key, received[key])
+        assert isinstance(record, NewLandmarks)
+        point = np.full(len(record.index), agents.flights[0].keyframes[0] << KEYPOINT_BITS, np.int64)
+        other |= _coded(
+            Observations(record.keyframe, key.part, record.index, record.uv, record.inv_depth, record.octave, point)
+        )
+    codes = SavedValues(other, kept.agents[AgentId(0)].own)
+    station = new_station(words, session=3)
+    restored = restore(station, replace(kept, agents={**kept.agents, AgentId(0): codes}), 0)
+    assert any("or to none" in fault for fault in restored.faults)
+    assert contradictions(station.mapper) == []
 
 
 def spoilt(

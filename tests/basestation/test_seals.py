@@ -14,6 +14,7 @@ from kiteline_basestation.runtime.seals import BaseSeals, logins_of
 from kiteline_codec.transport.seal import Direction, Sealer, Suite
 from kiteline_hw.links.ends import LinkOptions, OneLinkHub
 from kiteline_hw.links.no_link import open_base_end
+from kiteline_hw.links.zenoh_link import ZenohHub
 from kiteline_hw.ports import LinkError
 from kiteline_hw.system import key_store
 from kiteline_hw.system.key_store import new_code, new_maps_key, pair, read_keys
@@ -74,6 +75,32 @@ def test_what_the_link_tells_is_told_once(base: Base) -> None:
     base.wire.messages = ["the line is gone"]
     assert base.lines() == ["the line is gone"]
     assert base.lines() == []
+
+
+class DoubledHub(ZenohHub):
+    """A hub of which two agents have one number from now on."""
+
+    def __init__(self) -> None:
+        self.found: frozenset[int] = frozenset()
+
+    def doubles(self) -> frozenset[int]:
+        return self.found
+
+    def take_messages(self) -> list[str]:
+        return []
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
+def test_two_agents_with_one_number_are_told_soon_after_the_hub_knows() -> None:
+    """The hub needs 2.2 s to be sure, of the three within which they are to be named."""
+    hub = DoubledHub()
+    seals = BaseSeals(BaseOptions(folder="", link="zenoh:tcp/127.0.0.1:1"), hub)
+    assert seals.lines(10 * SECOND_NS) == []
+    hub.found = frozenset({3})
+    assert seals.lines(10 * SECOND_NS + SECOND_NS // 4) == ["two agents have number 3: give each its own --agent N"]
+    assert seals.lines(20 * SECOND_NS) == []
 
 
 def test_a_key_that_is_replaced_or_removed_opens_nothing_more(base: Base) -> None:

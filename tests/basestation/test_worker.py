@@ -139,6 +139,19 @@ def test_a_stopped_worker_is_replaced(bad_jobs: None) -> None:
         worker.close()
 
 
+def test_ctrl_c_does_not_reach_a_worker_that_starts(capfd: pytest.CaptureFixture[str]) -> None:
+    """A terminal sends it to all processes; a worker that was loading its modules ended in a traceback."""
+    worker = Worker()
+    try:
+        for _ in range(20):
+            os.kill(worker._process.pid or 0, signal.SIGINT)
+            time.sleep(0.02)
+        assert worker._process.is_alive()
+    finally:
+        worker.close()
+    assert capfd.readouterr().err == ""
+
+
 def test_a_large_job_does_not_wait_for_a_worker_that_was_stopped(bad_jobs: None) -> None:
     worker = Worker()
     try:

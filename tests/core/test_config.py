@@ -68,6 +68,8 @@ def test_unknown_key_names_key_section_and_what_is_known() -> None:
     [
         ({"rate_hz": "fast"}, ["rate_hz", "'fast'", "a number"]),
         ({"rate_hz": True}, ["rate_hz", "True", "a number"]),
+        ({"rate_hz": 10**400}, ["rate_hz", "a number"]),
+        ({"inner": {"tracker": {"points": 10**400}}}, ["inner.tracker.points", "a whole number"]),
         ({"inner": 3}, ["[inner]", "section"]),
         ({"inner": {"tracker": {"points": 1.5}}}, ["inner.tracker.points", "a whole number"]),
         ({"inner": {"tracker": {"mono": 1}}}, ["mono", "true or false"]),

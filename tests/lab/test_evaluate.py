@@ -63,6 +63,10 @@ def test_euroc_table(tmp_path: Path) -> None:
         ("1.0 0 0 0 1 1 0 1\n", "quaternion has length 1.732"),
         ("1 2 3 4 5 6 7 8 9 10 11 12\n", "no rotation matrix"),
         ("t,x,y\n1,2,3\n", "expected EuRoC's"),
+        ("9" * 5000 + " 0 0 0 0 0 0 1\n", "line 1: '999"),
+        ("9" * 19 + " 0 0 0 0 0 0 1\n", "no time in seconds"),
+        ("\N{SUPERSCRIPT TWO} 0 0 0 0 0 0 1\n", "no time in seconds"),
+        ("9" * 5000 + ",0,0,0,1,0,0,0\n", "no time in nanoseconds"),
     ],
 )
 def test_what_is_no_trajectory_is_named_by_line(text: str, words: str, tmp_path: Path) -> None:

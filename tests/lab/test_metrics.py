@@ -166,6 +166,16 @@ def test_too_few_common_poses_say_when_each_runs() -> None:
         match(late, truth, TrajectoryAlignment.SE3)
 
 
+@pytest.mark.parametrize("at_m", [1e10, 1e200, 1e308])
+def test_a_position_beyond_any_flight_is_refused_at_once(at_m: float) -> None:
+    """Where squares overflowed, the alignment never ended."""
+    far = flight()
+    far.T_w_b[5, :3, 3] = at_m, -at_m, 0.0
+    for pair in ((far, flight()), (flight(), far)):
+        with pytest.raises(ValueError, match="from the origin, expected at most"):
+            match(*pair, TrajectoryAlignment.SE3)
+
+
 def test_a_standing_estimate_has_no_scale() -> None:
     truth = flight()
     still = Trajectory(truth.t_ns, np.tile(np.eye(4), (120, 1, 1)))

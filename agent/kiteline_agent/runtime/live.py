@@ -3,7 +3,7 @@
 import os
 import threading
 from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -38,12 +38,14 @@ from kiteline_hw.system import kernel_cache, process
 from kiteline_hw.system.clock import MonotonicClock
 from kiteline_hw.system.cpu import CpuQuota
 from kiteline_hw.system.key_store import login_of, read_keys
-from kiteline_hw.system.long_work import starting
+from kiteline_hw.system.long_work import StoppedError, long_work, starting
 from kiteline_hw.system.start_numbers import Start, StartNumbers
 
 _Batch = TypeVar("_Batch", ImuBatch, OdometryBatch)
 _IDLE_TICK_S = 0.05  # s between two steps while no frame is due: keeps acknowledgements and heartbeats moving
 _DRAIN_S = 10.0  # s that a live flight waits at its end for the link to become quiet
+_FIRST_WORD_NS = 3_000_000_000  # ns after which it is said that no base answers: connections take less
+_SILENCE_NS = 10_000_000_000  # ns of silence after which it is said of one that did: a link that comes back takes less
 _QUIET_S = 1.0  # s that the link has to stay quiet: the base may still be working on the last keyframe
 
 
@@ -54,8 +56,9 @@ def fly_live(
 
     numbers: of this agent's starts; one is taken when all else is at hand. None: the options hold them.
     """
-    source = opened(options)
-    with ExitStack() as stack:
+    with suppress(StoppedError), ExitStack() as stack:
+        with long_work(stop, "opening the source"):  # that of a recording without an index is read from end to end
+            source = opened(options)
         stack.callback(source.close)
         source = with_controller_imu(options, source)
         # made before kernels and numbers are: a limit that cannot be set is told at once
@@ -71,7 +74,7 @@ def fly_live(
             options = _numbered(options, start)
             if start.kept:
                 process.print_lines([f"the number of this start is drawn, as it cannot be kept: {start.kept}"])
-        with starting():  # it compiles what could not be kept
+        with starting(), long_work(stop, "compiling kernels"):  # those that could not be kept
             runtime = AgentRuntime(options, source, channel_with_spill(options), whole_process=True)
         stack.callback(runtime.close)
         clock = MonotonicClock()
@@ -155,7 +158,7 @@ class _LiveFlight:
             if controller is not None:
                 push_obstacles(controller, runtime.agent, runtime.output, self._obstacles, now_ns)
             process.notify("WATCHDOG=1")
-            process.print_lines(self._base.lines())
+            process.print_lines(self._base.lines(now_ns))
             self._report(now_ns)
 
     def drain(self) -> None:
@@ -244,10 +247,14 @@ class _BaseEnd:
         self._link = SealedLink(end, options.agent, sealer, self._watch)
         self._follower = _SessionFollower(session, sealer, numbers)
         self._doubled_told = False
+        self._reach = None if options.link == "none" else _BaseReach(options.link)
+        self._heard = False  # since the last call of `lines`
 
     def receive(self) -> list[bytes]:
         """Packets that have arrived since the last call."""
-        return self._link.receive()
+        packets = self._link.receive()
+        self._heard |= bool(packets)
+        return packets
 
     def send(self, packets: Sequence[bytes], session: int) -> None:
         """Send packets of a session."""
@@ -255,13 +262,43 @@ class _BaseEnd:
         for packet in packets:
             self._link.send(packet)
 
-    def lines(self) -> list[str]:
+    def lines(self, now_ns: int) -> list[str]:
         """Messages about the link and seals, and about another agent with this number, each once."""
         lines = [*link_messages(self._end), *self._watch.lines()]
+        if self._reach is not None:
+            lines += self._reach.lines(now_ns, heard=self._heard or bool(lines))
+            self._heard = False
         if not self._doubled_told and getattr(self._end, "doubled", False):
             self._doubled_told = True
             lines.append(f"another agent has number {self._agent} too: give each its own --agent N")
         return lines
+
+
+class _BaseReach:
+    """Tells that no base answers, and that one does again: an agent flies on without a word from it."""
+
+    def __init__(self, link: str) -> None:
+        self._link = link
+        self._heard_ns: int | None = None  # last; of a flight that begins, its begin
+        self._silence_ns = _FIRST_WORD_NS
+        self._silent = False
+
+    def lines(self, now_ns: int, *, heard: bool) -> list[str]:
+        """What has changed. heard: whether anything came from the base since the last call."""
+        if heard or self._heard_ns is None:
+            self._heard_ns = now_ns
+        if heard:
+            self._silence_ns = _SILENCE_NS
+            self._silent, was_silent = False, self._silent
+            return ["the base answers"] if was_silent else []
+        if self._silent or now_ns - self._heard_ns < self._silence_ns:
+            return []
+        self._silent = True
+        line = (
+            f"no base answers at {self._link}, the flight goes on without: is one running there, does the network "
+            "reach it, and has it, if started with --paired-only, this agent's key?"
+        )
+        return [line]
 
 
 def _measured(by_controller: _Batch | None, by_source: _Batch | None, shift_ns: int) -> _Batch | None:
@@ -326,4 +363,8 @@ class _SessionFollower:
             self._sealer.raise_to(session)
         if self._numbers is not None:  # beside the flight, which cannot wait for a disk
             threading.Thread(target=self._numbers.raise_to, args=(order,), name="start-number", daemon=True).start()
-        process.print_lines(["the base knows a later start of this agent: state lost, or two agents with one number?"])
+        told = (
+            "the base knows a later start of this agent: was its state folder lost or copied, or do two agents have "
+            "its number (--agent N, its own for each)?"
+        )
+        process.print_lines([told])

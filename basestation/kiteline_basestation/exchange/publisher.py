@@ -264,10 +264,11 @@ def apply_record(sparse_map: SparseMap, record: Record) -> None:
     if isinstance(record, RefinedLandmarks):
         sparse_map.set_depths(slots, record.inv_depth[known], record.offset[known])
     elif isinstance(record, FusedLandmarks):
-        roots = sparse_map.find_landmarks(record.point[known])
-        for slot, root in zip(slots.tolist(), roots.tolist()):
-            if root >= 0 and sparse_map.keypoints.root[slot] == slot != root:
-                sparse_map.fuse(slot, int(sparse_map.keypoints.root[root]))
+        named, root = sparse_map.find_landmarks(record.point[known]), sparse_map.keypoints.root
+        for slot, other in zip(slots.tolist(), named.tolist()):
+            # What a store has lost is no landmark, and leads to none.
+            if other >= 0 and root[other] >= 0 and root[slot] == slot != root[other]:
+                sparse_map.fuse(slot, int(root[other]))
     else:
         bit = REMOVED if isinstance(record, RemovedObservations) else CULLED
         fresh = slots[flags[slots] & bit == 0]

@@ -192,7 +192,8 @@ class GridUpdates:
     def _make(self, keyframe: KeyframeId) -> None:
         """Make a scan of the landmarks of a keyframe and of those before it, and label those that are new in it."""
         S_w_k = self._pose(keyframe) if keyframe in self._map else None
-        if S_w_k is None:
+        camera = self._map.cameras.get(agent_of_keyframe(keyframe))
+        if S_w_k is None or camera is None:
             return
         submap = submap_of_keyframe(keyframe)
         siblings = self._map.submaps[submap]
@@ -208,7 +209,6 @@ class GridUpdates:
         scale = self._map.scale(submap)
         unit_m = sim3.scale_of(S_w_k)
         local = (xyz @ T_k_map[:3, :3].T + T_k_map[:3, 3]) * (unit_m / scale)
-        camera = self._map.cameras[agent_of_keyframe(keyframe)]
         made = sparse_scan(self._config, camera, S_w_k, local, np.isin(around, seen))
         if made is None:
             return

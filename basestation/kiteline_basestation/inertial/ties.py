@@ -57,7 +57,8 @@ class InertialTies:
     def take(self) -> InertialTie | None:
         """The next tie between two maps; one that joins nothing is dropped."""
         for record in list(self._waiting):
-            if record.keyframe in self._map and record.since in self._map:
+            has_camera = agent_of_keyframe(record.keyframe) in self._map.cameras
+            if has_camera and record.keyframe in self._map and record.since in self._map:
                 self._waiting.remove(record)
                 tie = self._tie(record)
                 if tie is not None:

@@ -28,12 +28,14 @@ from kiteline_basestation.map.rig_values import RigValues, parameters
 from kiteline_basestation.map.world_poses import in_submap, place_in_world
 from kiteline_core.arrays import F32, F64, I32, I64, U8, U16, Bool
 from kiteline_core.geometry import se3, sim3
+from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import (
     KEYPOINT_BITS,
     MAX_KEYPOINTS,
     NO_KEYFRAME,
     NO_LANDMARK,
     SEQUENCE_BITS,
+    AgentId,
     KeyframeId,
     SubmapId,
     agent_of_keyframe,
@@ -147,6 +149,13 @@ class SparseMap(RigValues):
             self.measures_depth.add(agent_of_keyframe(keyframe))
         self._link_observations(slots)
         self._refresh_usable(self.rows[keyframe])
+
+    def set_camera(self, agent: AgentId, camera: RectifiedCamera) -> None:
+        """Set the rectified camera of an agent; see `RigValues`. Observations are usable from the first one on."""
+        is_first = agent not in self.cameras
+        super().set_camera(agent, camera)
+        for row in [row for k, row in self.rows.items() if is_first and agent_of_keyframe(k) == agent]:
+            self._refresh_usable(row)
 
     # -- values of the base ------------------------------------------------------------------------------------------
 
@@ -331,6 +340,7 @@ class SparseMap(RigValues):
         start = int(self.keyframes.start[row])
         mine = slice(start, start + int(self.keyframes.count[row]))
         open_ = self.keyframes.culled[row] == 0 and self.keyframes.pose_source[row] != NO_POSE
+        open_ &= self.keyframes.camera[row, 0] > 0.0  # else its camera is still to come
         here = table.kind[mine] != EMPTY
         table.usable[mine] = here & (table.flags[mine] & REMOVED == 0) & open_
         self.keyframes.usable[row] = np.count_nonzero(table.usable[mine])

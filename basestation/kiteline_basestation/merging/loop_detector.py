@@ -276,6 +276,8 @@ class LoopDetector:
         back = sim3.inverse(correction)
         beside = [(k, match.old, correction) for k in reversed(before)] + [(k, match.new, back) for k in around]
         for keyframe, place, guess in beside:
+            if self._map.pose(keyframe) is None:  # its parent is still to come
+                continue
             if any(m.new == keyframe for m in self._matches[_pair(new, old)]):
                 continue
             found = verify_loop(

@@ -119,6 +119,8 @@ class MapMerger:
         now, self._requery = self._requery[:_REQUERIES], self._requery[_REQUERIES:]
         result = MergeResult(requeried=tuple(now))
         for keyframe in now:
+            if self._map.pose(keyframe) is None:  # its parent is still to come
+                continue
             landmark_matching.match_landmarks(self._map, keyframe, self._config.landmark_matching, self._publisher)
             result += self._query(keyframe)
         if now and not self._requery:
@@ -201,7 +203,7 @@ class MapMerger:
         merge = next((m for m in reversed(self.merges) if submap in m.moved), None)
         if merge is None:
             return None
-        rest = frozenset(self._map.submaps_of_map(merge.into)) - merge.moved.keys()
+        rest = frozenset(self._map.submaps_of_map(merge.into)).difference(merge.moved)  # `-` of its keys is a set
         self.detector.kept_apart.append((frozenset(merge.moved), rest))
         return self.undo(merge)
 

@@ -64,7 +64,7 @@ def nearby_keyframes(sparse_map: SparseMap, keyframe: KeyframeId) -> list[Keyfra
     distance = np.linalg.norm(poses[:, :3, 3] - table.T_w_k[row, :3, 3], axis=1)
     cosine = poses[:, :3, 2] @ table.T_w_k[row, :3, 2]
     near = (distance < reach) & (cosine > _NEAR_COSINE) & (table.pose_source[rows] != NO_POSE)
-    near &= (rows != row) & (table.culled[rows] == 0)
+    near &= (rows != row) & (table.culled[rows] == 0) & (table.camera[rows, 0] > 0.0)  # no camera: still to come
     ids = table.id[rows[near]]
     order = np.lexsort((ids, distance[near]))
     taken = set(covisible)

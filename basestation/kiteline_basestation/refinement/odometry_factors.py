@@ -105,6 +105,8 @@ def _steps(
     depth, units = median_depths(problem), units_of(sparse_map, window.rows, config.run)
     for k, row in enumerate(window.rows.tolist()):
         keyframe = KeyframeId(int(table.id[row]))
+        if agent_of_keyframe(keyframe) not in sparse_map.cameras:
+            continue  # its agent has yet to send it
         p, T_p_k = number.get(int(table.parent[row])), table.T_p_k[row]
         if p is None and (tie := sparse_map.inertial_steps.get(keyframe)) is not None:
             p, T_p_k = number.get(tie.since), moved_camera(sparse_map, tie)

@@ -12,6 +12,7 @@ from kiteline_hw.ports import LinkError, LinkHub, link_messages
 from kiteline_hw.system.key_store import MAPS, WatchedKeys, login_of, read_file
 
 _LOOK_NS = 1_000_000_000  # between two looks at the file of keys
+_DOUBLES_NS = 200_000_000  # between two looks for agents with one number, which are named within 3 s
 
 
 def logins_of(path: Path) -> dict[str, str]:
@@ -35,7 +36,7 @@ class BaseSeals:
         self._options, self._link = options, link
         self._file = WatchedKeys(Path(options.key)) if options.key else None
         self._keys = {} if self._file is None else dict(self._file.held.agents)
-        self._looked_ns = 0
+        self._looked_ns = self._looked_for_doubles_ns = 0
         self._doubles: frozenset[int] = frozenset()
         self._opener = None if self._file is None else Opener(self._keys, Direction.UP)
         self.sealers: dict[int, Sealer] = {}  # by agent
@@ -53,15 +54,17 @@ class BaseSeals:
         if now_ns - self._looked_ns >= _LOOK_NS:
             self._looked_ns = now_ns
             lines += self._new_keys()
-            doubles = self._link.doubles() if isinstance(self._link, ZenohHub) else frozenset()
-            if self._sealed is not None:
-                doubles &= self._sealed.alive()  # anyone can announce a number
-            lines += [
-                f"two agents have number {agent}: give each its own --agent N"
-                for agent in sorted(doubles - self._doubles)
-            ]
-            self._doubles = doubles
+        if now_ns - self._looked_for_doubles_ns >= _DOUBLES_NS:
+            self._looked_for_doubles_ns = now_ns
+            lines += self._new_doubles()
         return lines
+
+    def _new_doubles(self) -> list[str]:
+        doubles = self._link.doubles() if isinstance(self._link, ZenohHub) else frozenset()
+        if self._sealed is not None:
+            doubles &= self._sealed.alive()  # anyone can announce a number
+        new, self._doubles = sorted(doubles - self._doubles), doubles
+        return [f"two agents have number {agent}: give each its own --agent N" for agent in new]
 
     def _sealer(self, agent: int) -> Sealer | None:
         if agent in self._keys:

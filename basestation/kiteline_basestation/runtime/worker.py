@@ -9,6 +9,7 @@ import signal
 import time
 from collections import defaultdict, deque
 from collections.abc import Sequence
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 
 import cv2
@@ -40,7 +41,8 @@ def _work(pipe: Connection, nice: int) -> None:
     """Loop of a worker process: say that it is ready, then receive a job and send its result and CPU time in ms, or
     the error that it raised, until the pipe closes.
     """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C stops the base, which closes the pipe
+    # Ctrl-C stops the base, which closes the pipe. Until here the signal was held back.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.nice(nice)
     return_large_arrays()
     cv2.setNumThreads(1)
@@ -86,7 +88,12 @@ class Worker:
         context = multiprocessing.get_context("spawn")
         self._pipe, theirs = context.Pipe()
         self._process = context.Process(target=_work, args=(theirs, self._nice), name="kiteline-worker", daemon=True)
-        self._process.start()
+        resource_tracker.ensure_running()  # else `start` does it, and lets all signals through
+        held = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # it inherits that: its modules take a second
+        try:
+            self._process.start()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, held)
         self._ready = self._away = False
         theirs.close()  # so that each side notices when the other ends
 

@@ -1,6 +1,6 @@
 """Checks a saved map: inconsistent values are left out and reported, values still to come are counted.
 
-`check` works on the saved values, `contradictions` on the map that was restored from them.
+`check` works on the saved values, `relinked` and `contradictions` on the map that was restored from them.
 """
 
 from collections.abc import Mapping
@@ -8,7 +8,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from kiteline_basestation.map import sparse_map_kernels as kernels
 from kiteline_basestation.map.map_tables import EMPTY, LANDMARK, NO_POSE, OBSERVATION
+from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.mapper import Mapper
 from kiteline_basestation.mapper_state import MapperState
 from kiteline_basestation.store.saved_map import SavedMap, SavedValues, value_name
@@ -31,6 +33,7 @@ from kiteline_codec.schema import (
     WireError,
     messages,
 )
+from kiteline_core.arrays import I32
 from kiteline_core.ids import (
     KEYPOINT_BITS,
     NO_KEYFRAME,
@@ -175,11 +178,51 @@ def _sound_state(state: MapperState, submaps: set[SubmapId], faults: list[str]) 
     )
 
 
+def linked_across(sparse_map: SparseMap) -> I32:
+    """Slots (n,) of keypoints that are linked to landmarks of another map."""
+    table, root = sparse_map.keypoints, sparse_map.keypoints.root[: sparse_map.slots]
+    linked = np.flatnonzero(root >= 0).astype(np.int32)
+    submaps, of_slot = np.unique(
+        sparse_map.keyframes.id[table.row[: sparse_map.slots]] >> SEQUENCE_BITS, return_inverse=True
+    )
+    maps = np.array([sparse_map.map_id(SubmapId(s)) for s in submaps.tolist()], np.int64)
+    across: I32 = linked[maps[of_slot[linked]] != maps[of_slot[root[linked]]]]
+    return across
+
+
+def relinked(mapper: Mapper) -> list[str]:
+    """Unlink keypoints from landmarks of other maps, and from what is none: a damaged store lost what joined the maps,
+    or an agent sent other values under old keys. A line if any were.
+    """
+    sparse_map, table = mapper.map, mapper.map.keypoints
+    wrong = _linked_wrongly(sparse_map)
+    if not len(wrong):
+        return []
+    fused = wrong[table.kind[wrong] == LANDMARK]
+    sparse_map.unfuse(fused)  # observations of them follow
+    left = _linked_wrongly(sparse_map)
+    to = np.where(table.kind[left] == LANDMARK, left, -1).astype(np.int32)
+    kernels.link(left, to, table.root, table.first, table.next)
+    mapper.tell_fused(fused)
+    return [f"{len(wrong)} keypoints were linked to landmarks of another map, or to none: maps are apart there"]
+
+
+def _linked_wrongly(sparse_map: SparseMap) -> I32:
+    """Slots (n,) of keypoints that are linked to landmarks of another map, to fused ones, or to what is none."""
+    table, root = sparse_map.keypoints, sparse_map.keypoints.root[: sparse_map.slots]
+    linked = np.flatnonzero(root >= 0).astype(np.int32)
+    on = root[linked]
+    wrong = (table.kind[linked] == EMPTY) | (table.kind[on] == OBSERVATION)
+    wrong |= (root[on] != on) & (table.kind[on] != EMPTY)
+    slots: I32 = np.union1d(linked[wrong], linked_across(sparse_map)).astype(np.int32)
+    return slots
+
+
 def contradictions(mapper: Mapper) -> list[str]:
     """Inconsistencies of a map, a line each."""
     sparse_map = mapper.map
     keyframes, table, n = sparse_map.keyframes, sparse_map.keypoints, sparse_map.slots
-    out = []
+    out: list[str] = []
     for keyframe, row in sparse_map.rows.items():
         parent = KeyframeId(int(keyframes.parent[row]))
         if keyframes.pose_source[row] == NO_POSE:
@@ -212,11 +255,7 @@ def contradictions(mapper: Mapper) -> list[str]:
             at, steps = int(table.next[at]), steps + 1
     if np.any(listed[linked] != 1) or listed.sum() != len(linked):
         out.append("the lists of observations do not hold every observation once")
-    submap = keyframes.id[table.row[:n]] >> SEQUENCE_BITS
-    map_id = {s: int(sparse_map.map_id(SubmapId(s))) for s in np.unique(submap).tolist()}
-    across = linked[submap[linked] != submap[on]]
-    apart = sum(map_id[a] != map_id[b] for a, b in zip(submap[across].tolist(), submap[root[across]].tolist()))
-    if apart:
+    if apart := len(linked_across(sparse_map)):
         out.append(f"{apart} keypoints are linked to landmarks of another map")
     for merged, root_submap in sparse_map.root_submaps.items():
         known = root_submap in sparse_map.submaps and merged in sparse_map.submaps

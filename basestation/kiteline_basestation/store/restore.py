@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from kiteline_basestation.exchange.map_cache_planner import is_cached_key
 from kiteline_basestation.station import Station
-from kiteline_basestation.store.integrity import Checked, check, contradictions
+from kiteline_basestation.store.integrity import Checked, check, contradictions, relinked
 from kiteline_basestation.store.saved_map import SavedMap
 from kiteline_basestation.store.state_texts import state_of
 from kiteline_codec.channel import CodedChannel
@@ -47,7 +47,8 @@ def _restore(station: Station, checked: Checked, now_ns: int) -> Restored:
         own = [key for key in sorted(values.own) if not is_cached_key(key)]  # the map cache is planned anew
         station.restore(agent, [messages.decode(key, values.own[key]) for key in own], now_ns)
     mapper.restore_state(state_of(saved.texts))
+    faults = (*checked.faults, *relinked(mapper))
     wrong = contradictions(mapper)
     if wrong:
         raise WireError(f"the saved map contradicts itself: {'; '.join(wrong[:5])}; begin an empty store")
-    return Restored(saved, len(mapper.map), checked.faults, checked.awaited)
+    return Restored(saved, len(mapper.map), faults, checked.awaited)

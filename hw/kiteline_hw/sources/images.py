@@ -78,7 +78,7 @@ def _parse_times(files: list[Path], rate_hz: float) -> list[int]:
     """Stamps in ns from the file names, else at the given rate."""
     stems = [path.stem for path in files]
     try:
-        if all(stem.isdigit() and len(stem) >= 16 for stem in stems):
+        if all(stem.isdecimal() and len(stem) >= 16 for stem in stems):
             return [int(stem) for stem in stems]
         if all("." in stem for stem in stems):
             return [seconds_to_ns(stem) for stem in stems]

@@ -78,7 +78,7 @@ def _read_projections(path: Path, left: str, right: str) -> tuple[F64, F64 | Non
 
 def _row_indices(images: list[Path], row_count: int) -> list[int]:
     """The row of times.txt or poses.txt for each image: the image's number, if all are rows, else its position."""
-    if all(path.stem.isdigit() and int(path.stem) < row_count for path in images):
+    if all(path.stem.isdecimal() and int(path.stem) < row_count for path in images):
         return [int(path.stem) for path in images]
     return list(range(len(images)))
 
@@ -86,7 +86,7 @@ def _row_indices(images: list[Path], row_count: int) -> list[int]:
 def _read_times(folder: Path, lefts: list[Path]) -> list[int]:
     path = folder / "times.txt"
     if not path.is_file():
-        numbers = [int(p.stem) for p in lefts] if all(p.stem.isdigit() for p in lefts) else list(range(len(lefts)))
+        numbers = [int(p.stem) for p in lefts] if all(p.stem.isdecimal() for p in lefts) else list(range(len(lefts)))
         return [number * (1_000_000_000 // NOMINAL_HZ) for number in numbers]
     try:
         times = [seconds_to_ns(cells[0]) for cells in read_rows(path, "one time in seconds a line")]

@@ -127,7 +127,7 @@ def _read_times(path: Path, lefts: list[Path]) -> list[int]:
     lines = [line.strip() for line in read_text(path, "a date and time a line").splitlines() if line.strip()]
     if len(lines) < len(lefts):
         raise SourceError(f"{path}: {len(lines)} times for {len(lefts)} images: expected one a line for each image")
-    numbered = all(p.stem.isdigit() and int(p.stem) < len(lines) for p in lefts)
+    numbered = all(p.stem.isdecimal() and int(p.stem) < len(lines) for p in lefts)
     return [_nanoseconds(lines[int(p.stem) if numbered else k], path) for k, p in enumerate(lefts)]
 
 

@@ -14,6 +14,7 @@ from kiteline_core.frame import Trajectory
 from kiteline_core.geometry import se3
 
 MAX_DIFFERENCE_NS = 10_000_000  # largest difference in time of two poses that are compared (as in evo and TUM's tools)
+FARTHEST_M = 1e9  # of a position; squares of such as 1e200 overflow, on which a singular value decomposition never ends
 MAX_BRIDGE_NS = 50_000_000  # ground truth at 20 Hz or more is interpolated; the error on a drone is below 1 mm
 GAP_FACTOR = 1.5  # a step longer than this many median steps is a gap: poses are missing there
 SECOND_TOLERANCE = 0.1  # an RPE pair "one second apart" may be 10 % off
@@ -168,13 +169,16 @@ def umeyama(source: F64, target: F64, *, with_scale: bool = False) -> tuple[F64,
 def match(
     estimate: Trajectory, truth: Trajectory, alignment: TrajectoryAlignment, max_difference_ns: int = MAX_DIFFERENCE_NS
 ) -> Matched:
-    """Match in time and align. Raises ValueError if fewer than three poses match."""
+    """Match in time and align. Raises ValueError if fewer than three poses match, or lie beyond any flight."""
     i, true = truth_at(estimate.t_ns, truth, max_difference_ns)
     if len(i) < 3:
         raise ValueError(
             f"only {len(i)} of {len(estimate.t_ns)} poses have a true pose at their time: {_spans(estimate, truth)}"
         )
     est = estimate.T_w_b[i]
+    farthest_m = float(max(np.abs(poses[:, :3, 3]).max() for poses in (est, true)))
+    if not farthest_m <= FARTHEST_M:
+        raise ValueError(f"a position is {farthest_m:.3g} m from the origin, expected at most {FARTHEST_M:.0g} m")
     scale = 1.0
     if alignment is TrajectoryAlignment.ORIGIN:
         t = true[0] @ se3.inverse(est[0])

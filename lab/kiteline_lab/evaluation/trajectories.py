@@ -1,5 +1,6 @@
 """Read trajectories: TUM files, KITTI poses, EuRoC's data.csv, or the ground truth of a recording."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,6 +11,7 @@ from kiteline_core.errors import KitelineError
 from kiteline_core.frame import Trajectory
 from kiteline_core.geometry import se3
 from kiteline_hw.sources.kinds import is_source
+from kiteline_hw.sources.text_files import nanoseconds, seconds_to_ns
 
 KITTI_PERIOD_NS = 100_000_000  # 10 Hz: for KITTI poses without a times.txt
 QUATERNION_TOLERANCE = 0.02  # a length further from 1 than this is a wrong column
@@ -81,13 +83,11 @@ def _floats(spec: str, number: int, fields: list[str]) -> list[float]:
     return values
 
 
-def _seconds_to_ns(spec: str, number: int, text: str) -> int:
-    """Nanoseconds of decimal seconds; exact for plain decimals, since float64 resolves Unix time to 240 ns only."""
-    whole, _, fraction = text.partition(".")
-    if whole.lstrip("-").isdigit() and (fraction.isdigit() or not fraction):
-        magnitude = int(whole.lstrip("-")) * 10**9 + int(fraction[:9].ljust(9, "0"))
-        return -magnitude if whole.startswith("-") else magnitude
-    return round(_floats(spec, number, [text])[0] * 1e9)
+def _time_ns(spec: str, number: int, text: str, parse: Callable[[str], int]) -> int:
+    try:
+        return parse(text)
+    except ValueError as error:
+        raise TrajectoryError(f"{spec}: line {number}: {error}") from None
 
 
 def _pose(spec: str, number: int, position: list[float], q_wxyz: list[float]) -> F64:
@@ -118,7 +118,7 @@ def _tum(spec: str, numbered: list[tuple[int, str]]) -> Trajectory:
                 f"{spec}: line {number} has {len(fields)} columns, expected 8: t x y z qx qy qz qw; was the file cut?"
             )
         x, y, z, qx, qy, qz, qw = _floats(spec, number, fields[1:])
-        times.append(_seconds_to_ns(spec, number, fields[0]))
+        times.append(_time_ns(spec, number, fields[0], seconds_to_ns))
         poses.append(_pose(spec, number, [x, y, z], [qw, qx, qy, qz]))
     return _in_order(spec, [n for n, _ in numbered], times, poses)
 
@@ -127,12 +127,12 @@ def _euroc(spec: str, numbered: list[tuple[int, str]]) -> Trajectory:
     times, poses = [], []
     for number, line in numbered:
         fields = [f.strip() for f in line.split(",")]
-        if len(fields) < 8 or not fields[0].isdigit():
+        if len(fields) < 8:
             raise TrajectoryError(
                 f"{spec}: line {number}: expected EuRoC's t_ns, x, y, z, qw, qx, qy, qz, …; found {line[:60]!r}"
             )
         values = _floats(spec, number, fields[1:8])
-        times.append(int(fields[0]))
+        times.append(_time_ns(spec, number, fields[0], nanoseconds))
         poses.append(_pose(spec, number, values[:3], values[3:]))
     return _in_order(spec, [n for n, _ in numbered], times, poses)
 
@@ -150,12 +150,12 @@ def _kitti(path: Path, numbered: list[tuple[int, str]]) -> TrajectoryFile:
     beside = path.with_name("times.txt")
     timed = beside.is_file() and beside != path
     if timed:
-        texts = beside.read_text(encoding="utf-8").split()
+        texts = beside.read_text(encoding="utf-8", errors="replace").split()
         if len(texts) != len(poses):
             raise TrajectoryError(
                 f"{beside} has {len(texts)} times, but {path} has {len(poses)} poses: one a pose expected"
             )
-        times = [_seconds_to_ns(str(beside), i, t) for i, t in enumerate(texts, 1)]
+        times = [_time_ns(str(beside), i, t, seconds_to_ns) for i, t in enumerate(texts, 1)]
     else:
         times = [i * KITTI_PERIOD_NS for i in range(len(poses))]
     return TrajectoryFile(_in_order(str(path), [n for n, _ in numbered], times, poses), timed)
