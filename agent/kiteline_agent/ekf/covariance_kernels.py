@@ -10,21 +10,21 @@ from kiteline_core.jit import njit
 
 
 @njit
-def add_products(P: F64, left: F64, right: F64) -> None:
-    """Add left^T right, which is symmetric, to the lower triangle of P's first n rows. left, right: (m,n), m and n
-    multiples of four: so many rows of P take so many products at a time, since to load and store numbers takes as long
-    as to multiply them.
+def add_products(P: F64, rows: F64, sign: float) -> None:
+    """Add sign * rows^T rows to the lower triangle of P's first n rows. rows: (m,n), m and n multiples of four.
+
+    Four rows of P take four products at a time, since to load and store numbers takes as long as to multiply them.
     """
-    m, n = left.shape
+    m, n = rows.shape
     for i in range(0, n, 4):
         p0, p1, p2, p3 = P[i], P[i + 1], P[i + 2], P[i + 3]
         for k in range(0, m, 4):
-            a = left[k : k + 4, i : i + 4]
-            a00, a01, a02, a03 = a[0, 0], a[0, 1], a[0, 2], a[0, 3]
-            a10, a11, a12, a13 = a[1, 0], a[1, 1], a[1, 2], a[1, 3]
-            a20, a21, a22, a23 = a[2, 0], a[2, 1], a[2, 2], a[2, 3]
-            a30, a31, a32, a33 = a[3, 0], a[3, 1], a[3, 2], a[3, 3]
-            r0, r1, r2, r3 = right[k], right[k + 1], right[k + 2], right[k + 3]
+            a = rows[k : k + 4, i : i + 4]
+            a00, a01, a02, a03 = sign * a[0, 0], sign * a[0, 1], sign * a[0, 2], sign * a[0, 3]
+            a10, a11, a12, a13 = sign * a[1, 0], sign * a[1, 1], sign * a[1, 2], sign * a[1, 3]
+            a20, a21, a22, a23 = sign * a[2, 0], sign * a[2, 1], sign * a[2, 2], sign * a[2, 3]
+            a30, a31, a32, a33 = sign * a[3, 0], sign * a[3, 1], sign * a[3, 2], sign * a[3, 3]
+            r0, r1, r2, r3 = rows[k], rows[k + 1], rows[k + 2], rows[k + 3]
             for j in range(i + 4):
                 x0, x1, x2, x3 = r0[j], r1[j], r2[j], r3[j]
                 p0[j] += (a00 * x0 + a10 * x1) + (a20 * x2 + a30 * x3)

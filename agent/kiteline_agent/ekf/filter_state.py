@@ -149,9 +149,9 @@ class FilterState:
     def _add(self, rows: F64, sign: float) -> None:
         """Add sign * rows^T rows to the covariance. rows: (m,size)."""
         m, n = rows.shape
-        right = np.zeros((m + -m % 4, n + -n % 4))
-        right[:m, :n] = rows
-        kernels.add_products(self.P, sign * right, right)
+        padded = np.zeros((m + -m % 4, n + -n % 4))
+        padded[:m, :n] = rows
+        kernels.add_products(self.P, padded, sign)
 
     def add_view(self, view: int) -> None:
         """Keep the camera's pose as a past view."""

@@ -5,13 +5,13 @@ import numpy as np
 from kiteline_core.arrays import F64, Bool
 from kiteline_core.jit import helper, njit
 
-_STEPS = 3  # Gauss-Newton steps after the linear solution: it is near
-_STILL = 1e-4  # of the distance: a shorter step is the last
+_STEPS = 2  # Gauss-Newton steps after the linear solution: it is near
+_STILL = 1e-3  # of the distance: after a shorter step the next one would be a thousand times shorter
 
 
 @helper
 def _solve(a: F64, b: F64, x: F64) -> bool:
-    """Solve a symmetric 3x3 system by cofactors; False if it is singular."""
+    """Solve a symmetric 3x3 system, of which the upper triangle is read, by cofactors; False if it is singular."""
     c00 = a[1, 1] * a[2, 2] - a[1, 2] * a[1, 2]
     c01 = a[0, 2] * a[1, 2] - a[0, 1] * a[2, 2]
     c02 = a[0, 1] * a[1, 2] - a[0, 2] * a[1, 1]
@@ -46,7 +46,7 @@ def position_by_rays(xy: F64, T_o_c: F64, point: F64) -> bool:
             along += d[i] * T_o_c[k, i, 3]
         for i in range(3):
             b[i] += T_o_c[k, i, 3] - along * d[i]
-            for j in range(3):
+            for j in range(i, 3):
                 a[i, j] += (1.0 if i == j else 0.0) - d[i] * d[j]
     if not _solve(a, b, point):
         return False
@@ -70,7 +70,7 @@ def position_by_rays(xy: F64, T_o_c: F64, point: F64) -> bool:
                     d[i] = (T_o_c[k, i, r] - T_o_c[k, i, 2] * ahead) / z
                 for i in range(3):
                     b[i] += d[i] * error
-                    for j in range(3):
+                    for j in range(i, 3):
                         a[i, j] += d[i] * d[j]
         if not _solve(a, b, step):
             return False
@@ -108,7 +108,7 @@ def supporting_views(centres: F64, rays: F64, seen: Bool, tolerance: float, best
                 along = d[0] * centre[0] + d[1] * centre[1] + d[2] * centre[2]
                 for i in range(3):
                     b[i] += centre[i] - along * d[i]
-                    for j in range(3):
+                    for j in range(i, 3):
                         a[i, j] += (1.0 if i == j else 0.0) - d[i] * d[j]
             if not _solve(a, b, point):
                 continue

@@ -100,17 +100,15 @@ def _way(
 def _enters(motions: list[Motion], xy: F64, sigma: float, point: F64) -> bool:
     """Set the point (3,) with which the filter lets a landmark in; False if it does not.
 
-    xy: (n,2) observations before, between and after n - 1 motions. The rays of the last one and of as many views as the
-    filter keeps, spread evenly, correct the poses first.
+    xy: (n,2) observations before, between and after n - 1 motions. Each frame is a view of the filter, whose poses the
+    rays correct first.
     """
-    config = EkfConfig(landmarks=1, scale_sigma=0.0)
-    state = FilterState(vehicle.camera().T_b_c, config)
-    frames = np.linspace(0, len(motions) - 1, config.views).round().astype(np.int64)
-    for k, motion in enumerate(motions):
-        for view in np.flatnonzero(frames == k).tolist():
-            state.add_view(view)
+    count = len(motions)
+    state = FilterState(vehicle.camera().T_b_c, EkfConfig(landmarks=1, views=count, scale_sigma=0.0))
+    for view, motion in enumerate(motions):
+        state.add_view(view)
         state.propagate(motion)
-    track = Track(np.arange(config.views), xy[np.append(frames, -1)], sigma)
+    track = Track(np.arange(count), xy, sigma)
     update_by_rays(state, [track])
     rays = linearised(state, track, state.T_o_c, state.view_T_o_c)
     if rays is None:

@@ -35,7 +35,7 @@ def test_products_are_added_to_the_lower_triangle() -> None:
     for m, n in ((4, 20), (8, 12), (20, 4)):
         rows = np.random.default_rng(m).standard_normal((m, n))
         changed, expected = P.copy(), full.copy()
-        kernels.add_products(changed, -2.0 * rows, rows)
+        kernels.add_products(changed, rows, -2.0)
         expected[:n, :n] -= 2.0 * rows.T @ rows
         np.testing.assert_allclose(_whole(changed), expected, atol=1e-12)
 
