@@ -157,7 +157,8 @@ class DisparityConfig:
     """Estimation of a worn stereo rig's disparity offset on board."""
 
     on: bool = True  # False: only the base estimates it
-    every: int = 4  # frames between two pairs: each costs a quarter of a millisecond
+    every: int = 4  # frames between two pairs, at most: each costs 0.3 ms
+    every_s: float = 0.18  # s between two pairs, at most: slow cameras, and frames that the governor skips
     points: int = 120  # most of them that are used
     sigma_px: float = 0.3  # px at octave 0; of aligned coordinates and disparities
     growth: float = 1.2  # of the parallax between two pairs of the same keyframe
