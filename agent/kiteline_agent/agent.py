@@ -74,7 +74,7 @@ class Agent:
         self.work = Work()  # operations of the last step
         self.map = LocalMap(camera, config.local_map)
         self.map_cache = MapCache(camera, config.map_cache, config.matching, config.ransac, vocabulary)
-        self._governor = Governor(config.governor, inertial=imu is not None)
+        self._governor = Governor(config.governor)
         self._effort = FULL
         self._camera = CameraState(rig, imu, config, identity, self.map)
         self._tracker = Tracker(self.map, self.work)

@@ -244,7 +244,7 @@ class GovernorConfig:
     window_s: float = 1.0  # s: window in which the budget has to hold
     margin: float = 0.97  # share of the budget that is planned; the rest is for what was not expected
     fill: float = 0.9  # share that frames and keyframes may take between two rows; what is left is for early keyframes
-    carried_fill: float = 1.05  # the same with an IMU: a keyframe may wait for room, since frames are bridged meanwhile
+    carried_fill: float = 0.95  # the same with an IMU: a keyframe may wait for room, since frames are bridged meanwhile
     comfort: float = 0.86  # share below which the load at the next better effort must stay before effort rises
     grace_s: float = 2.0  # s at the start that do not count: a map has to be begun
     down_s: float = 0.25  # s between two falls: the expected costs need time to follow the first one
