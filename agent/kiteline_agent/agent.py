@@ -74,7 +74,7 @@ class Agent:
         self.work = Work()  # operations of the last step
         self.map = LocalMap(camera, config.local_map)
         self.map_cache = MapCache(camera, config.map_cache, config.matching, config.ransac, vocabulary)
-        self._governor = Governor(config.governor, inertial=imu is not None)
+        self._governor = Governor(config.governor)
         self._effort = FULL
         self._camera = CameraState(rig, imu, config, identity, self.map)
         self._tracker = Tracker(self.map, self.work)
@@ -86,7 +86,9 @@ class Agent:
         )  # fmt: skip
         self.right_camera = None
         if rig.right is not None:
-            self.right_camera = RightCamera(identity.agent, self._camera, self.map, self._rectifier, config, channel)
+            self.right_camera = RightCamera(
+                identity.agent, self._camera, self.map, self._rectifier, config, channel, self.work
+            )  # fmt: skip
         self._corrections = Corrections(
             self.map, self.map_cache, config.smoothing,
             None if self.right_camera is None else self.right_camera.take_base, config.local_grid.tiles,
@@ -215,7 +217,7 @@ class Agent:
             self._depth.search_seeds(ctx, track)
             if self.right_camera is not None:
                 T_o_m = camera.pose.T_o_m
-                moved, said = self.right_camera.add(track)
+                moved, said = self.right_camera.add(ctx.t_ns, track)
                 events += said
                 if moved:
                     self._corrections.move_on_board(self.submap, T_o_m)

@@ -157,7 +157,8 @@ class DisparityConfig:
     """Estimation of a worn stereo rig's disparity offset on board."""
 
     on: bool = True  # False: only the base estimates it
-    every: int = 4  # frames between two pairs: each costs a quarter of a millisecond
+    every: int = 4  # frames between two pairs, at most: each costs 0.3 ms
+    every_s: float = 0.18  # s between two pairs, at most: slow cameras, and frames that the governor skips
     points: int = 120  # most of them that are used
     sigma_px: float = 0.3  # px at octave 0; of aligned coordinates and disparities
     growth: float = 1.2  # of the parallax between two pairs of the same keyframe
@@ -243,7 +244,7 @@ class GovernorConfig:
     window_s: float = 1.0  # s: window in which the budget has to hold
     margin: float = 0.97  # share of the budget that is planned; the rest is for what was not expected
     fill: float = 0.9  # share that frames and keyframes may take between two rows; what is left is for early keyframes
-    carried_fill: float = 1.05  # the same with an IMU: a keyframe may wait for room, since frames are bridged meanwhile
+    carried_fill: float = 0.95  # the same with an IMU: a keyframe may wait for room, since frames are bridged meanwhile
     comfort: float = 0.86  # share below which the load at the next better effort must stay before effort rises
     grace_s: float = 2.0  # s at the start that do not count: a map has to be begun
     down_s: float = 0.25  # s between two falls: the expected costs need time to follow the first one
@@ -251,7 +252,7 @@ class GovernorConfig:
     max_gap_s: float = 0.35  # s between tracked frames; after more, tracking often fails
     carried_gap_s: float = 0.8  # s: the same with an IMU, whose prediction counts as tracking for 1 s
     blind_s: float = 1.0  # s without a tracked frame, after which one is tracked whatever it costs
-    doubt: float = 0.1  # relative error of the expected cost of a frame, at least
+    doubt: float = 0.15  # relative error of the expected cost of a frame, at least: a pair for the disparity offset
     first_frame_ms: float = 3.5  # ms: expected cost of a tracked frame at full effort at the start: 752x480 on a laptop
     settling_s: float = 1.0  # s at the start in which effort follows the load without hysteresis
 

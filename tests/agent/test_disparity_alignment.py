@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from kiteline_agent.config import AgentConfig, DisparityConfig, LocalMapConfig
 from kiteline_agent.exchange.no_base import NoBaseChannel
+from kiteline_agent.governor.cost_model import Work
 from kiteline_agent.local_map import disparity_kernels as kernels
 from kiteline_agent.local_map.disparity_alignment import DisparityAlignment
 from kiteline_agent.local_map.local_map import LocalMap
@@ -92,6 +93,7 @@ class Flight:
 
     def __init__(self, offset: F64, seed: int, step: F64) -> None:
         self.rng, self.offset, self.step = np.random.default_rng(seed), offset, step
+        self.period_ns = 50_000_000
         self.map = LocalMap(CAMERA, LocalMapConfig(keyframes=8))
         self.alignment = DisparityAlignment(self.map, DisparityConfig())
         uv = self.rng.uniform([40, 40], [710, 440], (160, 2))
@@ -101,8 +103,8 @@ class Flight:
         header = KeyframeHeader(KeyframeId(0), 0, NO_KEYFRAME, np.eye(4), len(uv))
         self.map.add(header, np.eye(4), plain_landmarks(uv, np.maximum(disparity, 0.1) / CAMERA.bf, 0.01), 0)
 
-    def frames(self, count: int) -> Iterator[tuple[F64, I64, F64]]:
-        """Pose, rows and observations of frames."""
+    def frames(self, count: int) -> Iterator[tuple[int, F64, I64, F64]]:
+        """Times, poses, rows and observations of frames."""
         for k in range(count):
             T = se3.inverse(se3.exp(np.concatenate([k * self.step, [0.0, 0.002 * k, 0.0]])))
             q = se3.transform(T, self.xyz)
@@ -110,7 +112,7 @@ class Flight:
             inside = (q[:, 2] > 0.3) & (uv > 10).all(1) & (uv < [740, 470]).all(1)
             disparity = CAMERA.bf / q[:, 2] + terms(normalised(uv)) @ self.offset - self.map.offset_px(uv)
             seen = np.column_stack([uv, disparity]) + self.rng.normal(0, 0.2, (len(uv), 3))
-            yield T, np.flatnonzero(inside), seen[inside]
+            yield k * self.period_ns, T, np.flatnonzero(inside), seen[inside]
 
     def fly(self, frames: int) -> list[F64]:
         """Changes of the map's offset."""
@@ -136,6 +138,17 @@ def test_the_offset_of_a_worn_rig_is_found_and_corrects_the_map(seed: int) -> No
     off = flight.map.rho[0, :160] - 1.0 / flight.depth
     assert abs(np.median(off * CAMERA.bf)) < 0.15
     assert flight.alignment.take_events() and not flight.alignment.take_events()
+
+
+def test_frames_that_are_skipped_do_not_make_pairs_rarer() -> None:
+    flight = Flight(WORN, 0, SIDEWAYS)
+    for k, frame in enumerate(flight.frames(80)):
+        if k % 8 == 0:
+            flight.alignment.add(*frame)
+    assert flight.alignment.pairs >= 7
+    whole = Flight(WORN, 0, SIDEWAYS)
+    whole.fly(80)
+    assert whole.alignment.pairs <= 20
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -338,11 +351,11 @@ def test_the_odometry_keeps_the_error_that_the_map_had(seed: int) -> None:
     flight, camera = Flight(WORN, seed, SIDEWAYS), Camera()
     lens = CameraModel(752, 480, 430.0, 430.0, 376.0, 240.0)
     rectifier = Rectifier(CameraRig(lens, lens, np.eye(4), se3.from_rt(np.eye(3), np.array([0.11, 0.0, 0.0]))))
-    right = RightCamera(AgentId(0), cast("Any", camera), flight.map, rectifier, AgentConfig(), NoBaseChannel())
+    right = RightCamera(AgentId(0), cast("Any", camera), flight.map, rectifier, AgentConfig(), NoBaseChannel(), Work())
     right.disparities = flight.alignment
-    for T, rows, seen in flight.frames(80):
+    for t_ns, T, rows, seen in flight.frames(80):
         track = SimpleNamespace(T_c_m=T, rows=rows, inlier=np.ones(len(rows), np.bool_), observed=seen)
-        right.add(cast("Any", track))
+        right.add(t_ns, cast("Any", track))
     assert camera.left
     for change, error in camera.left:
         assert change @ np.linalg.solve(error, change) <= 1.0  # it was within a deviation of what was found

@@ -1,4 +1,4 @@
-"""Kernels on the lower triangle of the filter's covariance: its upper triangle is neither read nor written.
+"""Kernels on the lower triangle of the filter's covariance; no value depends on what its upper triangle holds.
 
 Sums run in a fixed order, so that the same input gives the same bits.
 """
@@ -10,39 +10,39 @@ from kiteline_core.jit import njit
 
 
 @njit
-def add_rows(P: F64, n: int, rows: F64, sign: float) -> None:
-    """Add sign * rows^T rows to the first n rows of P. rows: (m, n or more)."""
-    m = rows.shape[0]
-    for i in range(n):
-        p = P[i]
-        k = 0
-        while k + 8 <= m:
-            a0, a1, a2, a3 = sign * rows[k, i], sign * rows[k + 1, i], sign * rows[k + 2, i], sign * rows[k + 3, i]
-            a4, a5 = sign * rows[k + 4, i], sign * rows[k + 5, i]
-            a6, a7 = sign * rows[k + 6, i], sign * rows[k + 7, i]
+def add_products(P: F64, rows: F64, sign: float) -> None:
+    """Add sign * rows^T rows to the lower triangle of P's first n rows. rows: (m,n), m and n multiples of four.
+
+    Four rows of P take four products at a time, since to load and store numbers takes as long as to multiply them.
+    """
+    m, n = rows.shape
+    for i in range(0, n, 4):
+        p0, p1, p2, p3 = P[i], P[i + 1], P[i + 2], P[i + 3]
+        for k in range(0, m, 4):
+            a = rows[k : k + 4, i : i + 4]
+            a00, a01, a02, a03 = sign * a[0, 0], sign * a[0, 1], sign * a[0, 2], sign * a[0, 3]
+            a10, a11, a12, a13 = sign * a[1, 0], sign * a[1, 1], sign * a[1, 2], sign * a[1, 3]
+            a20, a21, a22, a23 = sign * a[2, 0], sign * a[2, 1], sign * a[2, 2], sign * a[2, 3]
+            a30, a31, a32, a33 = sign * a[3, 0], sign * a[3, 1], sign * a[3, 2], sign * a[3, 3]
             r0, r1, r2, r3 = rows[k], rows[k + 1], rows[k + 2], rows[k + 3]
-            r4, r5, r6, r7 = rows[k + 4], rows[k + 5], rows[k + 6], rows[k + 7]
-            for j in range(i + 1):
-                p[j] += ((a0 * r0[j] + a1 * r1[j]) + (a2 * r2[j] + a3 * r3[j])) + (
-                    (a4 * r4[j] + a5 * r5[j]) + (a6 * r6[j] + a7 * r7[j])
-                )
-            k += 8
-        while k < m:
-            a0, r0 = sign * rows[k, i], rows[k]
-            for j in range(i + 1):
-                p[j] += a0 * r0[j]
-            k += 1
+            for j in range(i + 4):
+                x0, x1, x2, x3 = r0[j], r1[j], r2[j], r3[j]
+                p0[j] += (a00 * x0 + a10 * x1) + (a20 * x2 + a30 * x3)
+                p1[j] += (a01 * x0 + a11 * x1) + (a21 * x2 + a31 * x3)
+                p2[j] += (a02 * x0 + a12 * x1) + (a22 * x2 + a32 * x3)
+                p3[j] += (a03 * x0 + a13 * x1) + (a23 * x2 + a33 * x3)
 
 
 @njit
 def symmetric_rows(P: F64, n: int, index: I64, out: F64) -> None:
     """Copy whole rows of the symmetric P. index: (m,). out: (m, n)."""
     for a in range(len(index)):
-        i = index[a]
-        for j in range(i + 1):
-            out[a, j] = P[i, j]
-        for j in range(i + 1, n):
-            out[a, j] = P[j, i]
+        for j in range(index[a]):
+            out[a, j] = P[index[a], j]
+    for j in range(n):  # row by row, since neighbours in a column lie far apart
+        for a in range(len(index)):
+            if index[a] <= j:
+                out[a, j] = P[j, index[a]]
 
 
 @njit
@@ -90,78 +90,42 @@ def compatible_set(S: F64, residual: F64, order: I64, gate: float, L: F64, white
     """Take matches in an order, each if it fits given those taken before; returns how many are taken.
 
     S: (2m,2m) innovation covariance. residual: (2m,). order: (k,) matches. gate: squared deviations, two degrees of
-    freedom, of a match given the ones before. L (2m,2m), white (2m,): the Cholesky factor of the taken and their
-    whitened residuals. taken: (m,) the matches, in the order in which they were taken.
+    freedom, of a match given the ones before. L (2m,2m), white (2m,): columns of the Cholesky factor of the taken, one
+    after the other, and their whitened residuals. taken: (m,) the matches, in the order in which they were taken.
     """
     count = 0
+    left = np.empty((2, S.shape[0]))  # of the two rows that a match adds to the factor, beyond the columns done
     for k in range(len(order)):
         a = order[k]
-        for r in range(2):
-            row = 2 * count + r
-            for c in range(row + 1):
-                column = 2 * a + r if c == row else (2 * taken[c // 2] + c % 2 if c // 2 < count else 2 * a + c % 2)
-                s = S[2 * a + r, column]
-                for j in range(c):
-                    s -= L[row, j] * L[c, j]
-                if c < row:
-                    L[row, c] = s / L[c, c]
-                else:
-                    L[row, c] = np.sqrt(max(s, 1e-12))
-            s = residual[2 * a + r]
-            for j in range(row):
-                s -= L[row, j] * white[j]
-            white[row] = s / L[row, row]
-        if white[2 * count] ** 2 + white[2 * count + 1] ** 2 <= gate:
+        n = 2 * count
+        for b in range(count):
+            for c in range(2):
+                left[0, 2 * b + c] = S[2 * a, 2 * taken[b] + c]
+                left[1, 2 * b + c] = S[2 * a + 1, 2 * taken[b] + c]
+        s00, s10, s11 = S[2 * a, 2 * a], S[2 * a + 1, 2 * a], S[2 * a + 1, 2 * a + 1]
+        r0, r1 = residual[2 * a], residual[2 * a + 1]
+        for c in range(n):  # column by column: unlike sums along rows these loops need no order of their own
+            column = L[c]
+            u, v = left[0, c] / column[c], left[1, c] / column[c]
+            left[0, c], left[1, c] = u, v
+            for j in range(c + 1, n):
+                left[0, j] -= u * column[j]
+                left[1, j] -= v * column[j]
+            s00 -= u * u
+            s10 -= u * v
+            s11 -= v * v
+            r0 -= u * white[c]
+            r1 -= v * white[c]
+        d0 = np.sqrt(max(s00, 1e-12))
+        e = s10 / d0
+        d1 = np.sqrt(max(s11 - e * e, 1e-12))
+        w0 = r0 / d0
+        w1 = (r1 - e * w0) / d1
+        if w0 * w0 + w1 * w1 <= gate:
+            for c in range(n):
+                L[c, n], L[c, n + 1] = left[0, c], left[1, c]
+            L[n, n], L[n, n + 1], L[n + 1, n + 1] = d0, e, d1
+            white[n], white[n + 1] = w0, w1
             taken[count] = a
             count += 1
     return count
-
-
-@njit
-def innovation_rows(P: F64, n: int, index: I64, M: F64, out: F64) -> None:
-    """Rows M (P_l - P_p) of the covariance between pixels and state. index: (m,). M: (m,2,3). out: (2m,n)."""
-    for a in range(len(index)):
-        la = index[a]
-        for j in range(n):
-            for r in range(2):
-                out[2 * a + r, j] = 0.0
-        for c in range(3):
-            u, v = M[a, 0, c], M[a, 1, c]
-            i = la + c
-            for j in range(i + 1):
-                out[2 * a, j] += u * P[i, j]
-                out[2 * a + 1, j] += v * P[i, j]
-            for j in range(i + 1, n):
-                out[2 * a, j] += u * P[j, i]
-                out[2 * a + 1, j] += v * P[j, i]
-            for j in range(c + 1):
-                out[2 * a, j] -= u * P[c, j]
-                out[2 * a + 1, j] -= v * P[c, j]
-            for j in range(c + 1, n):
-                out[2 * a, j] -= u * P[j, c]
-                out[2 * a + 1, j] -= v * P[j, c]
-
-
-@njit
-def whiten_rows(L: F64, m: int, rows: F64) -> None:
-    """Replace rows (m,n) by L^-1 rows; L: lower triangular, its first m rows."""
-    n = rows.shape[1]
-    for i in range(m):
-        for k in range(i):
-            f = L[i, k]
-            for j in range(n):
-                rows[i, j] -= f * rows[k, j]
-        f = 1.0 / L[i, i]
-        for j in range(n):
-            rows[i, j] *= f
-
-
-@njit
-def weighted_sum(rows: F64, m: int, weight: F64, out: F64) -> None:
-    """The sum (n,) of weight[k] * rows[k] over the first m rows."""
-    for j in range(rows.shape[1]):
-        out[j] = 0.0
-    for k in range(m):
-        f = weight[k]
-        for j in range(rows.shape[1]):
-            out[j] += f * rows[k, j]

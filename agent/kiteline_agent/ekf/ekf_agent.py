@@ -49,7 +49,7 @@ class EkfAgent:
         self._R_l_o = np.eye(3)
         self._flow = CornerFlow(camera, config.detector, config.align, config.ekf)
         self._motion = OdometerMotion(camera.T_b_c, config.ekf, config.odometer.keep_s, config.odometer.max_gap_s)
-        self._governor = Governor(config.governor, inertial=True)  # odometry bridges skipped frames as an IMU does
+        self._governor = Governor(config.governor)
         self._keyframes = SharedKeyframes(camera, config, identity, channel, self._governor, self.work)
         self._last: Estimate | None = None
         self._frame_number = 0
@@ -65,6 +65,7 @@ class EkfAgent:
         self._motion.add(step_input.odometry)
         estimate = predicted = None
         if step_input.frame is not None:
+            # Odometry bridges skipped frames as an IMU does.
             decision = self._governor.frame(step_input.frame.t_ns, step_input.cpu_ns, carried=True)
             events += decision.events
             if decision.track:

@@ -13,8 +13,8 @@ from kiteline_agent.ekf.ray_initialisation import (
     linearised,
     new_landmark,
     rays_meet,
-    supporting_views,
 )
+from kiteline_agent.ekf.ray_kernels import supporting_views
 from kiteline_agent.ekf.ray_tracks import RayTracks
 from kiteline_agent.ekf.ray_update import update_by_rays
 from kiteline_agent.ekf_config import EkfConfig
@@ -110,18 +110,17 @@ class EkfSlam:
     def _update_landmarks(self, slots: I64, xy: F64, coarse: F64) -> tuple[Bool, Bool]:
         """Update by the observations of landmarks; masks (n,) of the compatible and of the rejected ones.
 
-        coarse: (n,) factors of their deviations. Divided by them, all observations have the same.
+        coarse: (n,) factors of their deviations.
         """
         good, bad = np.zeros(len(slots), np.bool_), np.zeros(len(slots), np.bool_)
         at = np.flatnonzero(slots >= 0)
         if not len(at):
             return good, bad
-        found, ahead = landmark_update.innovation(self.state, slots[at], xy[at])
+        found, ahead = landmark_update.innovation(self.state, slots[at], xy[at], coarse[at], self._sigma)
         bad[at[~ahead]] = True
         at = at[ahead]
-        found = landmark_update.divided(found, coarse[at])
         if len(at):
-            fits = landmark_update.compatible(self.state, found, self._sigma, self._config)
+            fits = landmark_update.compatible(found, self._config)
             good[at[fits]] = True
             bad[at[~fits]] = True
             # Those that waited longest: all that are in view get their turn.
@@ -129,8 +128,7 @@ class EkfSlam:
             order = np.argsort(self._updated_at[found.slots[waiting]], kind="stable")
             chosen = np.sort(waiting[order[:_UPDATED]])
             self._updated_at[found.slots[chosen]] = self._frame
-            part = landmark_update.Innovation(found.slots[chosen], found.residual[chosen], found.M[chosen])
-            landmark_update.update(self.state, part, self._sigma)
+            landmark_update.update(self.state, found.part(chosen))
         self._good[slots[good]] += 1
         self._bad[slots[bad]] += 1
         self._seen_at[slots[good]] = self._frame
@@ -182,13 +180,14 @@ class EkfSlam:
         if not len(wide):
             return []
         known, points, rays = known[wide], points[wide], rays[wide]
-        seen = supporting_views(poses[:, :3, 3], rays, seen[wide], _RAY_PX / float(self._focal[0]))
-        parallax = largest_parallax(rays, seen)
+        agrees = np.empty((len(wide), config.views + 1), np.bool_)
+        supporting_views(poses[:, :3, 3], rays, seen[wide], _RAY_PX / float(self._focal[0]), agrees)
+        parallax = largest_parallax(rays, agrees)
         order = np.argsort(-parallax, kind="stable")
-        enough = (parallax > _PARALLAX_RAD) & (seen.sum(axis=1) >= _LEAST_RAYS)
+        enough = (parallax > _PARALLAX_RAD) & (agrees.sum(axis=1) >= _LEAST_RAYS)
         out = []
         for k in order[enough[order]][:_ENTRIES].tolist():
-            views = np.flatnonzero(seen[k, :-1])
+            views = np.flatnonzero(agrees[k, :-1])
             observations = points[k, np.append(views, config.views)]
             out.append((int(known[k]), Track(views, observations, self._sigma * float(coarse[known[k]]))))
         return out

@@ -33,7 +33,7 @@ class Motion:
 
 
 class FilterState:
-    """The estimate and its covariance. Rows of free slots are zero."""
+    """The estimate and its covariance P, of which the lower triangle counts. Rows of free slots are zero."""
 
     def __init__(self, T_o_c: F64, config: EkfConfig) -> None:
         """T_o_c: (4,4) the first camera pose, known exactly: it defines o."""
@@ -45,7 +45,8 @@ class FilterState:
         self.used: Bool = np.zeros(config.landmarks, np.bool_)
         self._walk = np.zeros(config.landmarks)  # rad: what their pixels drift by, see `add_landmark`
         self._first = _VIEWS + 6 * config.views
-        self.P = np.zeros((self._first + 3 * config.landmarks,) * 2)
+        rows = self._first + 3 * config.landmarks
+        self.P = np.zeros((rows + -rows % 4,) * 2)  # the kernel that adds products takes four rows at a time
         self.P[SCALE, SCALE] = config.scale_sigma**2
         self._size = self._first
 
@@ -72,10 +73,10 @@ class FilterState:
         kernels.symmetric_rows(self.P, self._size, index, out)
         return out
 
-    def block(self, first: int, count: int) -> F64:
-        """A symmetric block (count,count) on the diagonal."""
-        lower = np.tril(self.P[first : first + count, first : first + count])
-        return np.asarray(lower + np.tril(lower, -1).T)
+    def covariance(self, columns: I64) -> F64:
+        """Covariance (k,k) of columns (k,) of the state."""
+        others = columns[:, None]
+        return np.asarray(self.P[np.maximum(columns, others), np.minimum(columns, others)])
 
     # changes
 
@@ -93,15 +94,21 @@ class FilterState:
             self.P[i, : i + 1] += along[i] * scale_row[: i + 1] + scale_row[i] * along[: i + 1]
             self.P[i, : i + 1] += along[i] * scale_row[SCALE] * along[: i + 1]
             self.P[3:n, i] += along[i] * scale_row[3:n]
-        # White errors: one of the rotation also moves landmarks relative to the camera's heading.
+        # White errors: one of the rotation also moves landmarks relative to the camera's heading. Of six independent
+        # ones three do not turn: they move the camera alone.
         factor = _root(motion.cov)
-        turned = R1 @ factor[3:]  # (3,6)
-        noise = np.zeros((6, n))
-        noise[:, :3] = (R0 @ factor[:3] + np.cross(p1, turned, axisb=0, axisc=0)).T
-        noise[:, 3:6] = turned.T
+        factor = factor @ np.linalg.qr(factor[3:].T, mode="complete")[0]
+        shifted = R0 @ factor[:3]
+        turned = R1 @ factor[3:, :3]
+        self.P[:3, :3] += shifted[:, 3:] @ shifted[:, 3:].T
         count = (n - self._first) // 3
-        noise[:, self._first :] = np.cross(self.points[None, :count], turned.T[:, None]).reshape(6, -1)
-        kernels.add_rows(self.P, n, noise, 1.0)
+        noise = np.zeros((3, n))
+        for k in range(3):
+            across = se3.skew(turned[:, k])
+            noise[k, :3] = shifted[:, k] + p1 @ across
+            noise[k, 3:6] = turned[:, k]
+            noise[k, self._first :] = (self.points[:count] @ across).ravel()
+        self._add(noise, 1.0)
         # Errors of a landmark's template change with the view: as if it moved by pixels.
         distance = np.linalg.norm(self.points[:count] - p1, axis=1)
         diagonal = np.arange(self._first, n)
@@ -130,17 +137,21 @@ class FilterState:
         views = self.view_T_o_c.copy()
         for view in self.used_views.tolist():
             row = self.view_row(view)
-            views[view] = _corrected(views[view], whole[row : row + 6])
-        return _corrected(self.T_o_c, whole[:6]), views
+            views[view] = se3.exp(whole[row : row + 6]) @ views[view]
+        return se3.exp(whole[:6]) @ self.T_o_c, views
 
     def update(self, rows: F64, L: F64, white: F64) -> None:
-        """Kalman update. rows: (m,size) H P, replaced. L: (m,m), L L^T = H P H^T + R. white: L^-1 residual."""
-        m = len(rows)
-        kernels.whiten_rows(L, m, rows)
-        change = np.empty(self._size)
-        kernels.weighted_sum(rows, m, white, change)
-        kernels.add_rows(self.P, self._size, rows, -1.0)
-        self.correct(change)
+        """Kalman update. rows: (m,size) H P. L: (m,m), L L^T = H P H^T + R. white: (m,) L^-1 residual."""
+        rows = np.linalg.inv(L) @ rows
+        self._add(rows, -1.0)
+        self.correct(white @ rows)
+
+    def _add(self, rows: F64, sign: float) -> None:
+        """Add sign * rows^T rows to the covariance. rows: (m,size)."""
+        m, n = rows.shape
+        padded = np.zeros((m + -m % 4, n + -n % 4))
+        padded[:m, :n] = rows
+        kernels.add_products(self.P, padded, sign)
 
     def add_view(self, view: int) -> None:
         """Keep the camera's pose as a past view."""
@@ -191,7 +202,7 @@ class FilterState:
         R, p_b = self.T_o_c[:3, :3] @ T_c_b[:3, :3], (self.T_o_c @ T_c_b)[:3, 3]
         to_error = np.zeros((6, 6))
         to_error[:3, :3], to_error[:3, 3:], to_error[3:, 3:] = np.eye(3), -se3.skew(p_b), R.T
-        return np.asarray(to_error @ self.block(0, 6) @ to_error.T)
+        return np.asarray(to_error @ self.covariance(np.arange(6)) @ to_error.T)
 
 
 def _root(cov: F64) -> F64:
@@ -207,12 +218,3 @@ def _jacobian(turn: F64) -> F64:
     """Left Jacobian (3,3) of a small rotation, to second order."""
     k = se3.skew(turn)
     return np.asarray(np.eye(3) + 0.5 * k + k @ k / 6.0)
-
-
-def _corrected(T: F64, change: F64) -> F64:
-    """A pose (4,4) after a correction (6,): position, rotation."""
-    turn = se3.so3_exp(change[3:])
-    out = np.eye(4)
-    out[:3, :3] = turn @ T[:3, :3]
-    out[:3, 3] = turn @ T[:3, 3] + _jacobian(change[3:]) @ change[:3]
-    return out

@@ -15,32 +15,40 @@ _AGREE = 0.6  # share of the matches in a set at which no other set is tried
 
 @dataclass(frozen=True, slots=True)
 class Innovation:
-    """Matched landmarks: slots (m,), residual (m,2) of x/z, y/z, and its Jacobian (m,2,3) by the landmark."""
+    """Matched landmarks: slots (m,), residual (m,2) of x/z, y/z, its Jacobian (m,2,3) by the landmark, and its
+    covariance S (2m,2m).
+    """
 
     slots: I64
     residual: F64
     M: F64
+    S: F64
+
+    def part(self, chosen: I64) -> "Innovation":
+        """Some of the matches (k,)."""
+        pixels = (2 * chosen[:, None] + [0, 1]).ravel()
+        return Innovation(self.slots[chosen], self.residual[chosen], self.M[chosen], self.S[np.ix_(pixels, pixels)])
 
 
-def innovation(state: FilterState, slots: I64, xy: F64) -> tuple[Innovation, Bool]:
-    """Residuals of observations (n,2) of landmarks (n,), and which of them lie before the camera (n,)."""
+def innovation(state: FilterState, slots: I64, xy: F64, coarse: F64, sigma: float) -> tuple[Innovation, Bool]:
+    """Residuals of observations (n,2) of landmarks (n,), and which of them lie before the camera (n,).
+
+    coarse: (n,) factors of the deviation sigma of an observation. Divided by them, all have the same.
+    """
     R = state.T_o_c[:3, :3]
     local = (state.points[slots] - state.T_o_c[:3, 3]) @ R
     ahead = local[:, 2] > 1e-2
-    local = local[ahead]
+    local, slots, unit = local[ahead], slots[ahead], coarse[ahead, None]
     predicted = local[:, :2] / local[:, 2:]
     M = np.empty((len(local), 2, 3))
     for r in range(2):
-        M[:, r] = (R[:, r] - predicted[:, r : r + 1] * R[:, 2]) / local[:, 2:]
-    return Innovation(slots[ahead], xy[ahead] - predicted, M), ahead
+        M[:, r] = (R[:, r] - predicted[:, r : r + 1] * R[:, 2]) / (local[:, 2:] * unit)
+    S = np.empty((2 * len(local),) * 2)
+    kernels.innovation_covariance(state.P, np.asarray(state.landmark_row(slots)), M, sigma * sigma, S)
+    return Innovation(slots, (xy[ahead] - predicted) / unit, M, S), ahead
 
 
-def divided(found: Innovation, factor: F64) -> Innovation:
-    """The same observations in units (m,) of their own."""
-    return Innovation(found.slots, found.residual / factor[:, None], found.M / factor[:, None, None])
-
-
-def compatible(state: FilterState, found: Innovation, sigma: float, config: EkfConfig) -> Bool:
+def compatible(found: Innovation, config: EkfConfig) -> Bool:
     """Mask (m,) of matches that are jointly compatible with the state.
 
     Each is taken if it fits given those taken before: a wrong one that the prior allows no longer fits then. As it may
@@ -48,11 +56,7 @@ def compatible(state: FilterState, found: Innovation, sigma: float, config: EkfC
     Source: J. Neira, J. Tardos, "Data association in stochastic mapping using the joint compatibility test", 2001;
     J. Civera et al., "1-point RANSAC for EKF filtering", 2010.
     """
-    m = len(found.slots)
-    index = np.asarray(state.landmark_row(found.slots))
-    S = np.empty((2 * m, 2 * m))
-    kernels.innovation_covariance(state.P, index, found.M, sigma * sigma, S)
-    residual = found.residual.ravel()
+    m, S, residual = len(found.slots), found.S, found.residual.ravel()
     pairs = S.reshape(m, 2, m, 2)[np.arange(m), :, np.arange(m), :]
     alone = np.einsum("mi,mi->m", found.residual, np.linalg.solve(pairs, found.residual[..., None])[..., 0])
     order = np.argsort(alone, kind="stable")
@@ -70,16 +74,13 @@ def compatible(state: FilterState, found: Innovation, sigma: float, config: EkfC
     return best
 
 
-def update(state: FilterState, found: Innovation, sigma: float) -> None:
+def update(state: FilterState, found: Innovation) -> None:
     """Update the state by observations."""
     m = len(found.slots)
     if m == 0:
         return
-    index = np.asarray(state.landmark_row(found.slots))
-    S = np.empty((2 * m, 2 * m))
-    kernels.innovation_covariance(state.P, index, found.M, sigma * sigma, S)
-    L, white, taken = np.zeros((2 * m, 2 * m)), np.zeros(2 * m), np.zeros(m, np.int64)
-    kernels.compatible_set(S, found.residual.ravel(), np.arange(m), np.inf, L, white, taken)
-    rows = np.empty((2 * m, state.size))
-    kernels.innovation_rows(state.P, state.size, index, found.M, rows)
-    state.update(rows, L, white)
+    first = np.asarray(state.landmark_row(found.slots))
+    points = state.rows((first[:, None] + np.arange(3)).ravel()).reshape(m, 3, -1)
+    rows = found.M @ (points - state.rows(np.arange(3)))
+    L = np.asarray(np.linalg.cholesky(found.S), np.float64)
+    state.update(rows.reshape(2 * m, -1), L, np.asarray(np.linalg.solve(L, found.residual.ravel()), np.float64))

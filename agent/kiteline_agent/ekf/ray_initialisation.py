@@ -24,41 +24,6 @@ class NewLandmark(NamedTuple):
     cov: F64
 
 
-def nearest_points(centres: F64, rays: F64, seen: Bool) -> tuple[F64, Bool]:
-    """Point (n,3) nearest to the rays of each of n landmarks, and whether it is well defined (n,).
-
-    centres: (v,3) camera centres. rays: (n,v,3) unit directions. seen: (n,v).
-    """
-    across = (np.eye(3) - rays[..., :, None] * rays[..., None, :]) * seen[..., None, None]
-    a = across.sum(axis=1)
-    b = np.einsum("nvij,vj->ni", across, centres)
-    good = np.abs(np.linalg.det(a)) > 1e-9
-    a[~good] = np.eye(3)
-    return np.asarray(np.linalg.solve(a, b[..., None])[..., 0]), good
-
-
-def supporting_views(centres: F64, rays: F64, seen: Bool, tolerance: float) -> Bool:
-    """Which views (n,v) agree with the last one on a point; rays far from it are wrong matches.
-
-    Each other view in turn gives a point with the last one; the one with most rays near it counts.
-    centres: (v,3). rays: (n,v,3) unit directions. seen: (n,v). tolerance: rad.
-    """
-    n, v = seen.shape
-    best: Bool = np.zeros((n, v), np.bool_)
-    most = np.zeros(n, np.int64)
-    for other in range(v - 1):
-        pair = [other, v - 1]
-        point, good = nearest_points(centres[pair], rays[:, pair], seen[:, pair])
-        to_point = point[:, None] - centres
-        along = np.einsum("nvi,nvi->nv", to_point, rays)
-        off = np.linalg.norm(to_point - along[..., None] * rays, axis=2)
-        near = seen & (along > 0.0) & (off < tolerance * along) & (good & seen[:, other])[:, None]
-        count = near.sum(axis=1) * near[:, -1]
-        better = count > most
-        best[better], most[better] = near[better], count[better]
-    return best
-
-
 def largest_parallax(rays: F64, seen: Bool) -> F64:
     """Largest angle (n,) in rad between the last view's ray and another one. rays: (n,v,3). seen: (n,v)."""
     cosine = np.einsum("nvj,nj->nv", rays, rays[:, -1])
@@ -133,7 +98,7 @@ def linearised(state: FilterState, track: Track, T_o_c: F64, view_T_o_c: F64) ->
 
 def rays_meet(state: FilterState, rays: Rays, gate: float) -> bool:
     """True if rays meet as well as the state's covariance allows, by chi-square over degrees of freedom."""
-    spread = rays.H @ state.rows(rays.columns)[:, rays.columns] @ rays.H.T + np.eye(len(rays.H))
+    spread = rays.H @ state.covariance(rays.columns) @ rays.H.T + np.eye(len(rays.H))
     return bool(rays.told @ np.linalg.solve(spread, rays.told) <= gate * len(rays.H))
 
 
@@ -148,7 +113,7 @@ def new_landmark(state: FilterState, rays: Rays) -> NewLandmark:
 
 def distance_share(state: FilterState, rays: Rays) -> float:
     """Deviation of the distance from the camera over that distance, without what moves camera and landmark alike."""
-    block = state.rows(rays.columns)[:, rays.columns]
+    block = state.covariance(rays.columns)
     inverse = np.linalg.inv(rays.by_point)
     relative = -inverse @ rays.by_state
     relative[:, :3] -= np.eye(3)

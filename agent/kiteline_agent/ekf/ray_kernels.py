@@ -1,17 +1,17 @@
-"""Kernel that positions a landmark by its rays."""
+"""Kernels that position a landmark by its rays, and find the rays that agree."""
 
 import numpy as np
 
-from kiteline_core.arrays import F64
+from kiteline_core.arrays import F64, Bool
 from kiteline_core.jit import helper, njit
 
-_STEPS = 3  # Gauss-Newton steps after the linear solution: it is near
-_STILL = 1e-4  # of the distance: a shorter step is the last
+_STEPS = 2  # Gauss-Newton steps after the linear solution: it is near
+_STILL = 1e-3  # of the distance: after a shorter step the next one would be a thousand times shorter
 
 
 @helper
 def _solve(a: F64, b: F64, x: F64) -> bool:
-    """Solve a symmetric 3x3 system by cofactors; False if it is singular."""
+    """Solve a symmetric 3x3 system, of which the upper triangle is read, by cofactors; False if it is singular."""
     c00 = a[1, 1] * a[2, 2] - a[1, 2] * a[1, 2]
     c01 = a[0, 2] * a[1, 2] - a[0, 1] * a[2, 2]
     c02 = a[0, 1] * a[1, 2] - a[0, 2] * a[1, 1]
@@ -46,7 +46,7 @@ def position_by_rays(xy: F64, T_o_c: F64, point: F64) -> bool:
             along += d[i] * T_o_c[k, i, 3]
         for i in range(3):
             b[i] += T_o_c[k, i, 3] - along * d[i]
-            for j in range(3):
+            for j in range(i, 3):
                 a[i, j] += (1.0 if i == j else 0.0) - d[i] * d[j]
     if not _solve(a, b, point):
         return False
@@ -70,7 +70,7 @@ def position_by_rays(xy: F64, T_o_c: F64, point: F64) -> bool:
                     d[i] = (T_o_c[k, i, r] - T_o_c[k, i, 2] * ahead) / z
                 for i in range(3):
                     b[i] += d[i] * error
-                    for j in range(3):
+                    for j in range(i, 3):
                         a[i, j] += d[i] * d[j]
         if not _solve(a, b, step):
             return False
@@ -82,3 +82,47 @@ def position_by_rays(xy: F64, T_o_c: F64, point: F64) -> bool:
         if moved < _STILL * _STILL * far:
             break
     return True
+
+
+@njit
+def supporting_views(centres: F64, rays: F64, seen: Bool, tolerance: float, best: Bool) -> None:
+    """Which views agree with the last one on a point; rays far from it are wrong matches.
+
+    Each other view in turn gives a point with the last one; the one with most rays near it counts.
+    centres: (v,3). rays: (n,v,3) unit directions. seen: (n,v). tolerance: rad. best: (n,v), set.
+    """
+    n, v = seen.shape
+    a = np.empty((3, 3))
+    b, point = np.empty(3), np.empty(3)
+    near = np.empty(v, np.bool_)
+    for k in range(n):
+        most = 0
+        best[k] = False
+        for other in range(v - 1):
+            if not seen[k, other]:
+                continue
+            a[:] = 0.0
+            b[:] = 0.0
+            for view in (other, v - 1):
+                d, centre = rays[k, view], centres[view]
+                along = d[0] * centre[0] + d[1] * centre[1] + d[2] * centre[2]
+                for i in range(3):
+                    b[i] += centre[i] - along * d[i]
+                    for j in range(i, 3):
+                        a[i, j] += (1.0 if i == j else 0.0) - d[i] * d[j]
+            if not _solve(a, b, point):
+                continue
+            count = 0
+            for view in range(v):
+                d, centre = rays[k, view], centres[view]
+                along = square = 0.0
+                for i in range(3):
+                    along += (point[i] - centre[i]) * d[i]
+                for i in range(3):
+                    off = point[i] - centre[i] - along * d[i]
+                    square += off * off
+                near[view] = seen[k, view] and along > 0.0 and square < (tolerance * along) ** 2
+                count += near[view]
+            if near[v - 1] and count > most:
+                most = count
+                best[k] = near

@@ -38,11 +38,11 @@ def update_by_rays(state: FilterState, tracks: Sequence[Track]) -> None:
         last, change = change, block @ H.T @ np.linalg.solve(L.T, white)
         if (np.abs(change - last) < _SETTLED * deviation).all():
             break
-    state.update(np.ascontiguousarray(H @ P), L, white)
+    state.update(H @ P, L, white)
 
 
 def _stacked(every: Sequence[Rays], columns: I64, change: F64) -> tuple[F64, F64]:
-    """H (m,k) over the columns (k,), and told (m,), each track by its weight."""
+    """H (m,k) over the columns (k,), and told (m,), m <= k, each track by its weight."""
     H = np.zeros((sum(len(r.told) for r in every), len(columns)))
     told = np.zeros(len(H))
     at = 0
@@ -52,4 +52,7 @@ def _stacked(every: Sequence[Rays], columns: I64, change: F64) -> tuple[F64, F64
         H[at : at + m, np.searchsorted(columns, r.columns)] = weight * r.H
         told[at : at + m] = weight * r.told
         at += m
-    return H, told
+    if len(H) > len(columns):  # as many equations as unknowns tell the same
+        q, H = np.linalg.qr(H)
+        told = q.T @ told
+    return np.asarray(H), told

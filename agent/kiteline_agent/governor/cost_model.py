@@ -17,6 +17,7 @@ class Work:
     posed_points: int = 0
     inertial_samples: int = 0
     fused: int = 0
+    pairs: int = 0
     keyframes: int = 0
     detected_px: int = 0
     new_landmarks: int = 0
@@ -42,7 +43,7 @@ _COUNTS = tuple(field.name for field in fields(Work))
 # ns each on the modelled core, an x86 laptop's: fitted to measured steps at every effort, and rounded.
 PRICES_NS: dict[str, float] = {
     "steps": 40_000,  # endpoint and log
-    "frames": 375_000,  # fixed cost: arrays, motion model, estimate
+    "frames": 305_000,  # fixed cost: arrays, motion model, estimate
     "rectified_px": 2.1,  # a remapped pixel
     "pyramid_px": 0.35,  # a pixel of an image whose pyramid was built
     "projected": 60,  # a landmark of the local map in view
@@ -51,6 +52,7 @@ PRICES_NS: dict[str, float] = {
     "posed_points": 1_300,  # a landmark in the motion-only optimisation
     "inertial_samples": 1_000,  # preintegration
     "fused": 340_000,  # a frame in the smoother
+    "pairs": 300_000,  # a frame compared with a keyframe for the disparity offset
     "keyframes": 1_200_000,  # coding and bookkeeping
     "detected_px": 2.1,  # a pixel searched for corners
     "new_landmarks": 11_000,  # row search, descriptor, template, code

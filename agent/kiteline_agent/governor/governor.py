@@ -47,11 +47,10 @@ class Decision:
 class Governor:
     """Decides about each frame and each expensive extra. Without a budget it permits everything."""
 
-    def __init__(self, config: GovernorConfig, *, inertial: bool = False) -> None:
-        """inertial: there is an IMU, which will soon bridge skipped frames."""
+    def __init__(self, config: GovernorConfig) -> None:
         self._config = config
         self.level = 0
-        self._ladder: tuple[Effort, ...] = CARRIED if inertial else ALONE
+        self._ladder: tuple[Effort, ...] = ALONE
         self._budget_ns = config.cpu_percent / 100.0 * config.window_s * 1e9  # per window
         self._spent: deque[tuple[int, int]] = deque()  # (t_ns, CPU ns) of the frames of the last window
         self._window_ns = 0
@@ -81,10 +80,6 @@ class Governor:
         if self.on:  # a map starts with expensive frames: choose an effort that fits
             self._frame_ns = config.first_frame_ms * 1e6
             self._change_row(self._ladder, self._best_affordable(0))
-            if self._row.every > 3:  # too few frames for the IMU initialisation
-                self._change_row(ALONE, 0)
-                self._change_row(ALONE, self._best_affordable(0))
-        self._first_ladder = self._ladder
 
     @property
     def on(self) -> bool:
@@ -108,7 +103,7 @@ class Governor:
         before, load = self.level, self._load(self.level)
         events: list[str] = []
         self._gap_s = self._config.carried_gap_s if carried else self._config.max_gap_s
-        self._choose_row(t_ns, CARRIED if carried else self._first_ladder if self._early(t_ns) else ALONE)
+        self._choose_row(t_ns, CARRIED if carried else ALONE)
         track = (self._is_due(lost=lost) or self._early(t_ns)) and self._affordable(t_ns, lost=lost)
         if not track and not lost and self._gap_exceeds(t_ns, self._gap_s):  # the last reserve, before tracking is lost
             track = self._window_ns + (1.0 + 0.5 * self._safety) * self._frame_ns <= self._budget_ns

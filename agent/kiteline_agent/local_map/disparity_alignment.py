@@ -66,7 +66,9 @@ class DisparityAlignment:
         self._prior = np.diag(np.array([_PRIOR_PX, *[_PRIOR_SLOPE_RAD * camera.fx] * (TERMS - 1)]) ** -2.0)
         x, y = np.meshgrid(np.linspace(0.0, camera.width, 7), np.linspace(0.0, camera.height, 5))
         self._grid = terms(np.stack([(x.ravel() - camera.cx) / camera.fx, (y.ravel() - camera.cy) / camera.fy], 1))
-        self._frames = 0
+        self._frames = 0  # since the last one that could make a pair
+        self._pair_t_ns: int | None = None  # of that one
+        self.pairs = 0  # compared so far
         self._estimate, self.cov = none(), np.linalg.inv(self._prior)
         # If the rig is not worn: what was expected of it, its most probable offset, and whether another one than the
         # expected is likelier, and differs from that by more than its deviation.
@@ -94,15 +96,18 @@ class DisparityAlignment:
         self.applied = bool(offset.any())
         self.expected_cov = self._expected_cov()
 
-    def add(self, T_c_m: F64, rows: I64, observed: F64) -> F64 | None:
-        """Add a frame at T_c_m (4,4) with landmarks in rows (n,) seen at observed (n,3) px.
+    def add(self, t_ns: int, T_c_m: F64, rows: I64, observed: F64) -> F64 | None:
+        """Add a frame of t_ns at T_c_m (4,4) with landmarks in rows (n,) seen at observed (n,3) px.
 
         Returns the change (5,) of the map's offset if there is one.
         """
         config, m = self._config, self._map
         self._frames += 1
-        if self._frames % config.every:
+        if self._pair_t_ns is None:
+            self._pair_t_ns = t_ns
+        if self._frames < config.every and t_ns - self._pair_t_ns < config.every_s * 1e9:
             return None
+        self._frames, self._pair_t_ns = 0, t_ns
         slots, counts = np.unique(rows // m.slot_size, return_counts=True)
         for slot in slots[counts >= _MIN_POINTS].tolist():
             if self._keyframe[slot] != m.keyframe[slot]:
@@ -198,6 +203,7 @@ class DisparityAlignment:
         if len(at) > config.points:
             chosen = np.linspace(0, len(at) - 1, config.points).astype(np.int64)
             at, index = at[chosen], index[chosen]
+        self.pairs += 1
         self._parallax[slot] = self._parallax_of(slot, T_c_m)
         seen = observed[at].copy()
         has = seen[:, 2] >= 0.0

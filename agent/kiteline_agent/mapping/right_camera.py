@@ -3,6 +3,7 @@
 import numpy as np
 
 from kiteline_agent.config import AgentConfig
+from kiteline_agent.governor.cost_model import Work
 from kiteline_agent.imaging.row_alignment import RowAlignment
 from kiteline_agent.known_rig import KnownRigConfig, known_rig
 from kiteline_agent.local_map.disparity_alignment import DisparityAlignment
@@ -22,9 +23,10 @@ class RightCamera:
 
     def __init__(
         self, agent: AgentId, camera: CameraState, local_map: LocalMap, rectifier: Rectifier, config: AgentConfig,
-        channel: RecordChannel,
+        channel: RecordChannel, work: Work,
     ) -> None:  # fmt: skip
         self._agent = agent
+        self._work = work
         self._camera = camera
         self._map = local_map
         self._channel = channel
@@ -48,15 +50,17 @@ class RightCamera:
         self._found_px = known.disparity
         self._put(known.rows)
 
-    def add(self, track: Track) -> tuple[bool, list[str]]:
-        """Estimate the disparity offset with a tracked frame. Returns whether that moved map and camera, and events."""
+    def add(self, t_ns: int, track: Track) -> tuple[bool, list[str]]:
+        """Estimate the disparity offset with a frame tracked at t_ns. Returns whether it moved the map, and events."""
         if self.disparities is None:
             return False, []
         covariance, disparities = self._camera.covariance, self.disparities
         disparities.add_row_evidence(self.rows.worn_evidence)
         if self.rows.roll_px is not None:
             covariance.set_roll(self.rows.roll_px)
-        change = disparities.add(track.T_c_m, track.rows[track.inlier], track.observed[track.inlier])
+        before = disparities.pairs
+        change = disparities.add(t_ns, track.T_c_m, track.rows[track.inlier], track.observed[track.inlier])
+        self._work.pairs += disparities.pairs - before
         if change is None:
             covariance.set_disparity_error(disparities.expected_cov, disparities.rig_worn)
             return False, []

@@ -18,7 +18,7 @@ def _whole(P: F64) -> F64:
     return np.asarray(np.tril(P) + np.tril(P, -1).T)
 
 
-def _sightings(n: int, m: int, seed: int = 1) -> tuple[I64, F64, F64]:
+def _observations(n: int, m: int, seed: int = 1) -> tuple[I64, F64, F64]:
     """First rows of m landmarks after a pose, their Jacobians (m,2,3), and the dense one (2m,n)."""
     rng = np.random.default_rng(seed)
     index = 7 + 3 * np.arange(m)
@@ -30,14 +30,14 @@ def _sightings(n: int, m: int, seed: int = 1) -> tuple[I64, F64, F64]:
     return index, M, dense
 
 
-def test_rows_are_added_to_the_lower_triangle() -> None:
-    full, P = _covariance(20)
-    for m in (1, 6, 8, 19):
-        rows = np.random.default_rng(m).standard_normal((m, 20))
-        changed = P.copy()
-        kernels.add_rows(changed, 20, rows, -1.0)
-        np.testing.assert_allclose(_whole(changed), full - rows.T @ rows, atol=1e-12)
-        assert (changed[np.triu_indices(20, 1)] == 777.0).all()
+def test_products_are_added_to_the_lower_triangle() -> None:
+    full, P = _covariance(22)
+    for m, n in ((4, 20), (8, 12), (20, 4)):
+        rows = np.random.default_rng(m).standard_normal((m, n))
+        changed, expected = P.copy(), full.copy()
+        kernels.add_products(changed, rows, -2.0)
+        expected[:n, :n] -= 2.0 * rows.T @ rows
+        np.testing.assert_allclose(_whole(changed), expected, atol=1e-12)
 
 
 def test_rows_are_read_and_set() -> None:
@@ -53,17 +53,15 @@ def test_rows_are_read_and_set() -> None:
 
 def test_innovation_of_landmarks_is_that_of_the_dense_jacobian() -> None:
     full, P = _covariance(22)
-    index, M, dense = _sightings(22, 5)
-    S, rows = np.empty((10, 10)), np.empty((10, 22))
+    index, M, dense = _observations(22, 5)
+    S = np.empty((10, 10))
     kernels.innovation_covariance(P, index, M, 0.25, S)
-    kernels.innovation_rows(P, 22, index, M, rows)
     np.testing.assert_allclose(S, dense @ full @ dense.T + 0.25 * np.eye(10), atol=1e-10)
-    np.testing.assert_allclose(rows, dense @ full, atol=1e-10)
 
 
 def test_set_without_a_gate_is_a_cholesky_factor_and_whitens() -> None:
     _, P = _covariance(22)
-    index, M, _ = _sightings(22, 5)
+    index, M, _ = _observations(22, 5)
     S = np.empty((10, 10))
     kernels.innovation_covariance(P, index, M, 0.25, S)
     residual = np.random.default_rng(2).standard_normal(10)
@@ -72,15 +70,26 @@ def test_set_without_a_gate_is_a_cholesky_factor_and_whitens() -> None:
     assert kernels.compatible_set(S, residual, order, np.inf, L, white, taken) == 5
     np.testing.assert_array_equal(taken, order)
     both = (2 * order[:, None] + [0, 1]).ravel()
-    np.testing.assert_allclose(L @ L.T, S[np.ix_(both, both)], atol=1e-10)
-    np.testing.assert_allclose(L @ white, residual[both], atol=1e-10)
-    rows = np.random.default_rng(3).standard_normal((10, 22))
-    whitened = rows.copy()
-    kernels.whiten_rows(L, 10, whitened)
-    np.testing.assert_allclose(L @ whitened, rows, atol=1e-10)
-    out = np.empty(22)
-    kernels.weighted_sum(whitened, 10, white, out)
-    np.testing.assert_allclose(out, white @ whitened, atol=1e-10)
+    np.testing.assert_allclose(L.T @ L, S[np.ix_(both, both)], atol=1e-10)
+    np.testing.assert_allclose(L.T @ white, residual[both], atol=1e-10)
+
+
+def test_matches_are_taken_that_fit_given_those_before() -> None:
+    a = np.random.default_rng(3).standard_normal((16, 16))
+    S = a @ a.T + np.eye(16)
+    residual = np.linalg.cholesky(S) @ np.random.default_rng(4).standard_normal(16)
+    expected: list[int] = []
+    for k in range(8):
+        before = np.array([2 * j + c for j in expected for c in (0, 1)], np.int64)
+        here = np.array([2 * k, 2 * k + 1])
+        gain = np.linalg.solve(S[np.ix_(before, before)], S[np.ix_(before, here)]).T
+        left = residual[here] - gain @ residual[before]
+        spread = S[np.ix_(here, here)] - gain @ S[np.ix_(before, here)]
+        if left @ np.linalg.solve(spread, left) <= 1.5:
+            expected.append(k)
+    L, white, taken = np.zeros((16, 16)), np.zeros(16), np.zeros(8, np.int64)
+    count = kernels.compatible_set(S, residual, np.arange(8), 1.5, L, white, taken)
+    assert taken[:count].tolist() == expected and 2 < count < 8
 
 
 def test_match_that_contradicts_those_before_is_left_out() -> None:

@@ -13,9 +13,8 @@ from kiteline_agent.ekf.ray_initialisation import (
     new_landmark,
     project,
     rays_meet,
-    supporting_views,
 )
-from kiteline_agent.ekf.ray_kernels import position_by_rays
+from kiteline_agent.ekf.ray_kernels import position_by_rays, supporting_views
 from kiteline_agent.ekf.ray_update import update_by_rays
 from kiteline_agent.ekf_config import EkfConfig
 from kiteline_bench.papers import simulated_vehicle as vehicle
@@ -82,8 +81,31 @@ def test_wrong_match_does_not_support_the_point() -> None:
     rays = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
     rays = np.einsum("vij,vj->vi", cameras[:, :3, :3], rays)
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    seen = np.ones((1, len(xy)), np.bool_)
-    assert supporting_views(cameras[:, :3, 3], rays[None], seen, 0.02)[0].tolist() == [True, True, False, True, True]
+    seen, agrees = np.ones((1, len(xy)), np.bool_), np.empty((1, len(xy)), np.bool_)
+    supporting_views(np.ascontiguousarray(cameras[:, :3, 3]), rays[None], seen, 0.02, agrees)
+    assert agrees[0].tolist() == [True, True, False, True, True]
+
+
+def test_supporting_views_are_those_of_plain_numpy() -> None:
+    rng, cameras = np.random.default_rng(0), _cameras()
+    centres, v = np.ascontiguousarray(cameras[:, :3, 3]), len(cameras)
+    points = _POINT + rng.uniform(-2.0, 2.0, (30, 3))
+    rays = points[:, None] - centres + rng.choice([0.02, 0.4], (30, v, 1)) * rng.standard_normal((30, v, 3))
+    rays /= np.linalg.norm(rays, axis=2, keepdims=True)
+    seen = rng.random((30, v)) < 0.8
+    agrees = np.empty((30, v), np.bool_)
+    supporting_views(centres, rays, seen, 0.02, agrees)
+    for k in range(30):
+        best = np.zeros(v, np.bool_)
+        for other in np.flatnonzero(seen[k, :-1]).tolist():
+            across = np.eye(3) - rays[k, [other, -1], :, None] * rays[k, [other, -1], None, :]
+            point = np.linalg.solve(across.sum(axis=0), np.einsum("vij,vj->i", across, centres[[other, -1]]))
+            along = ((point - centres) * rays[k]).sum(axis=1)
+            off = np.linalg.norm(point - centres - along[:, None] * rays[k], axis=1)
+            near = seen[k] & (along > 0.0) & (off < 0.02 * along)
+            if near[-1] and near.sum() > best.sum():
+                best = near
+        np.testing.assert_array_equal(agrees[k], best)
 
 
 def _drawn(

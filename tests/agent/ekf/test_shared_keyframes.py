@@ -121,7 +121,7 @@ def test_a_landmark_has_the_depth_that_the_filter_knows() -> None:
     camera, config = RectifiedCamera(320, 240, 200.0, 200.0, 159.5, 119.5, 0.0, False, np.eye(4)), AgentConfig()
     ours, theirs = plain_pair()
     keyframes = SharedKeyframes(
-        camera, config, Identity(AgentId(0), 0), ours, Governor(config.governor, inertial=True), Work()
+        camera, config, Identity(AgentId(0), 0), ours, Governor(config.governor), Work()
     )  # fmt: skip
     depth_m = np.where(np.arange(6) % 2, np.arange(2.0, 8.0), 0.0)
     uv, octave = np.array([[60.0 + 30.0 * i, 120.0] for i in range(6)]), np.zeros(6, np.uint8)
