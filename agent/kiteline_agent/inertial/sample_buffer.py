@@ -19,6 +19,7 @@ _RECENT = 10  # samples whose mean is without vibration
 _EVEN = 1.5  # longest over shortest step of three samples whose second difference is used
 _GAP = 2.5  # of the usual step: a longer one misses samples
 _GAP_GYRO_RAD_S, _GAP_ACCEL_M_S2 = 0.3, 2.0  # error of interpolation over missing samples
+_HELD_GYRO_RAD_S, _HELD_ACCEL_M_S2 = 2.0, 20.0  # error of samples that have not come yet: the images alone count
 _CLIPPED_GYRO_RAD_S, _CLIPPED_ACCEL_M_S2 = 1.0, 10.0  # error of a sample at the end of the range
 _RANGE_GYRO_RAD_S, _RANGE_ACCEL_M_S2 = 2.0, 15.0  # no IMU has a smaller range
 
@@ -87,6 +88,10 @@ class SampleBuffer:
         """Measured noise density (2,) of gyro (rad/s/sqrt(Hz)) and accelerometer (m/s^2/sqrt(Hz))."""
         return np.asarray(np.sqrt(self._variance.min(axis=0) * (self._step_ns or 0.0) * 1e-9))
 
+    def lacks(self, to_ns: int) -> bool:
+        """True if samples before an instant have not come yet; what `between` gives in their place is a guess."""
+        return len(self._t) == 0 or (self._step_ns is not None and to_ns - int(self._t[-1]) > _GAP * self._step_ns)
+
     def between(self, from_ns: int, to_ns: int) -> Samples | None:
         """Samples from one instant to another, ends interpolated (held beyond the newest); None with a gap."""
         t = self._t
@@ -114,6 +119,10 @@ class SampleBuffer:
         first, last = self._t.searchsorted(from_ns, "left"), self._t.searchsorted(to_ns, "right")
         return self._values[first:last]
 
+    def samples(self) -> tuple[I64, F64]:
+        """Stamps (n,) of all samples, and the samples (n,6)."""
+        return self._t, self._values
+
     def _at(self, t_ns: int) -> F64:
         t = self._t
         k = int(t.searchsorted(t_ns))
@@ -131,6 +140,8 @@ class SampleBuffer:
         if missed.any():
             dt_s = steps[missed] * 1e-9
             out[missed] = np.sqrt(out[missed] ** 2 + np.outer(dt_s, [_GAP_GYRO_RAD_S**2, _GAP_ACCEL_M_S2**2]))
+        if missed[-1] and hi == len(self._t):
+            out[-1] = np.sqrt(out[-1] ** 2 + steps[-1] * 1e-9 * np.array([_HELD_GYRO_RAD_S**2, _HELD_ACCEL_M_S2**2]))
         if clipped.any():
             extra = np.array([_CLIPPED_GYRO_RAD_S, _CLIPPED_ACCEL_M_S2]) * clipped.any(axis=0)
             out = np.sqrt(out**2 + np.outer(steps * 1e-9, extra**2))

@@ -1,0 +1,194 @@
+"""How an IMU is mounted, and its clock's offset, from turns alone: for a calibration that is off by degrees.
+
+The filters begin near the calibration that they are given, and follow slowly. This search needs no start: rotations
+by images and by the gyro over short windows are two sets of vectors that one rotation maps onto each other (R. Tsai,
+R. Lenz, "Hand/eye calibration", 1989, in the closed form of W. Kabsch, 1976), for each time offset of a grid.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from kiteline_agent.inertial.sample_buffer import SampleBuffer
+from kiteline_core.arrays import F64, I64
+from kiteline_core.geometry import se3
+
+_LONGEST = 2.5  # times the window: a longer one lacks frames
+_FITS = 4  # each with the weights that the one before gave
+_UNKNOWNS = 8.0  # rotation, scale, bias and time offset
+_TAIL = 2.0  # times the median residual, from which a window weighs less
+
+
+@dataclass(frozen=True, slots=True)
+class MountingSearchConfig:
+    """When a calibration is searched, and how much better a found one must explain the turns."""
+
+    suspicion: float = 1e-3  # squared errors over squared turns from which it is searched; sound rigs reach 5e-4
+    window_s: float = 0.09  # over which turns are compared: short beside changes of the rate
+    memory_s: float = 3.0  # of turns; samples are kept for as long
+    least_s: float = 0.5  # of turns that are compared
+    every_s: float = 0.24  # between two searches
+    most_offset_s: float = 0.15  # either way; drivers that stamp at arrival are late by less
+    step_s: float = 0.01  # of the grid of offsets: turns change slower
+    rotation_sigma_rad: float = 0.1  # of a mounting about an axis: an axis about which nothing turned stays as told
+    turn_sigma_rad: float = 2e-4  # least error of a turn by images over a window
+    explained: float = 0.8  # of the squared errors that a found calibration must explain
+    significance: float = 100.0  # squared errors that it explains, over the mean square of what it leaves
+    least_rotation_rad: float = 0.015  # smaller ones are left to the filters
+    most_rotation_rad: float = 0.4  # of a mounting; beyond it axes were confused, and nothing else of it is right
+    most_scale: float = 0.08  # of the gyro's scale, either way
+    least_scale: float = 0.015  # likewise of the gyro's scale
+    least_change_s: float = 0.015  # likewise of the time offset
+    sure_s: float = 1.5  # of turns after which an IMU that no plausible calibration explains is left
+
+
+@dataclass(frozen=True, slots=True)
+class Mounting:
+    """rotation: (3,3), IMU to body. scale: of the gyro. offset_s: camera stamp + offset = IMU time, sigma_s its
+    deviation. bias: (3,) of the gyro, rad/s: rate = scale * rotation @ gyro - bias. seconds: of turns.
+    """
+
+    rotation: F64
+    scale: float
+    offset_s: float
+    sigma_s: float
+    bias: F64
+    seconds: float
+
+    @property
+    def rotation_rad(self) -> float:
+        """Angle of the rotation."""
+        return float(np.linalg.norm(se3.so3_log(self.rotation)))
+
+
+class MountingSearch:
+    """Call `add` with each rotation by images, then `find`."""
+
+    def __init__(self, config: MountingSearchConfig) -> None:
+        self._config = config
+        self._frames = list[tuple[int, F64]]()  # stamps and R_m_b (3,3)
+        self._searched_ns = 0
+
+    def clear(self) -> None:
+        """Begin again after an image loss or in a new map."""
+        self._frames = []
+
+    def rotate_map(self, R_new_old: F64) -> None:
+        """Rotate the map by R_new_old (3,3)."""
+        self._frames = [(t, R_new_old @ R) for t, R in self._frames]
+
+    def add(self, t_ns: int, R_m_b: F64) -> None:
+        """Append the rotation R_m_b (3,3) of a frame by images."""
+        self._frames.append((t_ns, R_m_b))
+        while self._frames[0][0] < t_ns - self._config.memory_s * 1e9:
+            del self._frames[0]
+
+    def find(self, buffer: SampleBuffer, matrix: F64, offset_s: float) -> Mounting | None:
+        """The mounting, if it explains the turns far better than the gyro's present matrix (3,3) and offset do."""
+        config, t_ns = self._config, self._frames[-1][0]
+        if t_ns - self._searched_ns < config.every_s * 1e9:
+            return None
+        self._searched_ns = t_ns
+        windows, last = list[tuple[int, int, F64]](), self._frames[0]
+        for t_ns, R_m_b in self._frames:
+            duration_s = (t_ns - last[0]) * 1e-9
+            if duration_s >= config.window_s:
+                if duration_s < _LONGEST * config.window_s:
+                    windows.append((last[0], t_ns, se3.so3_log(last[1].T @ R_m_b)))
+                last = t_ns, R_m_b
+        if not windows:
+            return None
+        begin, end, turns = (np.array(column) for column in zip(*windows, strict=True))
+        return _found(config, _Turns(begin, end, turns, *buffer.samples()), matrix, offset_s)
+
+
+class _Turns:
+    """Rotations by images over n windows, and the gyro's samples, integrated axis by axis: the turns are small."""
+
+    def __init__(self, begin_ns: I64, end_ns: I64, turns: F64, stamps: I64, samples: F64) -> None:
+        """begin_ns, end_ns: (n,) camera stamps. turns: (n,3) rad. stamps (m,), samples (m,6): of the IMU."""
+        first, last = begin_ns - stamps[0], end_ns - stamps[0]
+        self._begin_s, self._end_s, self._t_s = 1e-9 * first, 1e-9 * last, 1e-9 * (stamps - stamps[0])
+        self.by_images, self.dt_s = turns, self._end_s - self._begin_s
+        rates = samples[:, :3]
+        steps = 0.5 * (rates[1:] + rates[:-1]) * np.diff(self._t_s)[:, None]
+        self._sum = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+
+    def keep_inside(self, margin_s: float) -> None:
+        """Keep the windows that have samples for any offset up to margin_s."""
+        inside = (self._begin_s >= margin_s) & (self._end_s + margin_s <= self._t_s[-1])
+        self._begin_s, self._end_s = self._begin_s[inside], self._end_s[inside]
+        self.by_images, self.dt_s = self.by_images[inside], self.dt_s[inside]
+
+    def by_gyro(self, offsets_s: F64) -> F64:
+        """Integrals (k,n,3) of the windows, at k time offsets."""
+        begin_s, end_s = self._begin_s + offsets_s[:, None], self._end_s + offsets_s[:, None]
+        columns = [np.interp(end_s, self._t_s, sums) - np.interp(begin_s, self._t_s, sums) for sums in self._sum.T]
+        return np.stack(columns, axis=-1)
+
+
+def _found(config: MountingSearchConfig, turns: _Turns, matrix: F64, offset_s: float) -> Mounting | None:
+    turns.keep_inside(config.most_offset_s)
+    if float(turns.dt_s.sum()) < config.least_s:
+        return None
+    steps = round(config.most_offset_s / config.step_s)
+    offsets = np.asarray(config.step_s * np.arange(-steps, steps + 1), np.float64)
+    pull, felt = 0.5 * (config.turn_sigma_rad / config.rotation_sigma_rad) ** 2, turns.by_gyro(offsets)
+    weight, cost, best = np.ones(len(turns.dt_s)), np.empty(0), 0
+    for _ in range(_FITS):
+        _, cost, left = _fit(turns, felt, weight, pull)
+        best = int(np.argmin(cost))
+        size = np.linalg.norm(left[best], axis=1)
+        weight = np.minimum(1.0, _TAIL * np.median(size) / np.maximum(size, 1e-12)) ** 2
+    if best in (0, len(offsets) - 1):
+        return None
+    curve = float(cost[best - 1] - 2.0 * cost[best] + cost[best + 1])
+    if not curve > 0.0:
+        return None
+    found_s = float(offsets[best] + 0.5 * config.step_s * (cost[best - 1] - cost[best + 1]) / curve)
+    felt = turns.by_gyro(np.array([found_s, offset_s]))
+    fitted, cost, _ = _fit(turns, felt, weight, pull)
+    axes, free = fitted[0], 3.0 * float(weight.sum()) - _UNKNOWNS
+    scale = float(np.cbrt(np.linalg.det(axes)))
+    noise = max(float(cost[0]) / free, config.turn_sigma_rad**2)
+    given = float(weight @ np.sum(_without_bias(turns.by_images - felt[1] @ matrix.T, turns.dt_s, weight) ** 2, axis=1))
+    explained = given - noise * free
+    change = np.linalg.solve(matrix, axes)
+    stays = abs(np.cbrt(np.linalg.det(change)) - 1.0) < config.least_scale
+    stays &= np.linalg.norm(se3.so3_log(_rotation(change))) < config.least_rotation_rad
+    if stays and abs(found_s - offset_s) < config.least_change_s:
+        return None
+    if explained < config.explained * given or explained < config.significance * noise:
+        return None
+    rest, share = turns.by_images - felt[0] @ axes.T, weight * turns.dt_s
+    bias = -share @ rest / float(share @ turns.dt_s)
+    sigma_s = float(np.sqrt(2.0 * noise * config.step_s**2 / curve))
+    return Mounting(axes / scale, scale, found_s, sigma_s, bias, float(turns.dt_s.sum()))
+
+
+def _fit(turns: _Turns, felt: F64, weight: F64, pull: float) -> tuple[F64, F64, F64]:
+    """Scaled rotations (k,3,3) of felt (k,n,3) onto the turns by images, apart from a bias.
+
+    weight (n,). pull: towards neither scale nor rotation, in units of the weighted squared turns. Also the squared
+    errors (k,), and the errors (k,n,3).
+    """
+    seen, felt = (_without_bias(vectors, turns.dt_s, weight) for vectors in (turns.by_images, felt))
+    moment = (weight * seen.T) @ felt + pull * np.eye(3)
+    rotation = _rotation(moment)
+    scale = np.sum(rotation * moment, axis=(1, 2)) / (np.sum(felt**2, axis=2) @ weight + 3.0 * pull)
+    axes = scale[:, None, None] * rotation
+    left = seen - felt @ axes.transpose(0, 2, 1)
+    return axes, np.asarray(np.sum(left**2, axis=2) @ weight), left
+
+
+def _rotation(moment: F64) -> F64:
+    """Rotations (...,3,3) that are next to matrices (...,3,3)."""
+    u, _, vt = np.linalg.svd(moment)
+    u[..., 2] *= np.linalg.det(u @ vt)[..., None]
+    return np.asarray(u @ vt)
+
+
+def _without_bias(vectors: F64, dt_s: F64, weight: F64) -> F64:
+    """Vectors (...,n,3) less what a constant rate explains of them."""
+    share = weight * dt_s
+    return np.asarray(vectors - dt_s[:, None] * (share @ vectors / float(share @ dt_s))[..., None, :])
