@@ -14,7 +14,7 @@ from kiteline_core.arrays import F64, I64
 from kiteline_core.geometry import se3
 
 _LONGEST = 2.5  # times the window: a longer one lacks frames
-_FITS = 4  # each with the weights that the one before gave
+_FITS = 3  # each with the weights that the one before gave
 _UNKNOWNS = 8.0  # rotation, scale, bias and time offset
 _TAIL = 2.0  # times the median residual, from which a window weighs less
 
@@ -27,7 +27,9 @@ class MountingSearchConfig:
     window_s: float = 0.09  # over which turns are compared: short beside changes of the rate
     memory_s: float = 3.0  # of turns; samples are kept for as long
     least_s: float = 0.5  # of turns that are compared
-    every_s: float = 0.24  # between two searches
+    every_s: float = 0.24  # between the first two searches
+    backoff: float = 1.4  # by which the time to the next search grows with each that finds nothing
+    seldom_s: float = 5.0  # longest time between two searches: rigs that are worn badly are doubted for good
     most_offset_s: float = 0.15  # either way; drivers that stamp at arrival are late by less
     step_s: float = 0.01  # of the grid of offsets: turns change slower
     rotation_sigma_rad: float = 0.1  # of a mounting about an axis: an axis about which nothing turned stays as told
@@ -67,7 +69,7 @@ class MountingSearch:
     def __init__(self, config: MountingSearchConfig) -> None:
         self._config = config
         self._frames = list[tuple[int, F64]]()  # stamps and R_m_b (3,3)
-        self._searched_ns = 0
+        self._next_ns, self._wait_s = 0, config.every_s  # time of the next search, and from it to the one after
 
     def clear(self) -> None:
         """Begin again after an image loss or in a new map."""
@@ -86,9 +88,10 @@ class MountingSearch:
     def find(self, buffer: SampleBuffer, matrix: F64, offset_s: float) -> Mounting | None:
         """The mounting, if it explains the turns far better than the gyro's present matrix (3,3) and offset do."""
         config, t_ns = self._config, self._frames[-1][0]
-        if t_ns - self._searched_ns < config.every_s * 1e9:
+        if t_ns < self._next_ns:
             return None
-        self._searched_ns = t_ns
+        self._next_ns = t_ns + round(1e9 * self._wait_s)
+        self._wait_s = min(config.backoff * self._wait_s, config.seldom_s)
         windows, last = list[tuple[int, int, F64]](), self._frames[0]
         for t_ns, R_m_b in self._frames:
             duration_s = (t_ns - last[0]) * 1e-9
@@ -99,7 +102,10 @@ class MountingSearch:
         if not windows:
             return None
         begin, end, turns = (np.array(column) for column in zip(*windows, strict=True))
-        return _found(config, _Turns(begin, end, turns, *buffer.samples()), matrix, offset_s)
+        found = _found(config, _Turns(begin, end, turns, *buffer.samples()), matrix, offset_s)
+        if found is not None:
+            self._wait_s = config.every_s
+        return found
 
 
 class _Turns:

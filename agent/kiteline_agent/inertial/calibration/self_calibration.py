@@ -276,15 +276,16 @@ class SelfCalibration:
 
     def _search_mounting(self, buffer: SampleBuffer) -> None:
         """Begin anew with another mounting and time offset where these explain turns that the present ones do not."""
-        config, moved_s = self._config, abs(self.gyro.offset_s - self._given_offset_s)
-        doubted = self._gyro_windows > 0 or moved_s > config.mounting.least_change_s
-        doubted |= self.gyro.disagreement.share > config.mounting.suspicion
-        if not (doubted and self._searches):
-            return
-        found = self._mounting.find(buffer, self._given_axes, self._given_offset_s)
+        gyro, limits = self.gyro, self._config.mounting
+        axes_off = float(np.abs(gyro.matrix - self._given_axes).max())
+        doubted = self._gyro_windows > 0 and axes_off > limits.least_rotation_rad
+        doubted |= abs(gyro.offset_s - self._given_offset_s) > limits.least_change_s
+        doubted |= gyro.disagreement.share > limits.suspicion
+        found = None
+        if doubted and self._searches:
+            found = self._mounting.find(buffer, self._given_axes, self._given_offset_s)
         if found is None:
             return
-        limits = config.mounting
         if found.rotation_rad > limits.most_rotation_rad or abs(found.scale - 1.0) > limits.most_scale:
             self._is_other_imu |= found.seconds > limits.sure_s
             return
