@@ -157,3 +157,16 @@ def test_intervals_with_few_samples_count_as_the_others() -> None:
 
 def test_motion_without_noise_is_no_vibration() -> None:
     assert vibration(intervals([0.0] * 3)).density < 1e-4
+
+
+def test_samples_that_have_not_come_are_told_and_hardly_count() -> None:
+    gyro, accel = lively(100)
+    buffer = filled(gyro, accel)
+    newest = 99 * STEP_NS
+    assert not buffer.lacks(newest + 2 * STEP_NS) and buffer.lacks(newest + 3 * STEP_NS)
+    near, far = interval(buffer, 90, 101), interval(buffer, 90, 109)
+    assert near.density is not None and near.density.max() < 0.01
+    assert far.density is not None and far.density[:-1].max() < 0.01
+    lasting_s = far.t_s[-1] - far.t_s[-2]
+    np.testing.assert_allclose(far.density[-1], np.sqrt(lasting_s) * np.array([2.0, 20.0]), rtol=0.05)
+    assert SampleBuffer(3.0, 0.2).lacks(0)

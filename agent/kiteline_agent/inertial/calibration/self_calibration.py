@@ -90,6 +90,7 @@ class SelfCalibration:
         self._is_other_imu = False  # only a mounting that no rig has explains its turns
         self._lever_m = np.zeros(3)  # origin of the body, as the calibration places it, in the IMU
         self.restarted = False  # True after an `update` that found a calibration: what was integrated before is void
+        self.turned = False  # True after one that found a rotation: so is the vertical
         self._before: tuple[Window, Link, float, float] | None = None  # last window of moves: density, `_unsteady`
         self._added = 0.0  # rad^2, of the rotation by images in the last window of turns, beside turn_sigma_rad
         self._unsteady = 1.0  # factor on the variance of poses by images, since the last window of moves
@@ -213,7 +214,7 @@ class SelfCalibration:
         gravity: (3,) in m as the smoother knows it; None: unknown. dt_s: since the last call. Returns the change (3,)
         of the corrected accelerometer bias, m/s^2, that the change of its axes entails.
         """
-        self.restarted = False
+        self.restarted = self.turned = False
         turn = self._turns.take(buffer, self.gyro.offset_s)
         if isinstance(turn, Link):
             offset_s, density = self.gyro.offset_s, float(self._density(turn)[0])
@@ -297,6 +298,8 @@ class SelfCalibration:
 
     def _begin_with_mounting(self, found: Mounting) -> None:
         axes = found.scale * found.rotation
+        change_rad = float(np.linalg.norm(se3.so3_log(found.rotation @ self._accel_matrix.T)))
+        self.turned = change_rad > self._config.mounting.least_rotation_rad
         self.gyro, self._unprimed_gyro = self._unknown_gyro(), None
         self.gyro.begin_with(axes, self._config.axes_sigma.reshape(3, 3), found.offset_s, found.sigma_s)
         self.gyro.set_bias(found.bias)
