@@ -33,34 +33,39 @@ class MountingSearchConfig:
     most_offset_s: float = 0.15  # either way; drivers that stamp at arrival are late by less
     step_s: float = 0.01  # of the grid of offsets: turns change slower
     rotation_sigma_rad: float = 0.1  # of a mounting about an axis: an axis about which nothing turned stays as told
+    scale_sigma: float = 0.02  # of the gyro's scale: what little turns leave open is the time offset first
     turn_sigma_rad: float = 2e-4  # least error of a turn by images over a window
-    explained: float = 0.8  # of the squared errors that a found calibration must explain
-    significance: float = 100.0  # squared errors that it explains, over the mean square of what it leaves
-    least_rotation_rad: float = 0.015  # smaller ones are left to the filters
+    explained: float = 0.5  # of the squared errors that a found calibration must explain
+    significance: float = 60.0  # squared errors that it explains, over the mean square of what it leaves
+    least_rotation_rad: float = 0.025  # smaller ones are left to the filters
     most_rotation_rad: float = 0.4  # of a mounting; beyond it axes were confused, and nothing else of it is right
     most_scale: float = 0.08  # of the gyro's scale, either way
-    least_scale: float = 0.015  # likewise of the gyro's scale
+    least_scale: float = 0.02  # likewise of the gyro's scale
     least_change_s: float = 0.015  # likewise of the time offset
-    sure_s: float = 1.5  # of turns after which an IMU that no plausible calibration explains is left
 
 
 @dataclass(frozen=True, slots=True)
 class Mounting:
-    """rotation: (3,3), IMU to body. scale: of the gyro. offset_s: camera stamp + offset = IMU time, sigma_s its
-    deviation. bias: (3,) of the gyro, rad/s: rate = scale * rotation @ gyro - bias. seconds: of turns.
+    """axes: (3,3), IMU to body, scaled as the gyro has to be. offset_s: camera stamp + offset = IMU time, sigma_s its
+    deviation. bias: (3,) of the gyro, rad/s: rate = axes @ gyro - bias.
     """
 
-    rotation: F64
-    scale: float
+    axes: F64
     offset_s: float
     sigma_s: float
     bias: F64
-    seconds: float
 
     @property
-    def rotation_rad(self) -> float:
-        """Angle of the rotation."""
-        return float(np.linalg.norm(se3.so3_log(self.rotation)))
+    def rotation(self) -> F64:
+        """(3,3) IMU to body."""
+        return _rotation(self.axes)
+
+    def __str__(self) -> str:
+        turned, measured = np.degrees(_angle_rad(self.axes)), 100.0 / _scale(self.axes)
+        return (
+            f"the camera is turned by {turned:.1f} degrees against it, camera stamps + {1e3 * self.offset_s:.0f} ms "
+            f"are its time, its gyro measures {measured:.0f} % of a rate"
+        )
 
 
 class MountingSearch:
@@ -139,52 +144,87 @@ def _found(config: MountingSearchConfig, turns: _Turns, matrix: F64, offset_s: f
         return None
     steps = round(config.most_offset_s / config.step_s)
     offsets = np.asarray(config.step_s * np.arange(-steps, steps + 1), np.float64)
-    pull, felt = 0.5 * (config.turn_sigma_rad / config.rotation_sigma_rad) ** 2, turns.by_gyro(offsets)
-    weight, cost, best = np.ones(len(turns.dt_s)), np.empty(0), 0
+    felt, weight, cost = turns.by_gyro(offsets), np.ones(len(turns.dt_s)), np.empty(0)
     for _ in range(_FITS):
-        _, cost, left = _fit(turns, felt, weight, pull)
-        best = int(np.argmin(cost))
-        size = np.linalg.norm(left[best], axis=1)
-        weight = np.minimum(1.0, _TAIL * np.median(size) / np.maximum(size, 1e-12)) ** 2
-    if best in (0, len(offsets) - 1):
+        _, cost, left = _fit(config, turns, felt, weight)
+        size = np.maximum(np.linalg.norm(left[np.argmin(cost)], axis=1), config.turn_sigma_rad)
+        weight = np.minimum(1.0, _TAIL * np.median(size) / size) ** 2
+    both_s, only_s = _least(offsets, cost), _least(offsets, _cost(turns, felt, matrix, weight))
+    if both_s is None or only_s is None:
         return None
-    curve = float(cost[best - 1] - 2.0 * cost[best] + cost[best + 1])
+    felt = turns.by_gyro(np.array([both_s[0], only_s[0], offset_s]))
+    fitted, cost, _ = _fit(config, turns, felt, weight)
+    by_offset, given = _cost(turns, felt[1:], matrix, weight)
+    noise = max(float(cost[0]) / max(3.0 * float(weight.sum()) - _UNKNOWNS, 1.0), config.turn_sigma_rad**2)
+    clear = config.significance * noise
+    # The fewest changes that explain the turns: where little turned, a rotation could pass for an offset.
+    k, axes, (found_s, sigma) = 0, fitted[0], both_s
+    if by_offset < cost[0] + clear:
+        k, axes, (found_s, sigma) = 1, matrix, only_s
+    elif cost[2] < cost[0] + clear:
+        k, axes, found_s = 2, fitted[2], offset_s
+    explained = given - (by_offset if k == 1 else float(cost[k]))
+    if explained < max(config.explained * given, clear) or not _differs(config, axes, matrix, found_s - offset_s):
+        return None
+    rest, share = turns.by_images - felt[k] @ axes.T, weight * turns.dt_s
+    bias = -share @ rest / float(share @ turns.dt_s)
+    return Mounting(axes, found_s, sigma * float(np.sqrt(noise)), bias)
+
+
+def _differs(config: MountingSearchConfig, axes: F64, matrix: F64, later_s: float) -> bool:
+    """True if axes (3,3) and a time offset are those of a rig, but not of the given one."""
+    change = np.asarray(np.linalg.solve(matrix, axes), np.float64)
+    turn, scale = (_angle_rad(change), _angle_rad(axes)), (_scale(change), _scale(axes))
+    if turn[1] > config.most_rotation_rad or abs(scale[1] - 1.0) > config.most_scale:
+        return False
+    changed = turn[0] > config.least_rotation_rad or abs(scale[0] - 1.0) > config.least_scale
+    return changed or abs(later_s) > config.least_change_s
+
+
+def _scale(axes: F64) -> float:
+    return float(np.cbrt(np.linalg.det(axes)))
+
+
+def _angle_rad(axes: F64) -> float:
+    return float(np.linalg.norm(se3.so3_log(_rotation(axes))))
+
+
+def _least(offsets_s: F64, cost: F64) -> tuple[float, float] | None:
+    """The offset of the least of costs, by a parabola, and its deviation for errors of one; None at an end."""
+    k = int(np.argmin(cost))
+    if k in (0, len(cost) - 1):
+        return None
+    curve = float(cost[k - 1] - 2.0 * cost[k] + cost[k + 1])
     if not curve > 0.0:
         return None
-    found_s = float(offsets[best] + 0.5 * config.step_s * (cost[best - 1] - cost[best + 1]) / curve)
-    felt = turns.by_gyro(np.array([found_s, offset_s]))
-    fitted, cost, _ = _fit(turns, felt, weight, pull)
-    axes, free = fitted[0], 3.0 * float(weight.sum()) - _UNKNOWNS
-    scale = float(np.cbrt(np.linalg.det(axes)))
-    noise = max(float(cost[0]) / free, config.turn_sigma_rad**2)
-    given = float(weight @ np.sum(_without_bias(turns.by_images - felt[1] @ matrix.T, turns.dt_s, weight) ** 2, axis=1))
-    explained = given - noise * free
-    change = np.linalg.solve(matrix, axes)
-    stays = abs(np.cbrt(np.linalg.det(change)) - 1.0) < config.least_scale
-    stays &= np.linalg.norm(se3.so3_log(_rotation(change))) < config.least_rotation_rad
-    if stays and abs(found_s - offset_s) < config.least_change_s:
-        return None
-    if explained < config.explained * given or explained < config.significance * noise:
-        return None
-    rest, share = turns.by_images - felt[0] @ axes.T, weight * turns.dt_s
-    bias = -share @ rest / float(share @ turns.dt_s)
-    sigma_s = float(np.sqrt(2.0 * noise * config.step_s**2 / curve))
-    return Mounting(axes / scale, scale, found_s, sigma_s, bias, float(turns.dt_s.sum()))
+    step_s = float(offsets_s[1] - offsets_s[0])
+    return float(offsets_s[k] + 0.5 * step_s * (cost[k - 1] - cost[k + 1]) / curve), step_s * float(
+        np.sqrt(2.0 / curve)
+    )
 
 
-def _fit(turns: _Turns, felt: F64, weight: F64, pull: float) -> tuple[F64, F64, F64]:
-    """Scaled rotations (k,3,3) of felt (k,n,3) onto the turns by images, apart from a bias.
+def _cost(turns: _Turns, felt: F64, axes: F64, weight: F64) -> F64:
+    """Squared errors (k,) of felt (k,n,3) by given axes (3,3), apart from a bias."""
+    left = _without_bias(turns.by_images - felt @ axes.T, turns.dt_s, weight)
+    return np.asarray(np.sum(left**2, axis=2) @ weight)
 
-    weight (n,). pull: towards neither scale nor rotation, in units of the weighted squared turns. Also the squared
-    errors (k,), and the errors (k,n,3).
+
+def _fit(config: MountingSearchConfig, turns: _Turns, felt: F64, weight: F64) -> tuple[F64, F64, F64]:
+    """Scaled rotations (k,3,3) of felt (k,n,3) onto the turns by images, apart from a bias. weight: (n,).
+
+    Also their squared errors (k,), with those of the prior, which is no scale and no rotation; and the errors (k,n,3).
     """
+    pull = 0.5 * (config.turn_sigma_rad / config.rotation_sigma_rad) ** 2
+    stiff = (config.turn_sigma_rad / config.scale_sigma) ** 2
     seen, felt = (_without_bias(vectors, turns.dt_s, weight) for vectors in (turns.by_images, felt))
     moment = (weight * seen.T) @ felt + pull * np.eye(3)
     rotation = _rotation(moment)
-    scale = np.sum(rotation * moment, axis=(1, 2)) / (np.sum(felt**2, axis=2) @ weight + 3.0 * pull)
+    matched, square = np.sum(rotation * moment, axis=(1, 2)), np.sum(felt**2, axis=2) @ weight + 3.0 * pull
+    scale = (matched + stiff) / (square + stiff)
     axes = scale[:, None, None] * rotation
     left = seen - felt @ axes.transpose(0, 2, 1)
-    return axes, np.asarray(np.sum(left**2, axis=2) @ weight), left
+    prior = pull * np.sum((axes - np.eye(3)) ** 2, axis=(1, 2)) + stiff * (scale - 1.0) ** 2
+    return axes, np.asarray(np.sum(left**2, axis=2) @ weight + prior), left
 
 
 def _rotation(moment: F64) -> F64:

@@ -87,7 +87,6 @@ class SelfCalibration:
         self._moves = PoseChain(config.move_window_s)
         self._mounting, self._lever = MountingSearch(config.mounting), LeverSearch(config.lever)
         self._given_axes, self._given_offset_s = np.eye(3), config.offset_s  # with which the filters began
-        self._is_other_imu = False  # only a mounting that no rig has explains its turns
         self._lever_m = np.zeros(3)  # origin of the body, as the calibration places it, in the IMU
         self.restarted = False  # True after an `update` that found a calibration: what was integrated before is void
         self.turned = False  # True after one that found a rotation: so is the vertical
@@ -173,8 +172,7 @@ class SelfCalibration:
     @property
     def contradicts(self) -> bool:
         """True if images and IMU measure other motions: no error of a calibrated IMU explains that."""
-        disagrees = self.gyro.disagreement.contradicts or self.accel.disagreement.contradicts
-        return disagrees or self._is_other_imu
+        return self.gyro.disagreement.contradicts or self.accel.disagreement.contradicts
 
     def take_events(self) -> list[str]:
         """A line for the log for each sensor whose correction began."""
@@ -279,25 +277,19 @@ class SelfCalibration:
         """Begin anew with another mounting and time offset where these explain turns that the present ones do not."""
         gyro, limits = self.gyro, self._config.mounting
         axes_off = float(np.abs(gyro.matrix - self._given_axes).max())
-        doubted = self._gyro_windows > 0 and axes_off > limits.least_rotation_rad
+        doubted = self._gyro_windows > 0 and axes_off > 0.5 * limits.least_rotation_rad
         doubted |= abs(gyro.offset_s - self._given_offset_s) > limits.least_change_s
         doubted |= gyro.disagreement.share > limits.suspicion
-        found = None
-        if doubted and self._searches:
-            found = self._mounting.find(buffer, self._given_axes, self._given_offset_s)
+        if not (doubted and self._searches):
+            return
+        found = self._mounting.find(buffer, self._given_axes, self._given_offset_s)
         if found is None:
             return
-        if found.rotation_rad > limits.most_rotation_rad or abs(found.scale - 1.0) > limits.most_scale:
-            self._is_other_imu |= found.seconds > limits.sure_s
-            return
         self._begin_with_mounting(found)
-        self._events.append(
-            f"imu: the camera is turned by {np.degrees(found.rotation_rad):.1f} degrees against it, camera stamps + "
-            f"{1e3 * found.offset_s:.0f} ms are its time, its gyro measures {100.0 / found.scale:.0f} %: {_CORRECT}"
-        )
+        self._events.append(f"imu: {found}: {_CORRECT}")
 
     def _begin_with_mounting(self, found: Mounting) -> None:
-        axes = found.scale * found.rotation
+        axes = found.axes
         change_rad = float(np.linalg.norm(se3.so3_log(found.rotation @ self._accel_matrix.T)))
         self.turned = change_rad > self._config.mounting.least_rotation_rad
         self.gyro, self._unprimed_gyro = self._unknown_gyro(), None
