@@ -29,7 +29,7 @@ class MountingSearchConfig:
     least_s: float = 0.5  # of turns that are compared
     every_s: float = 0.24  # between the first two searches
     backoff: float = 1.4  # by which the time to the next search grows with each that finds nothing
-    seldom_s: float = 5.0  # longest time between two searches: rigs that are worn badly are doubted for good
+    seldom_s: float = 5.0  # longest time between two searches: a rig that is worn badly stays in doubt
     most_offset_s: float = 0.15  # either way; drivers that stamp at arrival are late by less
     step_s: float = 0.01  # of the grid of offsets: turns change slower
     rotation_sigma_rad: float = 0.1  # of a mounting about an axis: an axis about which nothing turned stays as told
@@ -38,10 +38,10 @@ class MountingSearchConfig:
     explained: float = 0.5  # of the squared errors that a found calibration must explain
     significance: float = 60.0  # squared errors that it explains, over the mean square of what it leaves
     least_rotation_rad: float = 0.025  # smaller ones are left to the filters
-    most_rotation_rad: float = 0.4  # of a mounting; beyond it axes were confused, and nothing else of it is right
-    most_scale: float = 0.08  # of the gyro's scale, either way
     least_scale: float = 0.02  # likewise of the gyro's scale
     least_change_s: float = 0.015  # likewise of the time offset
+    most_rotation_rad: float = 0.4  # of a mounting; beyond it axes were confused, and nothing else of it is right
+    most_scale: float = 0.08  # of the gyro's scale, either way: beyond it the unit is another one, or the clock
 
 
 @dataclass(frozen=True, slots=True)
