@@ -144,7 +144,7 @@ class InertialTracker:
         """Buffer samples and predict the body at t_ns; None without samples or a previous pose."""
         self._buffer.push(imu)
         samples = self._interval(t_ns)
-        if self._last is None or samples is None:
+        if self._last is None or samples is None or self.self_calibration.awaits_search:
             return None
         last_ns, last_T_m_b = self._last
         if self._smoother.running:
@@ -193,7 +193,10 @@ class InertialTracker:
         samples = self._interval(t_ns)
         if samples is not None:
             self._calibrate(t_ns, T_m_b_visual, samples.duration_s)
-            samples = None if self.self_calibration.restarted else samples
+            if self.self_calibration.awaits_search:
+                self._smoother.stop()
+            if self.self_calibration.restarted or self.self_calibration.awaits_search:
+                samples = None
         state = None
         if self._smoother.running:
             state = self._advance(samples, points, velocity)

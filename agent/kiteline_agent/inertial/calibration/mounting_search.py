@@ -75,6 +75,7 @@ class MountingSearch:
         self._config = config
         self._frames = list[tuple[int, F64]]()  # stamps and R_m_b (3,3)
         self._next_ns, self._wait_s = 0, config.every_s  # time of the next search, and from it to the one after
+        self.has_searched = False  # in turns that last long enough
 
     def clear(self) -> None:
         """Begin again after an image loss or in a new map."""
@@ -95,8 +96,6 @@ class MountingSearch:
         config, t_ns = self._config, self._frames[-1][0]
         if t_ns < self._next_ns:
             return None
-        self._next_ns = t_ns + round(1e9 * self._wait_s)
-        self._wait_s = min(config.backoff * self._wait_s, config.seldom_s)
         windows, last = list[tuple[int, int, F64]](), self._frames[0]
         for t_ns, R_m_b in self._frames:
             duration_s = (t_ns - last[0]) * 1e-9
@@ -107,9 +106,13 @@ class MountingSearch:
         if not windows:
             return None
         begin, end, turns = (np.array(column) for column in zip(*windows, strict=True))
-        found = _found(config, _Turns(begin, end, turns, *buffer.samples()), matrix, offset_s)
-        if found is not None:
-            self._wait_s = config.every_s
+        compared = _Turns(begin, end, turns, *buffer.samples())
+        compared.keep_inside(config.most_offset_s)
+        if float(compared.dt_s.sum()) < config.least_s:
+            return None
+        found, self.has_searched = _found(config, compared, matrix, offset_s), True
+        self._next_ns = self._frames[-1][0] + round(1e9 * self._wait_s)
+        self._wait_s = config.every_s if found is not None else min(config.backoff * self._wait_s, config.seldom_s)
         return found
 
 
@@ -139,9 +142,6 @@ class _Turns:
 
 
 def _found(config: MountingSearchConfig, turns: _Turns, matrix: F64, offset_s: float) -> Mounting | None:
-    turns.keep_inside(config.most_offset_s)
-    if float(turns.dt_s.sum()) < config.least_s:
-        return None
     steps = round(config.most_offset_s / config.step_s)
     offsets = np.asarray(config.step_s * np.arange(-steps, steps + 1), np.float64)
     felt, weight, cost = turns.by_gyro(offsets), np.ones(len(turns.dt_s)), np.empty(0)

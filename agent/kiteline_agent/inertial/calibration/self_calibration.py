@@ -172,7 +172,13 @@ class SelfCalibration:
     @property
     def contradicts(self) -> bool:
         """True if images and IMU measure other motions: no error of a calibrated IMU explains that."""
-        return self.gyro.disagreement.contradicts or self.accel.disagreement.contradicts
+        turns, forces = self.gyro.disagreement.contradicts, self.accel.disagreement.contradicts
+        return (turns or forces) and not self.awaits_search
+
+    @property
+    def awaits_search(self) -> bool:
+        """True if turns contradict the calibration so early that another one could not be searched yet."""
+        return self._searches and self.gyro.disagreement.contradicts and not self._mounting.has_searched
 
     def take_events(self) -> list[str]:
         """A line for the log for each sensor whose correction began."""
