@@ -10,7 +10,7 @@ from kiteline_agent.inertial.fixed_lag import BodyVelocity, FixedLagSmoother, In
 from kiteline_agent.inertial.imu_initialisation import ImuInitialiser, InertialStartState, TimedPose
 from kiteline_agent.inertial.inertial_config import InertialConfig, StartDeviations
 from kiteline_agent.inertial.preintegration import BiasPrior, Preintegrated, Samples, preintegrate
-from kiteline_agent.inertial.sample_buffer import SampleBuffer
+from kiteline_agent.inertial.sample_buffer import SampleBuffer, without_held
 from kiteline_agent.inertial.scale_filter import ScaleFilter, camera_scaled
 from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuBatch, ImuCalibration
@@ -199,7 +199,8 @@ class InertialTracker:
                 samples = None
         state = None
         if self._smoother.running:
-            state = self._advance(samples, points, velocity)
+            awaits = self._awaited(samples) is not None
+            state = self._advance(without_held(samples) if samples and awaits else samples, points, velocity)
         self._watch_scale(t_ns, T_m_b_visual, points, state)
         if state is None:
             self._initialiser.add(TimedPose(t_ns, T_m_b_visual.copy(), samples, self._awaited(samples)))

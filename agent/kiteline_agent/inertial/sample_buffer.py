@@ -1,6 +1,7 @@
 """The newest IMU samples, and the noise that they show."""
 
 from copy import copy
+from dataclasses import replace
 
 import numpy as np
 
@@ -19,7 +20,7 @@ _RECENT = 10  # samples whose mean is without vibration
 _EVEN = 1.5  # longest over shortest step of three samples whose second difference is used
 _GAP = 2.5  # of the usual step: a longer one misses samples
 _GAP_GYRO_RAD_S, _GAP_ACCEL_M_S2 = 0.3, 2.0  # error of interpolation over missing samples
-_HELD_GYRO_RAD_S, _HELD_ACCEL_M_S2 = 2.0, 20.0  # error of samples that have not come yet: the images alone count
+_HELD = 2.0, 20.0  # rad/s and m/s^2, error of samples that have not come yet: next to nothing beside images
 _CLIPPED_GYRO_RAD_S, _CLIPPED_ACCEL_M_S2 = 1.0, 10.0  # error of a sample at the end of the range
 _RANGE_GYRO_RAD_S, _RANGE_ACCEL_M_S2 = 2.0, 15.0  # no IMU has a smaller range
 
@@ -140,8 +141,6 @@ class SampleBuffer:
         if missed.any():
             dt_s = steps[missed] * 1e-9
             out[missed] = np.sqrt(out[missed] ** 2 + np.outer(dt_s, [_GAP_GYRO_RAD_S**2, _GAP_ACCEL_M_S2**2]))
-        if missed[-1] and hi == len(self._t):
-            out[-1] = np.sqrt(out[-1] ** 2 + steps[-1] * 1e-9 * np.array([_HELD_GYRO_RAD_S**2, _HELD_ACCEL_M_S2**2]))
         if clipped.any():
             extra = np.array([_CLIPPED_GYRO_RAD_S, _CLIPPED_ACCEL_M_S2]) * clipped.any(axis=0)
             out = np.sqrt(out**2 + np.outer(steps * 1e-9, extra**2))
@@ -179,3 +178,11 @@ class SampleBuffer:
         """Average a variance (2,) of gyro and accelerometer."""
         before = self._variance[scale]
         self._variance[scale] = np.where(found > _ATTACK * before, found, before + share * (found - before))
+
+
+def without_held(samples: Samples) -> Samples:
+    """Samples of which the last step, held as they had not come yet, counts next to nothing."""
+    assert samples.density is not None
+    density = samples.density.copy()
+    density[-1] = np.maximum(density[-1], np.sqrt(samples.t_s[-1] - samples.t_s[-2]) * np.array(_HELD))
+    return replace(samples, density=density)

@@ -40,6 +40,7 @@ class MountingSearchConfig:
     least_rotation_rad: float = 0.025  # smaller ones are left to the filters
     least_scale: float = 0.02  # likewise of the gyro's scale
     least_change_s: float = 0.015  # likewise of the time offset
+    restart_s: float = 0.04  # change of the time offset from which velocity and vertical are found anew
     most_rotation_rad: float = 0.4  # of a mounting; beyond it axes were confused, and nothing else of it is right
     most_scale: float = 0.08  # of the gyro's scale, either way: beyond it the unit is another one, or the clock
 

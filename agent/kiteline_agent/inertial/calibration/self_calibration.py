@@ -295,17 +295,21 @@ class SelfCalibration:
         self._events.append(f"imu: {found}: {_CORRECT}")
 
     def _begin_with_mounting(self, found: Mounting) -> None:
-        axes = found.axes
+        """Begin the gyro's filter anew; all that rests on accelerations too, unless they were corrected so already."""
+        least = self._config.mounting
         change_rad = float(np.linalg.norm(se3.so3_log(found.rotation @ self._accel_matrix.T)))
-        self.turned = change_rad > self._config.mounting.least_rotation_rad
+        self.turned = change_rad > least.least_rotation_rad
+        jumps = abs(found.offset_s - self.offset_s) > least.restart_s
         self.gyro, self._unprimed_gyro = self._unknown_gyro(), None
-        self.gyro.begin_with(axes, self._config.axes_sigma.reshape(3, 3), found.offset_s, found.sigma_s)
+        self.gyro.begin_with(found.axes, self._config.axes_sigma.reshape(3, 3), found.offset_s, found.sigma_s)
         self.gyro.set_bias(found.bias)
-        self._given_axes, self._given_offset_s = axes, found.offset_s
+        self._given_axes, self._given_offset_s = found.axes, found.offset_s
         self.offset_s, self._corrects_offset = found.offset_s, True
-        self._gyro_matrix, self._corrects_gyro = axes, True
-        self._accel_matrix, self._corrects_accel = found.rotation, True
-        self._restart()
+        self._gyro_matrix, self._corrects_gyro = found.axes, True
+        if self.turned:
+            self._accel_matrix, self._corrects_accel = found.rotation, True
+        if self.turned or jumps:
+            self._restart()
 
     def _search_lever(self) -> None:
         """Begin anew with another lever arm where it explains accelerations that the present one does not."""
