@@ -295,11 +295,12 @@ class SelfCalibration:
         self._events.append(f"imu: {found}: {_CORRECT}")
 
     def _begin_with_mounting(self, found: Mounting) -> None:
-        """Begin the gyro's filter anew; all that rests on accelerations too, unless they were corrected so already."""
+        """Begin the gyro's filter anew; after more than a small change of the time offset all that is inertial, too."""
         least = self._config.mounting
         change_rad = float(np.linalg.norm(se3.so3_log(found.rotation @ self._accel_matrix.T)))
         self.turned = change_rad > least.least_rotation_rad
         jumps = abs(found.offset_s - self.offset_s) > least.restart_s
+        jumps |= not np.array_equal(found.axes, self._given_axes)
         self.gyro, self._unprimed_gyro = self._unknown_gyro(), None
         self.gyro.begin_with(found.axes, self._config.axes_sigma.reshape(3, 3), found.offset_s, found.sigma_s)
         self.gyro.set_bias(found.bias)
@@ -308,7 +309,7 @@ class SelfCalibration:
         self._gyro_matrix, self._corrects_gyro = found.axes, True
         if self.turned:
             self._accel_matrix, self._corrects_accel = found.rotation, True
-        if self.turned or jumps:
+        if jumps:
             self._restart()
 
     def _search_lever(self) -> None:
