@@ -86,9 +86,8 @@ class Agent:
         )  # fmt: skip
         self.right_camera = None
         if rig.right is not None:
-            self.right_camera = RightCamera(
-                identity.agent, self._camera, self.map, self._rectifier, config, channel, self.work
-            )  # fmt: skip
+            right = identity.agent, self._camera, self.map, self._rectifier, config, channel, self.work
+            self.right_camera = RightCamera(*right)
         self._corrections = Corrections(
             self.map, self.map_cache, config.smoothing,
             None if self.right_camera is None else self.right_camera.take_base, config.local_grid.tiles,

@@ -74,7 +74,8 @@ class Estimate(_InOdometryFrame):
     m, rad.
     cov_o: (6,6) of T_o_b relative to the start of the flight, [translation in o, rotation about the body's axes].
     R_l_o: (3,3) odometry frame to gravity-aligned frame, constant once it is known; None before, if a flight begins in
-    motion, and from when an IMU is left that never agreed with the images.
+    motion, from when an IMU is left that never agreed with the images, and while it is measured again, because the IMU
+    turned out to be mounted otherwise than the calibration says.
     initialising: there is no map yet, or one whose scale is still to come, and so no pose: T_o_b means nothing.
     """
 

@@ -59,10 +59,10 @@ def flight(
 
 def calibrated(
     f: Flight, config: SelfCalibrationConfig | None = None, turn_map_at: int | None = None,
-    known: KnownImuConfig | None = None, *, metric: bool = True,
+    known: KnownImuConfig | None = None, *, metric: bool = True, p_b_c: F64 = P_B_C,
 ) -> SelfCalibration:  # fmt: skip
-    """A calibration after a flight, in a map that is turned at a frame. known: from earlier flights."""
-    calibration = SelfCalibration(CALIBRATION, config or SelfCalibrationConfig(), P_B_C, 9.81, metric=metric)
+    """A calibration after a flight, in a map that is turned at a frame. known: from earlier flights. p_b_c: told."""
+    calibration = SelfCalibration(CALIBRATION, config or SelfCalibrationConfig(), p_b_c, 9.81, metric=metric)
     if known is not None:
         calibration.begin_with(known)
     buffer, done, moved = SampleBuffer(3.0, 0.2), 0, np.eye(4)

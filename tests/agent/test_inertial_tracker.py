@@ -200,6 +200,19 @@ def test_a_configured_time_offset_holds_and_changes_are_told() -> None:
     assert tracker.take_calibration_events() == []
 
 
+@pytest.mark.parametrize("late_ns", [40_000_000, 100_000_000])
+def test_samples_that_come_late_start_the_state_and_do_no_harm(late_ns: int) -> None:
+    """What has not come yet is held at the last sample: neither a start nor a pose may rest on that."""
+    steps = flight(100, 6, late_ns=late_ns)
+    known = InertialConfig(calibration=SelfCalibrationConfig(offset_s=1e-9 * late_ns))
+    tracker, states = run(steps, config=known)
+    started = [k for k, state in enumerate(states) if state is not None]
+    assert started and started[0] < 40
+    assert max(apart_m(states[k], steps[k].truth) for k in started) < 0.01
+    up = tracker.state
+    assert up is not None and np.linalg.norm(up.tilt) < 0.01
+
+
 def mono_start(tracker: InertialTracker, step: Step, velocity: F64, unit: float) -> F64:
     """Start at a step, in a map of which one unit is `unit` metres. Returns the body's pose there."""
     pose = camera_scaled(step.truth, 1.0 / unit, T_B_C[:3, 3])

@@ -108,7 +108,9 @@ def test_too_few_poses_give_nothing() -> None:
 
 @pytest.mark.parametrize(("rate_hz", "kept"), [(20, 60), (10, 30), (2, 7)])
 def test_the_window_is_as_long_at_any_frame_rate_but_never_too_thin(rate_hz: int, kept: int) -> None:
-    window = ImuInitialiser(InertialConfig(), CALIBRATION, np.zeros(3), cast(SampleBuffer, None))
+    window = ImuInitialiser(
+        InertialConfig(), CALIBRATION, np.zeros(3), cast(SampleBuffer, None), lambda samples: samples
+    )
     for k in range(100):
         window.add(TimedPose(k * 1_000_000_000 // rate_hz, np.eye(4), cast(Samples, object()) if k else None))
     assert len(window._poses) == kept

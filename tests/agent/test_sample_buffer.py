@@ -5,7 +5,7 @@ import pytest
 
 from kiteline_agent.inertial import imu_kernels
 from kiteline_agent.inertial.preintegration import Samples, preintegrate
-from kiteline_agent.inertial.sample_buffer import SampleBuffer
+from kiteline_agent.inertial.sample_buffer import SampleBuffer, without_held
 from kiteline_agent.initialisation.window_noise import vibration
 from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuBatch, ImuCalibration
@@ -157,3 +157,17 @@ def test_intervals_with_few_samples_count_as_the_others() -> None:
 
 def test_motion_without_noise_is_no_vibration() -> None:
     assert vibration(intervals([0.0] * 3)).density < 1e-4
+
+
+def test_samples_that_have_not_come_are_told_and_hardly_count() -> None:
+    gyro, accel = lively(100)
+    buffer = filled(gyro, accel)
+    newest = 99 * STEP_NS
+    assert not buffer.lacks(newest + 5 * STEP_NS) and buffer.lacks(newest + 6 * STEP_NS)
+    near, far = interval(buffer, 90, 101), interval(buffer, 90, 109)
+    assert near.density is not None and near.density.max() < 0.01
+    held = without_held(far)
+    assert held.density is not None and held.density[:-1].max() < 0.01
+    lasting_s = far.t_s[-1] - far.t_s[-2]
+    np.testing.assert_allclose(held.density[-1], np.sqrt(lasting_s) * np.array([2.0, 20.0]))
+    assert SampleBuffer(3.0, 0.2).lacks(0)

@@ -72,6 +72,15 @@ IN_A_FAST_FLIGHT: dict[str, Callable[[RoomFlight], RoomFlight]] = {
 }
 
 
+FOUND: dict[str, Callable[[RoomFlight], RoomFlight]] = {
+    "camera turned by 5 degrees": lambda flight: turned(flight, 2, 5.0),
+    "camera turned by 15 degrees": lambda flight: turned(flight, 0, 15.0),
+    "0.1 s late": lambda flight: late(flight, 100_000_000),
+    "0.1 s early": lambda flight: late(flight, -100_000_000),
+    "turned by 6 degrees, 40 ms late": lambda flight: turned(late(flight, 40_000_000), 1, 6.0),
+}
+
+
 @pytest.fixture(scope="module")
 def fast_flight(data_dir: Path) -> RoomFlight:
     """5 s of a recording with fast turns."""
@@ -101,6 +110,20 @@ def test_the_images_alone_carry_the_pose(room_flight: RoomFlight, what: str) -> 
 @pytest.mark.parametrize("what", IN_A_FAST_FLIGHT)
 def test_the_images_alone_carry_the_pose_of_a_fast_flight(fast_flight: RoomFlight, what: str) -> None:
     assert_images_alone(*fly(IN_A_FAST_FLIGHT[what](fast_flight), fast_flight.rig.T_b_c))
+
+
+@pytest.mark.parametrize("what", FOUND)
+def test_a_calibration_that_can_be_estimated_is_found_and_used(fast_flight: RoomFlight, what: str) -> None:
+    """Where it is believed as told, or the IMU is left, the pose errs by up to decimetres or the vertical is lost."""
+    found, events, worst_m = fly(FOUND[what](fast_flight), fast_flight.rig.T_b_c)
+    assert any("used from now on" in event for event in events)
+    assert not any("contradicts the images" in event for event in events)
+    assert worst_m < 0.05 and all(estimate.tracked for estimate in found)
+    flown, last = FOUND[what](fast_flight), found[-1]
+    assert last.R_l_o is not None
+    up = (last.R_l_o @ last.T_o_b[:3, :3] @ flown.rig.T_b_c[:3, :3])[2]
+    true_up = (fast_flight.truth[-1, :3, :3] @ fast_flight.rig.T_b_c[:3, :3])[2]
+    assert np.degrees(np.arccos(up @ true_up)) < 2.0, "a flight controller flies by this vertical"
 
 
 def assert_images_alone(found: list[Estimate], events: list[str], worst_m: float) -> None:

@@ -64,16 +64,22 @@ class GravityAligner:
         self._patience_ns = round(1e9 * patience_s)
         self._began_ns: int | None = None
         self._R_l_o: F64 | None = None if inertial is not None else np.eye(3)
+        self._renewed = False
         self.tilt_rad = 0.0  # of the first submap
 
     @property
     def R_l_o(self) -> F64 | None:
-        """(3,3) that gravity-aligns the odometry frame, constant once known; None before."""
+        """(3,3) that gravity-aligns the odometry frame; None before. Constant, but for `renew`."""
         return self._R_l_o
 
     def forget(self) -> None:
         """The vertical came from an IMU that contradicts the images: it is not known in this flight."""
         self._inertial, self._R_l_o = None, None
+
+    def renew(self) -> None:
+        """The IMU is mounted otherwise than the calibration says, and so was the vertical: it is measured again."""
+        if self._inertial is not None:
+            self._R_l_o, self._renewed = None, True
 
     def ignore_imu(self) -> None:
         """Go on as without an IMU, for a camera that was level when the flight began."""
@@ -98,12 +104,12 @@ class GravityAligner:
             self._began_ns = t_ns
         R_l_m = self._inertial.gravity_rotation()
         if R_l_m is None:
-            if t_ns - self._began_ns > self._patience_ns:
+            if t_ns - self._began_ns > self._patience_ns and not self._renewed:
                 self._R_l_o = np.eye(3)
             return None
         self._R_l_o = level_rotation(R_o_m @ R_l_m[2])
         self.tilt_rad = float(np.linalg.norm(se3.so3_log(R_l_m)))
-        if not first or self.tilt_rad < self._min_tilt_rad:
+        if not first or self._renewed or self.tilt_rad < self._min_tilt_rad:
             return None
         # Rotate about the vehicle, so that its position in the world does not jump.
         here = T_m_b[:3, 3]

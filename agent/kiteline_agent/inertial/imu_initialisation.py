@@ -20,11 +20,15 @@ _REST_SAMPLES = 20
 
 @dataclass(frozen=True, slots=True)
 class TimedPose:
-    """T_m_b (4,4) at t_ns, and the IMU samples since the pose before (None for the first one)."""
+    """T_m_b (4,4) at t_ns, and the IMU samples since the pose before (None for the first one).
+
+    awaited: begin and end, IMU time, of the samples if the last of them had not come: an IMU whose stamps are late.
+    """
 
     t_ns: int
     T_m_b: F64
     samples: Samples | None
+    awaited: tuple[int, int] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,12 +50,16 @@ class InertialStartState:
 class ImuInitialiser:
     """Window of poses by images, from which gravity, velocity, biases and scale are estimated."""
 
-    def __init__(self, config: InertialConfig, calibration: ImuCalibration, p_b_c: F64, buffer: SampleBuffer) -> None:
-        """p_b_c: (3,) m, camera in the body."""
+    def __init__(
+        self, config: InertialConfig, calibration: ImuCalibration, p_b_c: F64, buffer: SampleBuffer,
+        correct: Callable[[Samples], Samples],
+    ) -> None:  # fmt: skip
+        """p_b_c: (3,) m, camera in the body. correct: samples as the flight has calibrated them."""
         self._config = config
         self._calibration = calibration
         self._p_b_c = p_b_c
         self._buffer = buffer
+        self._correct = correct
         self._poses: list[TimedPose] = []
 
     def clear(self) -> None:
@@ -63,8 +71,15 @@ class ImuInitialiser:
         if pose.samples is None:
             self._poses = []
         self._poses.append(pose)
+        self._poses = [self._completed(p) for p in self._poses]
         recent = sum((pose.t_ns - p.t_ns) * 1e-9 <= self._config.window_s for p in self._poses)
         del self._poses[: -max(recent, self._config.motion_frames)]
+
+    def _completed(self, pose: TimedPose) -> TimedPose:
+        if pose.awaited is None or self._buffer.lacks(pose.awaited[1]):
+            return pose
+        samples = self._buffer.between(*pose.awaited)
+        return pose if samples is None else replace(pose, samples=self._correct(samples), awaited=None)
 
     def transform(self, function: Callable[[F64], F64]) -> None:
         """Replace every pose T_m_b by function(T_m_b)."""
@@ -114,8 +129,9 @@ class ImuInitialiser:
             return False
         if abs(np.linalg.norm(mean[3:]) - config.gravity_m_s2) > 0.1 * config.gravity_m_s2:
             return False
-        bias = np.concatenate([mean[:3], bias[3:]])
-        gravity = -last.T_m_b[:3, :3] @ (mean[3:] - bias[3:])
+        still = self._correct(Samples(np.array([0.0, 1.0]), np.tile(mean[:3], (2, 1)), np.tile(mean[3:], (2, 1))))
+        bias = np.concatenate([still.gyro[0], bias[3:]])
+        gravity = -last.T_m_b[:3, :3] @ (still.accel[0] - bias[3:])
         deviations = StartDeviations(velocity_m_s=0.02, gyro_bias_rad_s=0.002)
         smoother.start(last.T_m_b, np.zeros(3), bias, gravity, deviations)
         return True
@@ -129,14 +145,15 @@ class ImuInitialiser:
         if found is None or found.residual_m > config.max_residual_m or found.gravity_error > config.max_gravity_error:
             return False
         bias[3:] = found.accel_bias
-        smoother.start(last.T_m_b, found.velocities[-1], bias, found.gravity, StartDeviations())
+        velocity = found.velocities[-1] if last.awaited is None else self.velocity()
+        smoother.start(last.T_m_b, velocity, bias, found.gravity, StartDeviations())
         return True
 
     def _span_s(self) -> float:
         return (self._poses[-1].t_ns - self._poses[0].t_ns) * 1e-9
 
     def _window(self, most: int, bias: F64) -> tuple[F64, list[Preintegrated]]:
-        """The newest poses (n,4,4), and the motions between them."""
-        poses = self._poses[-most:]
+        """The newest poses (n,4,4) whose samples have come, and the motions between them."""
+        poses = [pose for pose in self._poses[-most:] if pose.awaited is None]
         motions = [preintegrate(p.samples, bias, self._calibration) for p in poses[1:] if p.samples is not None]
         return np.array([p.T_m_b for p in poses]), motions

@@ -10,7 +10,7 @@ from kiteline_agent.inertial.fixed_lag import BodyVelocity, FixedLagSmoother, In
 from kiteline_agent.inertial.imu_initialisation import ImuInitialiser, InertialStartState, TimedPose
 from kiteline_agent.inertial.inertial_config import InertialConfig, StartDeviations
 from kiteline_agent.inertial.preintegration import BiasPrior, Preintegrated, Samples, preintegrate
-from kiteline_agent.inertial.sample_buffer import SampleBuffer
+from kiteline_agent.inertial.sample_buffer import SampleBuffer, without_held
 from kiteline_agent.inertial.scale_filter import ScaleFilter, camera_scaled
 from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuBatch, ImuCalibration
@@ -54,9 +54,11 @@ class InertialTracker:
         self._p_b_c = camera.T_b_c[:3, 3].copy()
         self._buffer = SampleBuffer(3.0, config.max_gap_s)
         self._smoother = FixedLagSmoother(camera, calibration, config.smoother, config.gravity_m_s2)
-        self._initialiser = ImuInitialiser(config, calibration, self._p_b_c, self._buffer)
         self.self_calibration = SelfCalibration(
             calibration, config.calibration, self._p_b_c, config.gravity_m_s2, metric=metric
+        )
+        self._initialiser = ImuInitialiser(
+            config, calibration, self._p_b_c, self._buffer, self.self_calibration.correct
         )
         self._reported_s = config.calibration.offset_s
         self._scale = ScaleFilter(config.scale_filter, calibration, config.gravity_m_s2, self._p_b_c)
@@ -142,7 +144,7 @@ class InertialTracker:
         """Buffer samples and predict the body at t_ns; None without samples or a previous pose."""
         self._buffer.push(imu)
         samples = self._interval(t_ns)
-        if self._last is None or samples is None:
+        if self._last is None or samples is None or self.self_calibration.awaits_search:
             return None
         last_ns, last_T_m_b = self._last
         if self._smoother.running:
@@ -191,12 +193,17 @@ class InertialTracker:
         samples = self._interval(t_ns)
         if samples is not None:
             self._calibrate(t_ns, T_m_b_visual, samples.duration_s)
+            if self.self_calibration.awaits_search:
+                self._smoother.stop()
+            if self.self_calibration.restarted or self.self_calibration.awaits_search:
+                samples = None
         state = None
         if self._smoother.running:
-            state = self._advance(samples, points, velocity)
+            awaits = self._awaited(samples) is not None
+            state = self._advance(without_held(samples) if samples and awaits else samples, points, velocity)
         self._watch_scale(t_ns, T_m_b_visual, points, state)
         if state is None:
-            self._initialiser.add(TimedPose(t_ns, T_m_b_visual.copy(), samples))
+            self._initialiser.add(TimedPose(t_ns, T_m_b_visual.copy(), samples, self._awaited(samples)))
             self._set_last(t_ns, T_m_b_visual)
             if self.metric:
                 self.started = self._initialiser.start(self._smoother, self._bias) or self.started
@@ -312,6 +319,13 @@ class InertialTracker:
         begin = self._interval_end_ns if self._interval_end_ns else self._last[0] + self._offset_ns
         return self._between(begin, t_ns + self._offset_ns)
 
+    def _awaited(self, samples: Samples | None) -> tuple[int, int] | None:
+        """Begin and end of the last interval, IMU time, if its last samples have not come yet."""
+        if samples is None:
+            return None
+        end_ns = self._interval_end_ns + round(samples.duration_s * 1e9)
+        return (self._interval_end_ns, end_ns) if self._buffer.lacks(end_ns) else None
+
     def samples_between(self, from_ns: int, to_ns: int) -> Samples | None:
         """Corrected samples between two camera stamps; None with a gap."""
         return self._between(from_ns + self._offset_ns, to_ns + self._offset_ns)
@@ -376,6 +390,11 @@ class InertialTracker:
         gravity = self._smoother.gravity if self._smoother.running and self._images_have_scale else None
         self.self_calibration.add(t_ns, T_m_b_visual)
         change = self.self_calibration.update(self._buffer, gravity, dt_s)
-        if change.any():
+        if self.self_calibration.restarted:
+            self._smoother.stop()
+            self._initialiser.clear()
+            self._bias = np.concatenate([self.self_calibration.gyro.bias, np.zeros(3)])
+            self._cached = self._incomplete = None
+        elif change.any():
             self._bias = np.concatenate([self._bias[:3], self._bias[3:] + change])
             self._smoother.shift_accel_bias(change)

@@ -1,6 +1,7 @@
 """The newest IMU samples, and the noise that they show."""
 
 from copy import copy
+from dataclasses import replace
 
 import numpy as np
 
@@ -19,6 +20,8 @@ _RECENT = 10  # samples whose mean is without vibration
 _EVEN = 1.5  # longest over shortest step of three samples whose second difference is used
 _GAP = 2.5  # of the usual step: a longer one misses samples
 _GAP_GYRO_RAD_S, _GAP_ACCEL_M_S2 = 0.3, 2.0  # error of interpolation over missing samples
+_HELD_NS = 25_000_000  # for which the newest sample may stand in for those that have not come yet
+_HELD = 2.0, 20.0  # rad/s and m/s^2, error of samples that have not come yet: next to nothing beside images
 _CLIPPED_GYRO_RAD_S, _CLIPPED_ACCEL_M_S2 = 1.0, 10.0  # error of a sample at the end of the range
 _RANGE_GYRO_RAD_S, _RANGE_ACCEL_M_S2 = 2.0, 15.0  # no IMU has a smaller range
 
@@ -87,6 +90,10 @@ class SampleBuffer:
         """Measured noise density (2,) of gyro (rad/s/sqrt(Hz)) and accelerometer (m/s^2/sqrt(Hz))."""
         return np.asarray(np.sqrt(self._variance.min(axis=0) * (self._step_ns or 0.0) * 1e-9))
 
+    def lacks(self, to_ns: int) -> bool:
+        """True if samples before an instant have not come yet; what `between` gives in their place is a guess."""
+        return len(self._t) == 0 or to_ns - int(self._t[-1]) > _HELD_NS
+
     def between(self, from_ns: int, to_ns: int) -> Samples | None:
         """Samples from one instant to another, ends interpolated (held beyond the newest); None with a gap."""
         t = self._t
@@ -113,6 +120,10 @@ class SampleBuffer:
         """The samples (n,6) between two instants."""
         first, last = self._t.searchsorted(from_ns, "left"), self._t.searchsorted(to_ns, "right")
         return self._values[first:last]
+
+    def samples(self) -> tuple[I64, F64]:
+        """Stamps (n,) of all samples, and the samples (n,6)."""
+        return self._t, self._values
 
     def _at(self, t_ns: int) -> F64:
         t = self._t
@@ -168,3 +179,11 @@ class SampleBuffer:
         """Average a variance (2,) of gyro and accelerometer."""
         before = self._variance[scale]
         self._variance[scale] = np.where(found > _ATTACK * before, found, before + share * (found - before))
+
+
+def without_held(samples: Samples) -> Samples:
+    """Samples of which the last step, held as they had not come yet, counts next to nothing."""
+    assert samples.density is not None
+    density = samples.density.copy()
+    density[-1] = np.maximum(density[-1], np.sqrt(samples.t_s[-1] - samples.t_s[-2]) * np.array(_HELD))
+    return replace(samples, density=density)

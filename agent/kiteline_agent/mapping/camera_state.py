@@ -73,6 +73,8 @@ class CameraState:
         fused = self.motion.fuse(track, ctx.t_ns)
         if self.motion.has_false_vertical:
             self.gravity.forget()
+        elif self.motion.has_turned_imu:
+            self.gravity.renew()
         if self.motion.tracker is not None:
             self.covariance.update_imu_offset(track.T_c_m, fused.T_c_m)
             self.covariance.set_camera_rotation(self.motion.tracker.self_calibration.camera_rotation_rad)

@@ -90,6 +90,11 @@ class MotionModel:
         """True if lengths are not in metres yet, but the odometer may still give the scale."""
         return not self.metric and self.odometer.awaits_scale
 
+    @property
+    def has_turned_imu(self) -> bool:
+        """True after a frame by which the IMU turned out to be mounted otherwise than the calibration says."""
+        return self.tracker is not None and self.tracker.self_calibration.turned
+
     def known_imu(self) -> KnownImuConfig | None:
         """What is known of the IMU, for the next flight; None before anything was measured."""
         return None if self.tracker is None else self.tracker.self_calibration.known()

@@ -2,10 +2,10 @@
 
 The real samples fly with pairs that are rendered along a spline through the drone's true poses, which is a few
 millimetres off: that tells whether the IMU is believed, not what it gains. Wrong IMUs are those of `room_flight` with
-the mistakes that users make.
+the mistakes that users make. Calibrations that are off by what can be estimated in flight are told of both.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -22,22 +22,31 @@ from kiteline_lab.evaluation.metrics import TrajectoryAlignment
 
 _REAL, _PATH, _SEED, _SECONDS = "euroc_mh01_air", "MH_01_easy.txt", 61, 30.0
 _STARTS_S = (0.0, 3.0, 6.0, 9.0, 12.0)
+_REAL_SECONDS, _REAL_STARTS_S = 15.0, (0.0, 9.0)
 _ROOM, _ROOM_SECONDS, _ROOM_STARTS_S = "room_flight.mcap", 10.0, (0.0, 4.0, 8.0)
 _TIMES, _LEAST_M = 2.0, 0.02  # times the error of the images alone, or m, whichever is larger
 _SECOND_NS = 1e9
 
 
 def run(bench: Bench) -> list[Bar]:
-    """Errors with the real IMU over those without one, and errors with wrong IMUs."""
-    return [*_real(bench), *_wrong(bench)]
+    """Errors with the real IMU over those without one, and errors with wrong IMUs and calibrations."""
+    recording, room = _with_real_imu(bench), load(bench.source(_ROOM))
+    room_starts = [(s, s + _ROOM_SECONDS) for s in bench.chosen(_ROOM_STARTS_S)]
+    real_starts = [(s, s + _REAL_SECONDS) for s in bench.chosen(_REAL_STARTS_S)]
+    return [
+        *_real(bench, recording),
+        *_wrong(bench, "wrong IMU", f"Wrong IMUs, {_ROOM}", room, room_starts, _WRONG),
+        *_wrong(bench, "wrong calibration", f"Wrong calibrations, {_ROOM}", room, room_starts, _CALIBRATIONS),
+        *_wrong(bench, "wrong calibration of the real IMU", f"Wrong calibrations, real IMU of {_REAL}", recording,
+                real_starts, _CALIBRATIONS),
+    ]  # fmt: skip
 
 
 # the real IMU
 
 
-def _real(bench: Bench) -> list[Bar]:
+def _real(bench: Bench, recording: Recording) -> list[Bar]:
     rows = []
-    recording = _with_real_imu(bench)
     for start_s in bench.chosen(_STARTS_S):
         part = recording.seconds(start_s, np.inf)
         alone = flown(bench, f"real IMU from {start_s:g} s, images alone", part.without_imu(), base=False)
@@ -67,14 +76,17 @@ def _with_real_imu(bench: Bench) -> Recording:
 _Change = Callable[[Recording], Recording]
 
 
-def _wrong(bench: Bench) -> list[Bar]:
+def _wrong(
+    bench: Bench, what: str, title: str, whole: Recording, parts: Sequence[tuple[float, float]],
+    changes: Mapping[str, _Change],
+) -> list[Bar]:  # fmt: skip
+    """Errors of parts of a flight, from and to s, with what is changed in each. what: names the bars."""
     rows, over, kept = [], [], 0
-    whole = load(bench.source(_ROOM))
-    for start_s in bench.chosen(_ROOM_STARTS_S):
-        part = whole.seconds(start_s, start_s + _ROOM_SECONDS)
-        alone_m = _camera_ate_m(flown(bench, f"wrong IMUs from {start_s:g} s, images alone", part.without_imu(),
+    for start_s, end_s in parts:
+        part = whole.seconds(start_s, end_s)
+        alone_m = _camera_ate_m(flown(bench, f"{what} from {start_s:g} s, images alone", part.without_imu(),
                                       base=False), part, part)  # fmt: skip
-        for name, change in _WRONG.items():
+        for name, change in changes.items():
             told = change(part)
             flight = flown(bench, f"  {name}", told, base=False)
             error_m = _camera_ate_m(flight, told, part)
@@ -82,11 +94,9 @@ def _wrong(bench: Bench) -> list[Bar]:
             over.append(error_m / max(_TIMES * alone_m, _LEAST_M))
             kept += not _left(flight)
     columns = ("start s", "what is wrong", "images alone", "with it", "the IMU was left")
-    table(bench, f"Wrong IMUs, {_ROOM}, ATE of the camera in mm", columns, rows)
-    bench.more.append(
-        f"{kept} of {len(rows)} flights keep such an IMU: the smoother had refused it, or it did no harm."
-    )
-    return spread(f"wrong IMU: ATE over the larger of {_TIMES:g} x images alone and {_LEAST_M:g} m", over, 1.0, "", 2)
+    table(bench, f"{title}, ATE of the camera in mm", columns, rows)
+    bench.more.append(f"{kept} of {len(rows)} flights keep such an IMU: calibrated in flight, or it did no harm.")
+    return spread(f"{what}: ATE over the larger of {_TIMES:g} x images alone and {_LEAST_M:g} m", over, 1.0, "", 2)
 
 
 def _left(flight: Flown) -> bool:
@@ -112,6 +122,12 @@ def _turned(axis: int, degrees: float) -> _Change:
     return lambda flight: _placed(flight, turn @ flight.rig.T_b_c)
 
 
+def _moved(*metres: float) -> _Change:
+    """The camera is said to be elsewhere in the axes of the IMU."""
+    shift = se3.from_rt(np.eye(3), np.array(metres))
+    return lambda flight: _placed(flight, shift @ flight.rig.T_b_c)
+
+
 def _placed(flight: Recording, T_b_c: F64) -> Recording:
     return replace(flight, rig=replace(flight.rig, T_b_c=T_b_c))
 
@@ -127,6 +143,10 @@ def _sampled(flight: Recording, change: Callable[[ImuBatch], ImuBatch]) -> Recor
     samples = joined([item.imu for item in flight.items if item.imu is not None])
     assert samples is not None
     return flight.with_imu(change(samples))
+
+
+def _late(ms: int) -> _Change:
+    return lambda flight: _sampled(flight, lambda s: replace(s, t_ns=s.t_ns + 1_000_000 * ms))
 
 
 def _slow_clock(flight: Recording) -> Recording:
@@ -148,6 +168,22 @@ _WRONG: dict[str, _Change] = {
     "forces of the other sign": _measuring(_ONE, -_ONE, _NONE),
     "an accelerometer that stands still": _measuring(_ONE, _NONE, np.array([9.81, 0.0, 0.0])),
     "an accelerometer that gives zeros": _measuring(_ONE, _NONE, _NONE),
-    "samples 0.2 s early": lambda flight: _sampled(flight, lambda s: replace(s, t_ns=s.t_ns - 200_000_000)),
+    "samples 0.2 s early": _late(-200),
     "a clock that is a fifth too slow": _slow_clock,
+}
+
+_CALIBRATIONS: dict[str, _Change] = {
+    "camera turned by 3 degrees": _turned(1, 3.0),
+    "camera turned by 5 degrees": _turned(2, 5.0),
+    "camera turned by 10 degrees": _turned(0, 10.0),
+    "lever arm off by 0.3 m": _moved(0.3, 0.0, 0.0),
+    "lever arm off by 0.5 m": _moved(0.0, -0.3, 0.4),
+    "samples 50 ms late": _late(50),
+    "samples 100 ms late": _late(100),
+    "samples 100 ms early": _late(-100),
+    "gyro 3 % too large": _measuring(1.03 * _ONE, _ONE, _NONE),
+    "accelerometer 3 % too large": _measuring(_ONE, 1.03 * _ONE, _NONE),
+    "turned by 6 degrees, 40 ms late, lever off by 0.2 m": lambda flight: _turned(1, 6.0)(
+        _late(40)(_moved(0.0, 0.2, 0.0)(flight))
+    ),
 }

@@ -3,6 +3,7 @@
 import numpy as np
 
 from kiteline_agent.inertial.calibration.disagreement import Disagreement
+from kiteline_agent.inertial.calibration.lever_search import LeverSearch
 from kiteline_agent.inertial.calibration.robust_update import AxesFilter, robust_update
 from kiteline_agent.inertial.calibration.window import Window
 from kiteline_core.arrays import F64
@@ -67,10 +68,14 @@ class AccelCalibration(AxesFilter):
             self._cov[_TILT, :] = R_new_old @ self._cov[_TILT, :]
             self._cov[:, _TILT] = self._cov[:, _TILT] @ R_new_old.T
 
-    def add(self, windows: tuple[Window, Window], T_m_b: tuple[F64, F64, F64], p_b_c: F64, variance: float) -> None:
+    def add(
+        self, windows: tuple[Window, Window], T_m_b: tuple[F64, F64, F64], p_b_c: F64, variance: float,
+        search: LeverSearch,
+    ) -> None:  # fmt: skip
         """Add two windows with the poses (4,4) at their ends.
 
         p_b_c: (3,) m, camera in the body. variance: (m/s)^2 of the change of velocity, of images and IMU.
+        search: gets the same windows.
         """
         if self._gravity is None:
             return
@@ -80,12 +85,14 @@ class AccelCalibration(AxesFilter):
         dt = first.duration_s, second.duration_s
         moved = (camera[2] - camera[1]) / dt[1] - (camera[1] - camera[0]) / dt[0]
         lever = (r[2] - r[1]) @ p_b_c / dt[1] - (r[1] - r[0]) @ p_b_c / dt[0]
+        by_lever = (r[2] - r[1]) / dt[1] - (r[1] - r[0]) / dt[0]
         force = r[0] @ first.by_force[1] + r[1] @ (second.by_force[0] - second.by_force[1])
         time = r[0] @ first.time[1] + r[1] @ (second.time[0] - second.time[1])
         fallen = 0.5 * (dt[0] + dt[1]) * self._gravity
         x = self._x
         error = (1.0 + x[_SCALE]) * moved - lever - fallen - force @ self.matrix.ravel() + time @ x[_BIAS]
         self.disagreement.add(moved, error, variance, dt[1])
+        search.add(by_lever, 0.5 * (dt[0] + dt[1]), -time, moved - lever - force @ self.matrix.ravel(), dt[1])
         j = np.empty((3, 16))  # of the negative error
         j[:, _AXES], j[:, _BIAS], j[:, _TILT], j[:, _SCALE] = force, -time, -se3.skew(fallen), -moved
         self._cov[np.diag_indices(16)] += self._walk * dt[1]

@@ -40,6 +40,10 @@ class GyroCalibration(AxesFilter):
         sigma = np.concatenate([axes_sigma.ravel(), [offset_sigma_s]])
         self._cov[:10, :10] = np.diag(np.minimum(sigma**2, np.diag(self._cov)[:10]))
 
+    def set_bias(self, bias: F64) -> None:
+        """Begin with a bias (3,) rad/s."""
+        self._x[_BIAS] = bias
+
     @property
     def offset_s(self) -> float:
         """Camera stamp + offset = IMU time."""

@@ -4,15 +4,18 @@ Filters beside the smoother, at a few updates a second: these values change slow
 the filters contradict that significantly; then their estimates correct the samples.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from kiteline_agent.inertial.calibration.accel_calibration import AccelCalibration
+from kiteline_agent.inertial.calibration.axes_report import axes_report, correction_event, measured_rotation
 from kiteline_agent.inertial.calibration.disagreement import Disagreement
 from kiteline_agent.inertial.calibration.gyro_calibration import GyroCalibration
 from kiteline_agent.inertial.calibration.known_imu import KnownImuConfig, is_plausible, known_axes
+from kiteline_agent.inertial.calibration.lever_search import LeverSearch, LeverSearchConfig
+from kiteline_agent.inertial.calibration.mounting_search import Mounting, MountingSearch, MountingSearchConfig
 from kiteline_agent.inertial.calibration.pose_chain import Link, PoseChain
 from kiteline_agent.inertial.calibration.turn_scatter import added_variance
 from kiteline_agent.inertial.calibration.window import Window
@@ -27,6 +30,7 @@ from kiteline_core.geometry import se3
 # reach 0.001 and 0.08; a camera turned by 20 degrees 0.04, a dead accelerometer 0.3.
 _TURNS_COMPARED = 1.5, 0.03, 0.03, 0.4
 _FORCES_COMPARED = 3.0, 0.3, 0.25, 1.0
+_CORRECT = "used from now on, correct the calibration (T_BS, time offset)"
 _KEPT = 0.25  # share of a window's added variance that the next has at least: the map that was dragged is still seen
 
 
@@ -54,6 +58,8 @@ class SelfCalibrationConfig:
     refuted: float = 5.0  # log likelihood of an unknown IMU over that of earlier flights, from which those are dropped
     apply_axes: bool = True  # False: axes are only estimated
     apply_offset: bool = True  # False: only the configured offset is used
+    mounting: MountingSearchConfig = field(default_factory=MountingSearchConfig)
+    lever: LeverSearchConfig = field(default_factory=LeverSearchConfig)
 
     @property
     def axes_sigma(self) -> F64:
@@ -71,6 +77,7 @@ class SelfCalibration:
     ) -> None:  # fmt: skip
         """p_b_c: (3,) m, camera in the body. metric: images alone measure in metres."""
         self._metric = metric
+        self._searches = metric and config.apply_axes and config.apply_offset
         self._calibration, self._config, self._p_b_c = calibration, config, p_b_c
         self._gravity_m_s2 = gravity_m_s2
         self.gyro, self.accel = self._unknown_gyro(), self._unknown_accel()
@@ -78,6 +85,11 @@ class SelfCalibration:
         self._earlier = KnownImuConfig()  # what earlier flights found
         self._turns = PoseChain(config.turn_window_s)
         self._moves = PoseChain(config.move_window_s)
+        self._mounting, self._lever = MountingSearch(config.mounting), LeverSearch(config.lever)
+        self._given_axes, self._given_offset_s = np.eye(3), config.offset_s  # with which the filters began
+        self._lever_m = np.zeros(3)  # origin of the body, as the calibration places it, in the IMU
+        self.restarted = False  # True after an `update` that found a calibration: what was integrated before is void
+        self.turned = False  # True after one that found a rotation: so is the vertical
         self._before: tuple[Window, Link, float, float] | None = None  # last window of moves: density, `_unsteady`
         self._added = 0.0  # rad^2, of the rotation by images in the last window of turns, beside turn_sigma_rad
         self._unsteady = 1.0  # factor on the variance of poses by images, since the last window of moves
@@ -112,6 +124,7 @@ class SelfCalibration:
                 np.reshape(known.gyro, (3, 3)), np.hypot(known.gyro_sigma, config.kept_axes_sigma),
                 offset_s, float(np.hypot(offset_sigma_s, config.kept_offset_sigma_s)),
             )  # fmt: skip
+            self._given_axes, self._given_offset_s = self.gyro.matrix, offset_s
             self._follow_offset(np.inf)
             self._gyro_windows = config.significant_windows  # they were, in flight
             self._test_gyro()
@@ -135,9 +148,13 @@ class SelfCalibration:
         return replace(out, accel=axes, accel_sigma=sigma)
 
     def correct(self, samples: Samples) -> Samples:
-        """Samples with the applied scales and axes."""
+        """Samples with the applied scales and axes, as the body's origin feels them."""
         gyro = samples.gyro @ self._gyro_matrix.T if self._corrects_gyro else samples.gyro
         accel = samples.accel @ self._accel_matrix.T if self._corrects_accel else samples.accel
+        if self._lever_m.any():
+            rate = gyro - self.gyro.bias
+            speed = np.cross(rate, self._lever_m)
+            accel = accel + np.gradient(speed, samples.t_s, axis=0) + np.cross(rate, speed)
         return Samples(samples.t_s, gyro, accel, samples.density)
 
     def report(self) -> dict[str, Any]:
@@ -146,16 +163,22 @@ class SelfCalibration:
         camera_rotation_deg: (3,) rotation vector of the gyro's axes against those of the body, degrees.
         """
         return {
-            "gyro": _axes_report(self.gyro.matrix, self.gyro.axes_cov, applied=self._corrects_gyro),
-            "accel": _axes_report(self.accel.matrix, self.accel.axes_cov, applied=self._corrects_accel),
-            "camera_rotation_deg": np.degrees(_measured(self.gyro.matrix)[1]).round(3).tolist(),
+            "gyro": axes_report(self.gyro.matrix, self.gyro.axes_cov, applied=self._corrects_gyro),
+            "accel": axes_report(self.accel.matrix, self.accel.axes_cov, applied=self._corrects_accel),
+            "camera_rotation_deg": np.degrees(measured_rotation(self.gyro.matrix)[1]).round(3).tolist(),
             "image_scale": [round(value, 5) for value in self.accel.scale],
         }
 
     @property
     def contradicts(self) -> bool:
         """True if images and IMU measure other motions: no error of a calibrated IMU explains that."""
-        return self.gyro.disagreement.contradicts or self.accel.disagreement.contradicts
+        turns, forces = self.gyro.disagreement.contradicts, self.accel.disagreement.contradicts
+        return (turns or forces) and not self.awaits_search
+
+    @property
+    def awaits_search(self) -> bool:
+        """True if turns contradict the calibration so early that another one could not be searched yet."""
+        return self._searches and self.gyro.disagreement.contradicts and not self._mounting.has_searched
 
     def take_events(self) -> list[str]:
         """A line for the log for each sensor whose correction began."""
@@ -165,17 +188,20 @@ class SelfCalibration:
     def add(self, t_ns: int, T_m_b: F64) -> None:
         """Append the pose T_m_b (4,4) of a frame, by images alone."""
         self._turns.add(t_ns, T_m_b)
-        self._moves.add(t_ns, T_m_b)
+        self._moves.add(t_ns, se3.from_rt(T_m_b[:3, :3], T_m_b[:3, 3] - T_m_b[:3, :3] @ self._lever_m))
+        self._mounting.add(t_ns, T_m_b[:3, :3])
 
     def clear(self) -> None:
         """Begin new windows after an image loss."""
         self._turns.clear()
         self._moves.clear()
+        self._mounting.clear()
         self._before = None
 
     def begin_map(self) -> None:
         """Begin new windows in a new map, whose vertical is unknown."""
         self.clear()
+        self._lever.clear()
         self.accel.set_vertical(None)
 
     def move_map(self, T_new_old: F64) -> None:
@@ -183,7 +209,8 @@ class SelfCalibration:
         self._turns.move_map(T_new_old)
         self._moves.move_map(T_new_old)
         self._before = None
-        self.accel.rotate_map(T_new_old[:3, :3])
+        for rotated in (self.accel, self._mounting, self._lever):
+            rotated.rotate_map(T_new_old[:3, :3])
 
     def update(self, buffer: SampleBuffer, gravity: F64 | None, dt_s: float) -> F64:
         """Add windows that are complete, and let the applied values follow the estimates.
@@ -191,6 +218,7 @@ class SelfCalibration:
         gravity: (3,) in m as the smoother knows it; None: unknown. dt_s: since the last call. Returns the change (3,)
         of the corrected accelerometer bias, m/s^2, that the change of its axes entails.
         """
+        self.restarted = self.turned = False
         turn = self._turns.take(buffer, self.gyro.offset_s)
         if isinstance(turn, Link):
             offset_s, density = self.gyro.offset_s, float(self._density(turn)[0])
@@ -206,6 +234,9 @@ class SelfCalibration:
                     gyro.add(window, turn.T_m_b0[:3, :3].T @ turn.T_m_b1[:3, :3], variance, offset_s)
             self._drop_refuted_prior()
             self._test_gyro()
+            self._search_mounting(buffer)
+            if self.restarted:
+                return np.zeros(3)
         if gravity is not None:
             if not self.accel.has_vertical:
                 self.accel.set_vertical(gravity)
@@ -213,6 +244,7 @@ class SelfCalibration:
             if isinstance(move, Link):
                 self._add_move(move)
                 self._test_accel()
+                self._search_lever()
             elif move:
                 self._before = None
         turns, forces = self.gyro.disagreement, self.accel.disagreement
@@ -225,6 +257,7 @@ class SelfCalibration:
         unprimed = self._unprimed_gyro
         if unprimed is not None and unprimed.log_likelihood - self.gyro.log_likelihood > self._config.refuted:
             self.gyro, self._unprimed_gyro, self._earlier = unprimed, None, KnownImuConfig()
+            self._given_axes, self._given_offset_s = np.eye(3), self._config.offset_s
             accel, self.accel = self.accel, self._unknown_accel()
             self.accel.continue_map(accel)
             self._events.append("the IMU is not the one of the rig file: calibrated anew")
@@ -236,7 +269,7 @@ class SelfCalibration:
         self._gyro_windows = self._gyro_windows + 1 if self.gyro.significance() > config.significance else 0
         if config.apply_axes and not self._corrects_gyro and self._gyro_windows >= config.significant_windows:
             self._corrects_gyro = True
-            self._events.append(_event("gyro", self.gyro.matrix))
+            self._events.append(correction_event("gyro", self.gyro.matrix))
 
     def _test_accel(self) -> None:
         """The same of the accelerometer; not by a monocular map, whose lengths come from the accelerometer itself."""
@@ -244,7 +277,59 @@ class SelfCalibration:
         may = config.apply_axes and self._metric and not self._corrects_accel
         if may and self.accel.significance() > config.significance:
             self._corrects_accel = True
-            self._events.append(_event("accelerometer", self.accel.matrix))
+            self._events.append(correction_event("accelerometer", self.accel.matrix))
+
+    def _search_mounting(self, buffer: SampleBuffer) -> None:
+        """Begin anew with another mounting and time offset where these explain turns that the present ones do not."""
+        gyro, limits = self.gyro, self._config.mounting
+        axes_off = float(np.abs(gyro.matrix - self._given_axes).max())
+        doubted = self._gyro_windows > 0 and axes_off > 0.5 * limits.least_rotation_rad
+        doubted |= abs(gyro.offset_s - self._given_offset_s) > limits.least_change_s
+        doubted |= gyro.disagreement.share > limits.suspicion
+        if not (doubted and self._searches):
+            return
+        found = self._mounting.find(buffer, self._given_axes, self._given_offset_s)
+        if found is None:
+            return
+        self._begin_with_mounting(found)
+        self._events.append(f"imu: {found}: {_CORRECT}")
+
+    def _begin_with_mounting(self, found: Mounting) -> None:
+        """Begin the gyro's filter anew; after more than a small change of the time offset all that is inertial, too."""
+        least = self._config.mounting
+        change_rad = float(np.linalg.norm(se3.so3_log(found.rotation @ self._accel_matrix.T)))
+        self.turned = change_rad > least.least_rotation_rad
+        jumps = abs(found.offset_s - self.offset_s) > least.restart_s
+        jumps |= not np.array_equal(found.axes, self._given_axes)
+        self.gyro, self._unprimed_gyro = self._unknown_gyro(), None
+        self.gyro.begin_with(found.axes, self._config.axes_sigma.reshape(3, 3), found.offset_s, found.sigma_s)
+        self.gyro.set_bias(found.bias)
+        self._given_axes, self._given_offset_s = found.axes, found.offset_s
+        self.offset_s, self._corrects_offset = found.offset_s, True
+        self._gyro_matrix, self._corrects_gyro = found.axes, True
+        if self.turned:
+            self._accel_matrix, self._corrects_accel = found.rotation, True
+        if jumps:
+            self._restart()
+
+    def _search_lever(self) -> None:
+        """Begin anew with another lever arm where it explains accelerations that the present one does not."""
+        if not (self._searches and self.gyro.disagreement.agrees):
+            return
+        change = self._lever.find()
+        if change is not None:
+            self._lever_m, self._p_b_c = self._lever_m + change, self._p_b_c + change
+            self._restart()
+            at = self._p_b_c.round(2).tolist()
+            self._events.append(f"imu: the camera is at {at} m in its axes: {_CORRECT}")
+
+    def _restart(self) -> None:
+        """Begin the accelerometer's calibration anew, with the axes that are applied."""
+        self.accel = self._unknown_accel()
+        self.accel.begin_with(self._accel_matrix, self._config.axes_sigma.reshape(3, 3))
+        self._moves.clear()
+        self._lever.clear()
+        self._before, self.restarted = None, True
 
     def _follow_offset(self, dt_s: float) -> None:
         """Move the applied time offset towards the estimate, once that is significant."""
@@ -279,7 +364,8 @@ class SelfCalibration:
             imu = (t0 * density_before**2 + t1 * density**2) / 3.0
             tilt = (self._gravity_m_s2 * self._config.turn_sigma_rad) ** 2 * 0.5 * (t0**2 + t1**2)
             variance = images + imu + tilt + (unsteady - 1.0) * (images + tilt)
-            self.accel.add((first, window), (before.T_m_b0, link.T_m_b0, link.T_m_b1), self._p_b_c, variance)
+            poses = before.T_m_b0, link.T_m_b0, link.T_m_b1
+            self.accel.add((first, window), poses, self._p_b_c, variance, self._lever)
         self._before, self._unsteady = (window, link, density, self._unsteady), 1.0
 
     def _integrate(self, link: Link, gyro: GyroCalibration) -> Window:
@@ -292,13 +378,6 @@ class SelfCalibration:
         calibrated = np.array([self._calibration.gyro_noise, self._calibration.accel_noise])
         measured = link.samples.density
         return calibrated if measured is None else np.maximum(calibrated, np.sqrt(np.mean(measured**2, axis=0)))
-
-
-def _measured(matrix: F64) -> tuple[F64, F64]:
-    """What an IMU does, measured = matrix @ true, and its rotation vector (3,), for the correction `matrix` (3,3)."""
-    measured = np.asarray(np.linalg.inv(matrix), np.float64)
-    u, _, vt = np.linalg.svd(measured)
-    return measured, se3.so3_log(u @ vt)
 
 
 def _rotation_rad(matrix: F64, cov: F64, misalignment_sigma: float) -> float:
@@ -315,20 +394,3 @@ def _rotation_rad(matrix: F64, cov: F64, misalignment_sigma: float) -> float:
     log_factor += 0.5 * float(np.linalg.slogdet(own)[1]) - 1.5 * float(np.log(0.5 * misalignment_sigma**2))
     probability = 1.0 / (1.0 + float(np.exp(-np.clip(log_factor, -50.0, 50.0))))
     return float(np.sqrt(probability * (turned @ turned)))
-
-
-def _event(sensor: str, matrix: F64) -> str:
-    measured, rotation = _measured(matrix)
-    scale, angle = 100.0 * float(np.abs(np.diag(measured) - 1.0).max()), np.degrees(np.linalg.norm(rotation))
-    return f"{sensor}: scale off by up to {scale:.1f} %, camera rotated by {angle:.2f} degrees against it: corrected"
-
-
-def _axes_report(matrix: F64, cov: F64, *, applied: bool) -> dict[str, Any]:
-    measured, _ = _measured(matrix)
-    sigma = np.sqrt(np.diag(cov)).reshape(3, 3)
-    return {
-        "applied": applied,
-        "scale": np.diag(measured).round(5).tolist(),
-        "matrix": measured.round(5).tolist(),
-        "sigma": sigma.round(5).tolist(),
-    }
