@@ -68,7 +68,7 @@ FLIGHTS = (
     KeptFlight("lossy", "a stereo pair with an IMU, a base on a slow link that loses a fifth of the packets",
                options={"profile": "radio", "up_bytes_s": 6000, "down_bytes_s": 3000, "loss": 0.2, "delay_s": 0.05}),
     KeptFlight("two-agents", "two stereo pairs without IMU on one street, whose maps are merged",
-               ((0, 30), (6, STREET_FRAMES)), options={"imu": False}, images=STREET_IMAGES),
+               ((0, 29), (7, STREET_FRAMES)), options={"imu": False}, images=STREET_IMAGES),
     KeptFlight("ekf", "one camera with an odometer and the Kalman tracker, a base on a wide link",
                odometer=True, options={"mono": True, "imu": False, "tracker": "ekf"}),
 )  # fmt: skip
