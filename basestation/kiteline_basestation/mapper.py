@@ -131,7 +131,8 @@ class Mapper:
             answers.append(answer)
             changes += changed
         # 3. Refine the map with each new keyframe, and search for loop closures and merges.
-        for keyframe in self._intake.ready(now_ns):
+        ready = self._intake.ready(now_ns)
+        for keyframe in ready:
             changes += self._add_keyframe(keyframe)
         if self._placements.follow_ties():
             self.grid_updates.rebuild()
@@ -141,8 +142,8 @@ class Mapper:
                 changes += self.merger.merge_tied(tie)
         # 4. Apply what merges and corrections of whole maps changed.
         withdrawn = self._apply_merges(changes)
-        # 5. Draw the grid where keyframes are new or moved.
-        self._draw_grid()
+        # 5. Draw the grid where keyframes are new or moved, in a step of its own if that can be.
+        self._draw_grid(busy=bool(ready))
         # 6. Start jobs: local bundles, scans of images, pose graphs, full bundles.
         self._send_calibrations()
         jobs = self._local_bundles.jobs() + self.image_scans.jobs()
@@ -333,14 +334,14 @@ class Mapper:
         if self.merger is not None:
             self.merger.forget_job(done.id, now_ns)
 
-    def _draw_grid(self) -> None:
+    def _draw_grid(self, *, busy: bool) -> None:
         begin_ns = self.cpu_ns()
         for record in self._intake.take_scans():
             self.grid_updates.add_scan(record)
         for images in self._intake.take_images():
             self.image_scans.add(images)
         before = self.grid_updates.grid.revision
-        self.grid_updates.update()
+        self.grid_updates.update(busy=busy)
         if self.grid_updates.grid.revision != before:
             self.counts.grids += 1
             self.grid_ns.append(self.cpu_ns() - begin_ns)

@@ -146,6 +146,25 @@ def test_scans_between_keyframes_are_drawn_and_move_with_their_keyframe(make_fli
     assert_equal(mapper.grid, from_scratch(mapper, every))
 
 
+def test_busy_steps_leave_the_drawing_to_the_next_but_not_for_ever(make_flight: MakeFlight) -> None:
+    flight = make_flight(keyframes=24, turns=0.9)
+    mapper = Mapper(BaseConfig())
+    feed(mapper, flight, with_scans(flight))
+    updates = mapper.grid_updates
+
+    def waits(*busy: bool) -> list[bool]:
+        """Whether scans wait after each of some updates, before each of which the map has moved."""
+        found = []
+        for one in busy:
+            updates.rebuild()
+            updates.update(busy=one)
+            found.append(len(updates._due) == len(flight.keyframes))
+        return found
+
+    assert waits(True, True, True, True, True) == [True, True, True, False, True]
+    assert waits(False, True, False) == [False, True, False]
+
+
 def test_a_scan_between_keyframes_is_taken_back_alone(make_flight: MakeFlight) -> None:
     flight = make_flight(keyframes=12, turns=0.5)
     mapper, later = Mapper(BaseConfig()), between(flight)

@@ -18,6 +18,7 @@ from kiteline_core.arrays import F64, I32, U8
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import AgentId, KeyframeId, SubmapId, agent_of_keyframe, agent_of_submap, submap_of_keyframe
 
+_MOST_WAITS = 3  # busy steps in a row that leave the drawing to the next one
 _LOOKED = 16  # keyframes looked at for each that one step may draw: most may not have moved
 
 
@@ -44,6 +45,7 @@ class GridUpdates:
         self._scanning: set[AgentId] = set()  # agents that send scans
         self._due: dict[KeyframeId, None] = {}  # may have moved, or are new
         self._unmade: dict[KeyframeId, None] = {}  # their scan is to be made from landmarks
+        self._waited = 0  # busy steps since something could be drawn
 
     def add_scan(self, record: KeyframeScan) -> None:
         """Take an agent's scan. From the first one on, only its scans are drawn."""
@@ -87,9 +89,16 @@ class GridUpdates:
             self._drop(keyframe)
             self._labels.pop(keyframe, None)
 
-    def update(self) -> None:
-        """Draw as many keyframes as one step has time for, the oldest first."""
+    def update(self, *, busy: bool = False) -> None:
+        """Draw as many keyframes as one step has time for, the oldest first.
+
+        busy: the step has taken long already, so that the next one draws, unless several before were busy, too.
+        """
         self._gather_moved()
+        self._waited = self._waited + 1 if busy else 0
+        if 0 < self._waited <= _MOST_WAITS:
+            return
+        self._waited = 0
         scanless = {a for a in map(agent_of_keyframe, self._unmade) if self._is_scanless(a)}
         ready = [keyframe for keyframe in sorted(self._unmade) if agent_of_keyframe(keyframe) in scanless]
         for keyframe in ready[: self._config.made_per_step]:

@@ -1,6 +1,7 @@
 """Hours of a flight's log in minutes: the agent's runtime, its log and its limit on the disk, without tracking."""
 
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -122,7 +123,10 @@ def fly_hours(folder: Path, hours: float, cap_mib: int) -> LogDay:
 
 def _look(folder: Path, day: LogDay, seen: dict[str, int]) -> None:
     """Sizes of all logs, and whether those that are gone were the oldest. seen: largest size of each, by name."""
-    now = {path.stem: path.stat().st_size for path in folder.glob("*.mcap") if path.exists()}
+    now = {}
+    for path in folder.glob("*.mcap"):
+        with suppress(FileNotFoundError):  # deleted meanwhile
+            now[path.stem] = path.stat().st_size
     day.looks += 1
     day.most_bytes = max(day.most_bytes, sum(now.values()))
     seen |= {name: max(size, seen.get(name, 0)) for name, size in now.items()}
