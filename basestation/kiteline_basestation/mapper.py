@@ -142,7 +142,7 @@ class Mapper:
                 changes += self.merger.merge_tied(tie)
         # 4. Apply what merges and corrections of whole maps changed.
         withdrawn = self._apply_merges(changes)
-        # 5. Draw the grid where keyframes are new or moved, in a step of its own if that can be.
+        # 5. Draw the grid where keyframes are new or moved.
         self._draw_grid(busy=bool(ready))
         # 6. Start jobs: local bundles, scans of images, pose graphs, full bundles.
         self._send_calibrations()
