@@ -3,31 +3,15 @@
 from kiteline_agent.runtime.live import _BaseEnd
 from kiteline_agent.runtime.options import AgentOptions
 from kiteline_codec.transport.seal_watch import Trouble, notice
+from tests.handed_link import HandedLink
 
 S = 1_000_000_000
 
 
-class End:
-    """A ByteLink that tells what it is told to."""
+class End(HandedLink):
+    """A link that knows whether another agent has its number."""
 
-    def __init__(self) -> None:
-        self.doubled = False
-        self.messages: list[str] = []
-        self.packets: list[bytes] = []
-
-    def take_messages(self) -> list[str]:
-        messages, self.messages = self.messages, []
-        return messages
-
-    def send(self, packet: bytes) -> bool:
-        return True
-
-    def receive(self) -> list[bytes]:
-        packets, self.packets = self.packets, []
-        return packets
-
-    def close(self) -> None:
-        """Nothing to close."""
+    doubled = False
 
 
 def test_another_agent_with_this_number_is_told_once_with_the_mend() -> None:
@@ -54,7 +38,7 @@ def test_a_base_that_does_not_answer_is_named_once_and_so_is_its_return() -> Non
     (line,) = base.lines(3 * S)
     assert "no base answers at zenoh:tcp/10.0.0.1:7447" in line and "--paired-only" in line
     assert base.lines(60 * S) == []
-    end.packets = [b"a packet"]
+    end.inbox = [b"a packet"]
     assert base.receive() == [b"a packet"]
     assert base.lines(61 * S) == ["the base answers"]
     assert [base.lines(t * S) for t in (62, 70)] == [[], []]
@@ -70,7 +54,7 @@ def test_a_base_that_is_not_understood_does_answer() -> None:
     end = End()
     base = _BaseEnd(AgentOptions(source="", folder="", link="zenoh:tcp/10.0.0.1:7447"), end, None, None)
     base.lines(0)
-    end.packets = [notice(Trouble.UNSEALED)]
+    end.inbox = [notice(Trouble.UNSEALED)]
     assert base.receive() == []
     assert "seals" in base.lines(1 * S)[0]
     assert base.lines(10 * S) == []

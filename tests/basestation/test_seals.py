@@ -18,37 +18,16 @@ from kiteline_hw.links.zenoh_link import ZenohHub
 from kiteline_hw.ports import LinkError
 from kiteline_hw.system import key_store
 from kiteline_hw.system.key_store import new_code, new_maps_key, pair, read_keys
+from tests.handed_link import HandedLink
 
 SECOND_NS = 1_000_000_000
-
-
-class Wire:
-    """A ByteLink whose incoming packets are handed in."""
-
-    def __init__(self) -> None:
-        self.inbox: list[bytes] = []
-        self.messages: list[str] = []
-
-    def take_messages(self) -> list[str]:
-        messages, self.messages = self.messages, []
-        return messages
-
-    def send(self, packet: bytes) -> bool:
-        return True
-
-    def receive(self) -> list[bytes]:
-        packets, self.inbox = self.inbox, []
-        return packets
-
-    def close(self) -> None:
-        self.inbox = []
 
 
 class Base:
     """Seals of a base that serves agent 3 with a file of keys."""
 
     def __init__(self, path: Path) -> None:
-        self.path, self.wire, self.now_ns = path, Wire(), 0
+        self.path, self.wire, self.now_ns = path, HandedLink(), 0
         options = BaseOptions(folder="", key=str(path), link="zenoh:tcp/127.0.0.1:1", session=7)
         self.seals = BaseSeals(options, OneLinkHub(self.wire, 3))
 

@@ -154,8 +154,9 @@ class SparseMap(RigValues):
         """Set the rectified camera of an agent; see `RigValues`. Observations are usable from the first one on."""
         is_first = agent not in self.cameras
         super().set_camera(agent, camera)
-        for row in [row for k, row in self.rows.items() if is_first and agent_of_keyframe(k) == agent]:
-            self._refresh_usable(row)
+        if is_first:
+            for row in [row for keyframe, row in self.rows.items() if agent_of_keyframe(keyframe) == agent]:
+                self._refresh_usable(row)
 
     # -- values of the base ------------------------------------------------------------------------------------------
 
