@@ -1,7 +1,8 @@
 """CPU of the agent over a yardstick of the same machine in the same minute: ORB on the flight's own images.
 
 The agent is flown as in any flight: a process of its own, with IMU, link and log. Its CPU is that of the whole process,
-all threads and rectification included, image decoding taken off. Yardstick and flights alternate.
+all threads and rectification included, image decoding taken off. Yardstick and flights alternate, and flights with and
+without scans of ground and obstacles, which are the grid's cost and not that of flying.
 
 Usage: python -m kiteline_bench.reality.cpu SOURCE    prints the yardstick of a recording as JSON.
 """
@@ -22,10 +23,12 @@ from kiteline_hw.sources.open import open_source
 
 RUNS = 5
 FLIGHTS = ("room_flight.mcap", "euroc_mh01_air", "kitti_straight")  # stereo and IMU, monocular with IMU, stereo
+_GRIDS = {"off": "", "agent": ", with scans"}  # options of a flight: their names in a bar
 _CORNERS = 1000  # of the yardstick, cv2.ORB_create
 _EVERY = 4  # images of which one is measured
 _MEAN, _P95 = 0.95, 2.3  # over the yardstick
 _RSS_MIB, _FIRST_POSE_S = 200.0, 2.0
+_MEDIAN = f"median of {RUNS} runs"
 _TIMEOUT_S = 300.0
 
 
@@ -61,23 +64,27 @@ def over_yardstick(cpu_ms: dict[str, float], before: list[float], after: list[fl
 
 def _flight(bench: Bench, name: str) -> list[Bar]:
     source = bench.source(name)
-    found: list[tuple[float, float, float]] = []
+    found: dict[str, list[tuple[float, float, float]]] = {grid: [] for grid in _GRIDS}
     rss_mib = 0.0
     before = _measured_ms(source)
     for k in range(RUNS):
-        timing: dict[str, Any] = bench.fly(source, f"cpu_{name.partition('.')[0]}_{k}").agent()["timing"]
-        after = _measured_ms(source)
-        found.append(over_yardstick(timing["cpu_ms_per_frame"], before, after))
-        rss_mib = max(rss_mib, timing["rss_mib"])
-        before = after
-    listed = ", ".join(f"{unit:.2f} ms: {mean:.2f} / {p95:.2f}" for unit, mean, p95 in found)
-    bench.more.append(f"{name}, yardstick: mean / p95 of each run: {listed}.")
-    means, p95s = ([run[column] for run in found] for column in (1, 2))
-    return [
-        at_most(f"{name}: CPU a frame over the yardstick, median of {RUNS} runs", median(means), _MEAN, "", 2),
-        at_most(f"{name}: p95 over the yardstick, median of {RUNS} runs", median(p95s), _P95, "", 2),
-        at_most(f"{name}: resident memory", rss_mib, _RSS_MIB, "MiB", 0),
-    ]
+        for grid in _GRIDS:
+            flown = bench.fly(source, f"cpu_{name.partition('.')[0]}_{grid}_{k}", grid=grid)
+            timing: dict[str, Any] = flown.agent()["timing"]
+            after = _measured_ms(source)
+            found[grid].append(over_yardstick(timing["cpu_ms_per_frame"], before, after))
+            rss_mib = max(rss_mib, timing["rss_mib"])
+            before = after
+    bars = []
+    for grid, what in _GRIDS.items():
+        listed = ", ".join(f"{unit:.2f} ms: {mean:.2f} / {p95:.2f}" for unit, mean, p95 in found[grid])
+        bench.more.append(f"{name}{what}, yardstick: mean / p95 of each run: {listed}.")
+        means, p95s = ([run[column] for run in found[grid]] for column in (1, 2))
+        bars += [
+            at_most(f"{name}{what}: CPU a frame over the yardstick, {_MEDIAN}", median(means), _MEAN, "", 2),
+            at_most(f"{name}{what}: p95 over the yardstick, {_MEDIAN}", median(p95s), _P95, "", 2),
+        ]
+    return [*bars, at_most(f"{name}: resident memory", rss_mib, _RSS_MIB, "MiB", 0)]
 
 
 def run(bench: Bench) -> list[Bar]:
