@@ -296,7 +296,7 @@ class _BaseReach:
         self._silent = True
         line = (
             f"no base answers at {self._link}, the flight goes on without: is one running there, does the network "
-            "reach it, and has it, if started with --paired-only, this agent's key?"
+            "reach it, and is this agent paired with it? One started with --paired-only tells strangers nothing"
         )
         return [line]
 
