@@ -39,9 +39,12 @@ class Flight:
 
 def flight(
     seconds: float, seed: int = 0, gyro: F64 | None = None, accel: F64 | None = None, late_ns: int = 0,
-    at_rest: bool = False,
+    at_rest: bool = False, position_m: float = 5e-4,
 ) -> Flight:  # fmt: skip
-    """A lively flight. gyro, accel: (3,3) with which the IMU measures. late_ns: stamps of frames after the exposure."""
+    """A lively flight. gyro, accel: (3,3) with which the IMU measures. late_ns: stamps of frames after the exposure.
+
+    position_m: error of a position by images.
+    """
     rng = np.random.default_rng([seed, 5])
     path = built_in_path("room", (seconds + 3.0) / HASTE, T_B_C, 0)
     rest_s = seconds + 2.0 if at_rest else 0.0
@@ -52,16 +55,19 @@ def flight(
     rate = measured.gyro if gyro is None else measured.gyro @ gyro.T
     force = measured.accel if accel is None else measured.accel @ accel.T
     truth = path.motion(exposed * 1e-9).T_w_b
-    errors = np.concatenate([5e-4 * rng.normal(size=(len(exposed), 3)), 2e-4 * rng.normal(size=(len(exposed), 3))], 1)
+    errors = np.concatenate([position_m * rng.normal(size=(len(exposed), 3)), 2e-4 * rng.normal(size=(len(exposed), 3))], 1)
     seen = np.array([T @ se3.exp(e) for T, e in zip(truth, errors, strict=True)])
     return Flight(exposed + late_ns, seen, truth, ImuBatch(stamps, rate, force))
 
 
 def calibrated(
     f: Flight, config: SelfCalibrationConfig | None = None, turn_map_at: int | None = None,
-    known: KnownImuConfig | None = None, *, metric: bool = True, p_b_c: F64 = P_B_C,
+    known: KnownImuConfig | None = None, *, metric: bool = True, p_b_c: F64 = P_B_C, depth_m: float = 3.0,
 ) -> SelfCalibration:  # fmt: skip
-    """A calibration after a flight, in a map that is turned at a frame. known: from earlier flights. p_b_c: told."""
+    """A calibration after a flight, in a map that is turned at a frame. known: from earlier flights. p_b_c: told.
+
+    depth_m: of what the images see.
+    """
     calibration = SelfCalibration(CALIBRATION, config or SelfCalibrationConfig(), p_b_c, 9.81, metric=metric)
     if known is not None:
         calibration.begin_with(known)
@@ -73,7 +79,7 @@ def calibrated(
         if k == turn_map_at:
             moved = se3.from_rt(se3.so3_exp(np.array([0.2, -0.3, 1.0])), np.array([3.0, 1.0, -2.0]))
             calibration.move_map(moved)
-        calibration.add(int(t_ns), moved @ T)
+        calibration.add(int(t_ns), moved @ T, depth_m)
         calibration.update(buffer, moved[:3, :3] @ np.array([0.0, 0.0, -9.81]), 0.05)
     return calibration
 
@@ -150,6 +156,18 @@ def test_a_true_imu_is_left_alone(seed: int) -> None:
     assert calibration.correct(samples).accel is samples.accel
     assert abs(calibration.offset_s) < 5e-4
     assert calibration.camera_rotation_rad < 5e-4  # a rotation that is not clear is most likely none
+
+
+def test_positions_by_far_landmarks_say_little_of_an_accelerometer() -> None:
+    """At 40 m a tenth of a pixel is 9 mm, which says nothing against a true IMU."""
+    believed_near = []
+    for seed in range(3):
+        f = flight(25.0, seed, position_m=9e-3)
+        far, near = calibrated(f, depth_m=40.0), calibrated(f)
+        assert far.report()["accel"]["applied"] is False and far.accel.disagreement.agrees
+        believed_near.append(near.report()["accel"]["applied"] or not near.accel.disagreement.agrees)
+        assert far.accel.scale[1] > near.accel.scale[1]
+    assert any(believed_near)
 
 
 def test_without_motion_nothing_is_learned() -> None:

@@ -18,6 +18,7 @@ from kiteline_core.arrays import F64, Bool
 from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
+from kiteline_core.order_statistics import median
 
 _BY_DEFINITION = 1e-4  # m and rad: deviation of a pose that defines its map
 
@@ -35,6 +36,11 @@ class VisualPoints:
     observed: F64
     sigma_px: F64
     inlier: Bool
+
+    def depth_m(self, T_m_b: F64) -> float:
+        """Median distance of the inliers from a body at T_m_b (4,4); 0 without any."""
+        seen = self.xyz[self.inlier]
+        return median(np.linalg.norm(seen - T_m_b[:3, 3], axis=1)) if len(seen) else 0.0
 
 
 @dataclass(frozen=True, slots=True)

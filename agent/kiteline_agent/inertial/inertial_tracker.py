@@ -16,7 +16,6 @@ from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuBatch, ImuCalibration
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
-from kiteline_core.order_statistics import median
 
 _PRIOR_SIGMA = np.repeat([0.005, 0.1], 3)  # rad/s, m/s^2: of biases of earlier tracking, after a loss
 
@@ -192,7 +191,7 @@ class InertialTracker:
         """
         samples = self._interval(t_ns)
         if samples is not None:
-            self._calibrate(t_ns, T_m_b_visual, samples.duration_s)
+            self._calibrate(t_ns, T_m_b_visual, points, samples.duration_s)
             if self.self_calibration.awaits_search:
                 self._smoother.stop()
             if self.self_calibration.restarted or self.self_calibration.awaits_search:
@@ -371,9 +370,8 @@ class InertialTracker:
             self._scale_from = (t_ns, T_m_b)
         elif (t_ns - self._scale_from[0]) * 1e-9 >= self._config.scale_filter.interval_s:
             samples = self.samples_between(self._scale_from[0], t_ns)
-            seen = points.xyz[points.inlier]
-            if samples is not None and len(seen):
-                depth_m = median(np.linalg.norm(seen - T_m_b[:3, 3], axis=1))
+            depth_m = points.depth_m(T_m_b)
+            if samples is not None and depth_m > 0.0:
                 self._scale.add(self._scale_from[1], T_m_b, samples, state.bias[:3], depth_m)
             else:
                 self._scale.resume(state.velocity)
@@ -386,9 +384,9 @@ class InertialTracker:
             if samples is not None:
                 self._smoother.replace_last(samples)
 
-    def _calibrate(self, t_ns: int, T_m_b_visual: F64, dt_s: float) -> None:
+    def _calibrate(self, t_ns: int, T_m_b_visual: F64, points: VisualPoints, dt_s: float) -> None:
         gravity = self._smoother.gravity if self._smoother.running and self._images_have_scale else None
-        self.self_calibration.add(t_ns, T_m_b_visual)
+        self.self_calibration.add(t_ns, T_m_b_visual, points.depth_m(T_m_b_visual))
         change = self.self_calibration.update(self._buffer, gravity, dt_s)
         if self.self_calibration.restarted:
             self._smoother.stop()

@@ -32,3 +32,19 @@ def axes_report(matrix: F64, cov: F64, *, applied: bool) -> dict[str, Any]:
         "matrix": measured.round(5).tolist(),
         "sigma": sigma.round(5).tolist(),
     }
+
+
+def turned_rad(matrix: F64, cov: F64, misalignment_sigma: float) -> float:
+    """Size of the rotation in the correction `matrix` (3,3), rad. cov: (9,9) of its elements.
+
+    Its square is weighted with the probability that there is one at all, by the Bayes factor of a rotation as large as
+    misalignment_sigma allows against none.
+    """
+    turned = 0.5 * np.array([matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]])
+    j = np.zeros((3, 9))
+    j[0, [7, 5]], j[1, [2, 6]], j[2, [3, 1]] = [0.5, -0.5], [0.5, -0.5], [0.5, -0.5]
+    own = j @ cov @ j.T
+    log_factor = 0.5 * float(turned @ np.linalg.solve(own, turned))
+    log_factor += 0.5 * float(np.linalg.slogdet(own)[1]) - 1.5 * float(np.log(0.5 * misalignment_sigma**2))
+    probability = 1.0 / (1.0 + float(np.exp(-np.clip(log_factor, -50.0, 50.0))))
+    return float(np.sqrt(probability * (turned @ turned)))

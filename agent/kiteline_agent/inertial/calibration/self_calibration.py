@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from kiteline_agent.inertial.calibration.accel_calibration import AccelCalibration
-from kiteline_agent.inertial.calibration.axes_report import axes_report, correction_event, measured_rotation
+from kiteline_agent.inertial.calibration.axes_report import axes_report, correction_event, measured_rotation, turned_rad
 from kiteline_agent.inertial.calibration.disagreement import Disagreement
 from kiteline_agent.inertial.calibration.gyro_calibration import GyroCalibration
 from kiteline_agent.inertial.calibration.known_imu import KnownImuConfig, is_plausible, known_axes
@@ -41,7 +41,8 @@ class SelfCalibrationConfig:
     turn_window_s: float = 0.25  # over which rotations are compared
     move_window_s: float = 0.6  # of two windows over which velocities are compared: vibration averages out
     turn_sigma_rad: float = 4e-4  # error of a rotation by images over a window
-    position_sigma_m: float = 7e-4  # error of a position by images, as it changes over windows
+    position_sigma_m: float = 7e-4  # error of a position by images, as it changes over windows, at least
+    position_rad: float = 2.3e-4  # the same over the depth that the images see: a tenth of a pixel
     sensor_scale_sigma: float = 0.01  # of the scales of gyro and accelerometer; data sheets give 1 to 3 %
     misalignment_sigma: float = 0.007  # rad; by which a sensing axis leans to another; data sheets give 0.5 to 1 degree
     scale_sigma: float = 0.015  # relative, of lengths by the images
@@ -68,6 +69,19 @@ class SelfCalibrationConfig:
         return np.where(np.eye(3, dtype=np.bool_), scale, misalignment).ravel()
 
 
+@dataclass(frozen=True, slots=True)
+class _Move:
+    """A window of motion. density: of the accelerometer's noise. position_m: error of a position by images. unsteady:
+    factor on the variance of poses by images.
+    """
+
+    window: Window
+    link: Link
+    density: float
+    position_m: float
+    unsteady: float
+
+
 class SelfCalibration:
     """Call `add` with each pose by images, then `update`."""
 
@@ -90,9 +104,10 @@ class SelfCalibration:
         self._lever_m = np.zeros(3)  # origin of the body, as the calibration places it, in the IMU
         self.restarted = False  # True after an `update` that found a calibration: what was integrated before is void
         self.turned = False  # True after one that found a rotation: so is the vertical
-        self._before: tuple[Window, Link, float, float] | None = None  # last window of moves: density, `_unsteady`
+        self._before: _Move | None = None  # last window of moves
         self._added = 0.0  # rad^2, of the rotation by images in the last window of turns, beside turn_sigma_rad
         self._unsteady = 1.0  # factor on the variance of poses by images, since the last window of moves
+        self._depth_m = 0.0  # that the images saw, largest since the last window of moves
         self.offset_s = config.offset_s  # applied: camera stamp + offset = IMU time
         self._gyro_matrix, self._accel_matrix = np.eye(3), np.eye(3)  # applied to samples
         self._gyro_windows = 0  # in a row after which the gyro's axes differed significantly
@@ -185,8 +200,9 @@ class SelfCalibration:
         events, self._events = self._events, []
         return events
 
-    def add(self, t_ns: int, T_m_b: F64) -> None:
-        """Append the pose T_m_b (4,4) of a frame, by images alone."""
+    def add(self, t_ns: int, T_m_b: F64, depth_m: float) -> None:
+        """Append the pose T_m_b (4,4) of a frame, by images alone. depth_m: median distance of what they saw."""
+        self._depth_m = max(self._depth_m, depth_m)
         self._turns.add(t_ns, T_m_b)
         self._moves.add(t_ns, se3.from_rt(T_m_b[:3, :3], T_m_b[:3, 3] - T_m_b[:3, :3] @ self._lever_m))
         self._mounting.add(t_ns, T_m_b[:3, :3])
@@ -265,7 +281,7 @@ class SelfCalibration:
     def _test_gyro(self) -> None:
         """Correct the gyro's samples from now on if its axes differ significantly from those of a true rig."""
         config = self._config
-        self.camera_rotation_rad = _rotation_rad(self.gyro.matrix, self.gyro.axes_cov, config.misalignment_sigma)
+        self.camera_rotation_rad = turned_rad(self.gyro.matrix, self.gyro.axes_cov, config.misalignment_sigma)
         self._gyro_windows = self._gyro_windows + 1 if self.gyro.significance() > config.significance else 0
         if config.apply_axes and not self._corrects_gyro and self._gyro_windows >= config.significant_windows:
             self._corrects_gyro = True
@@ -355,18 +371,20 @@ class SelfCalibration:
         return change
 
     def _add_move(self, link: Link) -> None:
-        window, density = self._integrate(link, self.gyro), float(self._density(link)[1])
-        if self._before is not None:
-            first, before, density_before, unsteady = self._before
-            unsteady = max(unsteady, self._unsteady)
-            t0, t1 = first.duration_s, window.duration_s
-            images = self._config.position_sigma_m**2 * (1 / t0**2 + (1 / t0 + 1 / t1) ** 2 + 1 / t1**2)
-            imu = (t0 * density_before**2 + t1 * density**2) / 3.0
-            tilt = (self._gravity_m_s2 * self._config.turn_sigma_rad) ** 2 * 0.5 * (t0**2 + t1**2)
-            variance = images + imu + tilt + (unsteady - 1.0) * (images + tilt)
-            poses = before.T_m_b0, link.T_m_b0, link.T_m_b1
-            self.accel.add((first, window), poses, self._p_b_c, variance, self._lever)
-        self._before, self._unsteady = (window, link, density, self._unsteady), 1.0
+        config = self._config
+        position_m = max(config.position_sigma_m, config.position_rad * self._depth_m)
+        now = _Move(self._integrate(link, self.gyro), link, float(self._density(link)[1]), position_m, self._unsteady)
+        before, self._before, self._unsteady, self._depth_m = self._before, now, 1.0, 0.0
+        if before is None:
+            return
+        unsteady, position_m = max(before.unsteady, now.unsteady), max(before.position_m, now.position_m)
+        t0, t1 = before.window.duration_s, now.window.duration_s
+        images = position_m**2 * (1 / t0**2 + (1 / t0 + 1 / t1) ** 2 + 1 / t1**2)
+        imu = (t0 * before.density**2 + t1 * now.density**2) / 3.0
+        tilt = (self._gravity_m_s2 * config.turn_sigma_rad) ** 2 * 0.5 * (t0**2 + t1**2)
+        variance = images + imu + tilt + (unsteady - 1.0) * (images + tilt)
+        poses = before.link.T_m_b0, link.T_m_b0, link.T_m_b1
+        self.accel.add((before.window, now.window), poses, self._p_b_c, variance, self._lever)
 
     def _integrate(self, link: Link, gyro: GyroCalibration) -> Window:
         matrix, bias = gyro.matrix, gyro.bias
@@ -378,19 +396,3 @@ class SelfCalibration:
         calibrated = np.array([self._calibration.gyro_noise, self._calibration.accel_noise])
         measured = link.samples.density
         return calibrated if measured is None else np.maximum(calibrated, np.sqrt(np.mean(measured**2, axis=0)))
-
-
-def _rotation_rad(matrix: F64, cov: F64, misalignment_sigma: float) -> float:
-    """Size of the rotation in the correction `matrix` (3,3), rad. cov: (9,9) of its elements.
-
-    Its square is weighted with the probability that there is one at all, by the Bayes factor of a rotation as large as
-    misalignment_sigma allows against none.
-    """
-    turned = 0.5 * np.array([matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]])
-    j = np.zeros((3, 9))
-    j[0, [7, 5]], j[1, [2, 6]], j[2, [3, 1]] = [0.5, -0.5], [0.5, -0.5], [0.5, -0.5]
-    own = j @ cov @ j.T
-    log_factor = 0.5 * float(turned @ np.linalg.solve(own, turned))
-    log_factor += 0.5 * float(np.linalg.slogdet(own)[1]) - 1.5 * float(np.log(0.5 * misalignment_sigma**2))
-    probability = 1.0 / (1.0 + float(np.exp(-np.clip(log_factor, -50.0, 50.0))))
-    return float(np.sqrt(probability * (turned @ turned)))
