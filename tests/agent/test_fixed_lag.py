@@ -114,6 +114,24 @@ def test_biases_and_a_wrong_level_are_found() -> None:
     assert np.abs(s.bias[3:] - bias[3:]).max() < 0.06
 
 
+def test_a_map_that_is_too_long_turns_the_vertical_less_once_its_lengths_count_as_uncertain() -> None:
+    longer, tilts = 1.04, dict[float, list[float]]()
+    for length_error in (0.0, longer - 1.0):
+        for seed in range(6):
+            rng = np.random.default_rng([seed, 2])
+            flight = make_flight(seed, 60)
+            # Accelerations that the IMU measures are shorter than those in the map; gravity is not. All points are far.
+            down = np.einsum("nji,j->ni", flight.T[:, :3, :3], GRAVITY)
+            flight = replace(flight, accel=(flight.accel + down) / longer - down, points=5.0 * flight.points)
+            smoother = FixedLagSmoother(CAMERA, CALIBRATION, FixedLagConfig())
+            smoother.start(flight.pose(0), flight.velocity[0], np.zeros(6), GRAVITY, StartDeviations())
+            for k in range(60):
+                state = smoother.add(flight.samples(k), see(flight, k + 1, rng, 0.3), length_error=length_error)
+                assert state is not None
+            tilts.setdefault(length_error, []).append(float(np.abs(state.tilt).max()))
+    assert np.mean(tilts[longer - 1.0]) < 0.6 * np.mean(tilts[0.0])
+
+
 def test_in_dead_reckoning_the_imu_carries_and_the_covariance_grows() -> None:
     flight, states, _ = fly(
         8, 80, FixedLagConfig(), bias=np.array([0.01, 0.0, 0.0, 0.05, 0.0, 0.0]), blind=range(41, 81)

@@ -55,7 +55,9 @@ def flight(
     rate = measured.gyro if gyro is None else measured.gyro @ gyro.T
     force = measured.accel if accel is None else measured.accel @ accel.T
     truth = path.motion(exposed * 1e-9).T_w_b
-    errors = np.concatenate([position_m * rng.normal(size=(len(exposed), 3)), 2e-4 * rng.normal(size=(len(exposed), 3))], 1)
+    errors = np.concatenate(
+        [position_m * rng.normal(size=(len(exposed), 3)), 2e-4 * rng.normal(size=(len(exposed), 3))], 1
+    )
     seen = np.array([T @ se3.exp(e) for T, e in zip(truth, errors, strict=True)])
     return Flight(exposed + late_ns, seen, truth, ImuBatch(stamps, rate, force))
 

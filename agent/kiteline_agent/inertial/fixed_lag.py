@@ -101,7 +101,7 @@ class FixedLagSmoother:
         self._newest: tuple[Samples, Preintegrated] | None = None  # preintegrated last
         self._imu_dt, self._imu_turn, self._imu_vp = np.zeros(n), np.zeros((n, 3, 3)), np.zeros((n, 6))
         self._imu_jac, self._imu_bias = np.zeros((n, 9, 6)), np.zeros((n, 6))
-        self._imu_info, self._imu_walk = np.zeros((n, 9, 9)), np.zeros((n, 2))
+        self._imu_info, self._imu_walk, self._imu_length = np.zeros((n, 9, 9)), np.zeros((n, 2)), np.zeros((n, 9))
         self._prior_h, self._prior_b = np.zeros((17, 17)), np.zeros(17)
         self._prior_r, self._prior_s, self._prior_tilt = np.eye(3), np.zeros(12), np.zeros(2)
         self._counts, self._scale = np.zeros(n, np.int64), np.ones(n)
@@ -175,11 +175,14 @@ class FixedLagSmoother:
         return held[1]
 
     def add(
-        self, samples: Samples, points: VisualPoints | None, odometry: BodyVelocity | None = None
-    ) -> InertialState | None:
+        self, samples: Samples, points: VisualPoints | None, odometry: BodyVelocity | None = None,
+        length_error: float = 0.0,
+    ) -> InertialState | None:  # fmt: skip
         """Add a frame: samples since the last one, landmark observations (None: dead reckoning) and odometry.
 
-        Returns None, without a state, if the system could not be solved; `start` is needed then.
+        length_error: relative deviation of lengths in the map. A change of velocity in it differs by that from what the
+        IMU measures. Without it, biases and vertical would take up the difference, and poses would lag behind the
+        images later. Returns None, without a state, if the system could not be solved; `start` is needed then.
         """
         if self._n > self._config.states - 1 and not self._drop_oldest():
             self.stop()
@@ -193,6 +196,9 @@ class FixedLagSmoother:
         if not (np.isfinite(T_m_b).all() and np.isfinite(motion.cov).all()):
             self.stop()
             return None
+        change = self._rot[k - 1].T @ (velocity - self._state[k - 1, 3:6])
+        self._imu_length[k - 1, 3:6], self._imu_length[k - 1, 6:] = change, 0.5 * motion.dt_s * change
+        self._imu_length[k - 1] *= self._config.length_inflation * length_error
         self._put_interval(k - 1, motion)
         self._samples.append(samples)
         self._rot[k] = se3.orthonormalise(T_m_b)[:3, :3]
@@ -301,7 +307,8 @@ class FixedLagSmoother:
     def _put_interval(self, k: int, motion: Preintegrated) -> None:
         self._imu_dt[k], self._imu_turn[k], self._imu_vp[k] = motion.dt_s, motion.turn, motion.vp
         self._imu_jac[k], self._imu_bias[k] = motion.jac, motion.bias
-        self._imu_info[k] = np.linalg.inv(motion.cov + self._floor)
+        by_length = self._imu_length[k]
+        self._imu_info[k] = np.linalg.inv(motion.cov + self._floor + np.outer(by_length, by_length))
         self._imu_walk[k] = 1.0 / (self._walk_square * motion.dt_s)
 
     def _put_points(self, k: int, points: VisualPoints | None) -> None:
@@ -357,8 +364,8 @@ class FixedLagSmoother:
         n = self._n
         arrays: list[NDArray[np.generic]] = [
             self._rot, self._state, self._imu_dt, self._imu_turn, self._imu_vp, self._imu_jac, self._imu_bias,
-            self._imu_info, self._imu_walk, self._counts, self._scale, self._vis_h, self._vis_b, self._vis_r,
-            self._vis_p, self._vel, self._vel_info,
+            self._imu_info, self._imu_walk, self._imu_length, self._counts, self._scale, self._vis_h, self._vis_b,
+            self._vis_r, self._vis_p, self._vel, self._vel_info,
         ]  # fmt: skip
         if self._config.fresh > 1:  # else points of older frames are condensed already
             arrays += [self._xyz, self._ray, self._observed, self._sigma, self._use]

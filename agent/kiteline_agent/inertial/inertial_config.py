@@ -18,6 +18,7 @@ class FixedLagConfig:
     velocity_gate: float = 16.27  # 99.9 %: beyond it a velocity is rejected: wheels slip
     visual_inflation: float = 16.0  # of variance: errors of templates and points are correlated over frames
     imu_inflation: float = 3.0  # of noise densities: vibration, uncalibrated scale and axes, a bent map
+    length_inflation: float = 3.0  # of the deviation of the map's lengths: it lasts over the frames of an acceleration
     turn_floor_rad: float = 2e-5  # error of a preintegrated rotation that no noise density explains
     velocity_floor_m_s: float = 5e-4  # the same of velocity: interpolated ends of the interval
     position_floor_m: float = 2e-5  # the same of position
@@ -77,6 +78,7 @@ class InertialConfig:
     calibration: SelfCalibrationConfig = field(default_factory=SelfCalibrationConfig)
     scale_filter: ScaleFilterConfig = field(default_factory=ScaleFilterConfig)
     loss_motion: LossMotionConfig = field(default_factory=LossMotionConfig)
+    disparity_px: float = 0.1  # px; by which good calibrations are off: an error of lengths that grows with the depth
     gravity_m_s2: float = 9.81  # differs by 0.3 % over the earth, which the accelerometer bias absorbs
     silent_s: float = 3.0  # time without a sample after which an event is logged
     max_gap_s: float = 0.2  # a longer gap in the samples makes an interval unknown: a bus was blocked

@@ -50,7 +50,7 @@ class InertialTracker:
     ) -> None:
         self._config = config
         self._calibration = calibration
-        self._p_b_c = camera.T_b_c[:3, 3].copy()
+        self._p_b_c, self._bf = camera.T_b_c[:3, 3].copy(), camera.bf
         self._buffer = SampleBuffer(3.0, config.max_gap_s)
         self._smoother = FixedLagSmoother(camera, calibration, config.smoother, config.gravity_m_s2)
         self.self_calibration = SelfCalibration(
@@ -189,9 +189,9 @@ class InertialTracker:
         T_m_b_visual: (4,4) by images alone, from `points`. velocity: by an odometer. Returns the fused state; None
         before the initialisation and without samples, when the pose from images stands.
         """
-        samples = self._interval(t_ns)
+        samples, depth_m = self._interval(t_ns), points.depth_m(T_m_b_visual)
         if samples is not None:
-            self._calibrate(t_ns, T_m_b_visual, points, samples.duration_s)
+            self._calibrate(t_ns, T_m_b_visual, depth_m, samples.duration_s)
             if self.self_calibration.awaits_search:
                 self._smoother.stop()
             if self.self_calibration.restarted or self.self_calibration.awaits_search:
@@ -199,8 +199,10 @@ class InertialTracker:
         state = None
         if self._smoother.running:
             awaits = self._awaited(samples) is not None
-            state = self._advance(without_held(samples) if samples and awaits else samples, points, velocity)
-        self._watch_scale(t_ns, T_m_b_visual, points, state)
+            held = without_held(samples) if samples and awaits else samples
+            length_error = self._config.disparity_px * depth_m / self._bf if self._images_have_scale else 0.0
+            state = self._advance(held, points, velocity, length_error)
+        self._watch_scale(t_ns, T_m_b_visual, depth_m, state)
         if state is None:
             self._initialiser.add(TimedPose(t_ns, T_m_b_visual.copy(), samples, self._awaited(samples)))
             self._set_last(t_ns, T_m_b_visual)
@@ -346,13 +348,14 @@ class InertialTracker:
         self._interval_end_ns = t_ns + self._offset_ns
 
     def _advance(
-        self, samples: Samples | None, points: VisualPoints | None, velocity: BodyVelocity | None
-    ) -> InertialState | None:
+        self, samples: Samples | None, points: VisualPoints | None, velocity: BodyVelocity | None,
+        length_error: float = 0.0,
+    ) -> InertialState | None:  # fmt: skip
         if samples is None:
             self._smoother.stop()
             return None
         self._complete_interval()
-        state = self._smoother.add(samples, points, velocity)
+        state = self._smoother.add(samples, points, velocity, length_error)
         if state is not None:
             self._bias = state.bias
         end_ns = self._interval_end_ns + round(samples.duration_s * 1e9)
@@ -360,7 +363,7 @@ class InertialTracker:
         self._incomplete = (self._interval_end_ns, end_ns) if newest is not None and newest < end_ns else None
         return state
 
-    def _watch_scale(self, t_ns: int, T_m_b: F64, points: VisualPoints, state: InertialState | None) -> None:
+    def _watch_scale(self, t_ns: int, T_m_b: F64, depth_m: float, state: InertialState | None) -> None:
         """Compare a pose by images, and one some frames before, with the IMU in between."""
         if not self._scale.running or state is None:
             self._scale.stop()
@@ -370,7 +373,6 @@ class InertialTracker:
             self._scale_from = (t_ns, T_m_b)
         elif (t_ns - self._scale_from[0]) * 1e-9 >= self._config.scale_filter.interval_s:
             samples = self.samples_between(self._scale_from[0], t_ns)
-            depth_m = points.depth_m(T_m_b)
             if samples is not None and depth_m > 0.0:
                 self._scale.add(self._scale_from[1], T_m_b, samples, state.bias[:3], depth_m)
             else:
@@ -384,9 +386,9 @@ class InertialTracker:
             if samples is not None:
                 self._smoother.replace_last(samples)
 
-    def _calibrate(self, t_ns: int, T_m_b_visual: F64, points: VisualPoints, dt_s: float) -> None:
+    def _calibrate(self, t_ns: int, T_m_b_visual: F64, depth_m: float, dt_s: float) -> None:
         gravity = self._smoother.gravity if self._smoother.running and self._images_have_scale else None
-        self.self_calibration.add(t_ns, T_m_b_visual, points.depth_m(T_m_b_visual))
+        self.self_calibration.add(t_ns, T_m_b_visual, depth_m)
         change = self.self_calibration.update(self._buffer, gravity, dt_s)
         if self.self_calibration.restarted:
             self._smoother.stop()
