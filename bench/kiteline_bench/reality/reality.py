@@ -1,6 +1,6 @@
 """The bars of real and worn recordings."""
 
-from kiteline_bench.agent import rigs
+from kiteline_bench.agent import altitude, rigs
 from kiteline_bench.base import real_places
 from kiteline_bench.reality import (
     base,
@@ -30,6 +30,7 @@ PARTS = {
     "nees": ("Reality: consistent poses of worn rigs", nees.run),
     "people": ("Reality: people who walk through", people.run),
     "rigs": ("Reality: rigs of many kinds", rigs.run),
+    "altitude": ("Reality: high above ground", altitude.run),
     "difficult": ("Reality: difficult images", difficult.run),
     "places": ("Reality: places on real images", real_places.run),
     "cpu": ("Reality: CPU over a yardstick", cpu.run),
