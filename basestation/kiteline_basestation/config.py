@@ -1,6 +1,7 @@
 """Configuration of the base station: one frozen section per stage."""
 
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 from kiteline_core.ground.config import GroundConfig as ScanConfig
 from kiteline_core.imaging.matching import MatchConfig
@@ -166,7 +167,9 @@ class PublishConfig:
 class MapCacheConfig:
     """Keyframes that are sent to an agent for its map cache."""
 
-    max_keyframes: int = 24  # keyframes in an agent's cache, 0 none; they cover two views of a room and the way there
+    MAY_BE_ZERO: ClassVar = ("max_keyframes",)
+
+    max_keyframes: int = 24  # keyframes in an agent's cache, 0: none; they cover two views of a room and the way there
     period_s: float = 1.0  # s between two plans
     horizon_s: float = 2.0  # s that the motion is predicted: what a thin link takes to carry two keyframes
     local_keyframes: int = 48  # newest keyframes of its own that an agent keeps in its local map
@@ -180,7 +183,9 @@ class MapCacheConfig:
 class TileConfig:
     """Tiles of the grid that are sent to an agent."""
 
-    max_tiles: int = 96  # tiles that an agent holds, 0 none: 4 kB each on board; a disc of 15 m radius at 0.05 m has 70
+    MAY_BE_ZERO: ClassVar = ("max_tiles",)
+
+    max_tiles: int = 96  # tiles that an agent holds, 0: none; 4 kB each on board; a disc of 15 m radius has 70
     period_s: float = 1.0  # s between two plans
     horizon_s: float = 3.0  # s that the motion is predicted: what lies ahead is of use before the agent is there
     reach_m: float = 14.0  # m; tiles whose centres are nearer are sent: distances are told up to 10 m

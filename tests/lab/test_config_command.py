@@ -1,3 +1,4 @@
+import re
 import resource
 import tomllib
 from collections.abc import Callable
@@ -36,7 +37,7 @@ def test_options_have_units_and_all_a_reason() -> None:
     assert by_name["agent.keyframe.max_gap_s"].unit == "s"
     assert by_name["base.grid.cell_m"].reason.startswith("a quarter of the gap")
     assert all(s.purpose for s in sections())
-    assert by_name["base.measurement.sigma_disparity_px"].reason.startswith("px at octave 0")  # in brackets
+    assert by_name["base.measurement.sigma_disparity_px"].reason.startswith("at octave 0; ")  # in brackets
     assert [o.name for o in by_name.values() if not o.reason] == []
 
 
@@ -85,6 +86,25 @@ def test_a_check_names_line_and_expectation_of_every_problem(
         assert all(part in line for part in parts), (line, parts)
     with pytest.raises(ConfigError):
         agent_config(str(path))
+
+
+def test_nothing_stands_for_a_number_only_where_the_reason_says_what_that_means() -> None:
+    numbers = [
+        o for s in sections() for o in s.options
+        if isinstance(o.default, int | float) and not isinstance(o.default, bool) and o.default > 0
+    ]  # fmt: skip
+    assert len(numbers) > 400
+    for o in numbers:
+        problems = command.check(f"[{o.section}]\n{o.key} = 0\n")
+        assert bool(problems) == (re.search(r"\b0: ", o.reason) is None or "octave 0: " in o.reason), o
+        assert all("expected" in p.text for p in problems), problems
+
+
+def test_reasons_do_not_repeat_the_unit_and_name_values_as_toml_has_them() -> None:
+    options = [o for s in sections() for o in s.options]
+    assert [o for o in options if o.unit and o.reason.startswith(f"{o.unit} ")] == []
+    assert [o for o in options if re.search("True|False", o.reason)] == []
+    assert next(o for o in options if o.name == "agent.stereo.sigma_px").reason.startswith("at octave 0: ")
 
 
 @pytest.mark.parametrize("text", ["a = = 1\n", "[agent\n"])
