@@ -98,8 +98,8 @@ class LoopConfig:
     agree_scale: float = 0.05  # difference of the logarithms of two scales that agree
     drift_m: float = 0.3  # m; correction of a loop that drift explains
     drift_path: float = 0.02  # added share of the path between the two keyframes
-    drift_votes: int = 12  # keyframes in a row, none against them, that outvote this expectation in one submap
-    most_drift: float = 5.0  # times the expected drift; no votes suffice beyond: two storeys that look alike
+    drift_votes: int = 12  # keyframes in a row, none against them, that refute this expectation in one submap
+    most_drift: float = 5.0  # times the expected drift; beyond, no number of them does: two storeys that look alike
     tilt_rad: float = 0.05  # rad; by which gravity of two maps may differ that are merged: cameras on worn mounts
     monocular_drift_path: float = 0.05  # share of the path instead of drift_path if the scale drifts too
 

@@ -16,7 +16,7 @@ from kiteline_agent.runtime.options import AgentOptions
 from kiteline_bench.vehicle import guided
 from kiteline_core.geometry import se3
 from kiteline_hw.calibration import own
-from kiteline_hw.calibration.told import ToldCalibration
+from kiteline_hw.calibration.file_calibration import FileCalibration
 from kiteline_hw.ports import SourceError
 from kiteline_hw.sources.open import open_source
 from kiteline_lab.calibration import calibrate, imu
@@ -49,7 +49,7 @@ def test_a_camera_that_was_mounted_by_a_ruler_is_found_by_turns(
     assert source.rig.right is not None and source.rig.T_c_r is not None
     T_b_c = source.rig.T_b_c.copy()
     T_b_c[:3, :3] = T_b_c[:3, :3] @ se3.so3_exp(np.radians([1.5, -1.0, 1.5]))
-    told = ToldCalibration("", (source.rig.left, source.rig.right), source.rig.T_c_r, T_b_c, source.imu)
+    told = FileCalibration("", (source.rig.left, source.rig.right), source.rig.T_c_r, T_b_c, source.imu)
     calibration, rig = tmp_path / "calibration.yaml", tmp_path / "rig.toml"
     calibration.write_text(own.texts(told)["calibration.yaml"])
     command = ["imu", str(flight), "--calibration", str(calibration), "--rig", str(rig)]

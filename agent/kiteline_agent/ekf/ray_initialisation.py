@@ -55,9 +55,9 @@ class Track:
 class Rays:
     """A track's rays, linearised and split by the point where they meet, in deviations of an observation.
 
-    0 = by_point error of the point + by_state error of the state + white noise, and told = H error of the state + white
-    noise, where the point is eliminated. point: (3,). columns: (k,) of the state. by_point: (3,3). by_state: (3,k). H:
-    (m,k). told: (m,).
+    0 = by_point error of the point + by_state error of the state + white noise, and residual = H error of the state +
+    white noise, where the point is eliminated. point: (3,). columns: (k,) of the state. by_point: (3,3). by_state:
+    (3,k). H: (m,k). residual: (m,).
     """
 
     point: F64
@@ -65,7 +65,7 @@ class Rays:
     by_point: F64
     by_state: F64
     H: F64
-    told: F64
+    residual: F64
 
 
 def linearised(state: FilterState, track: Track, T_o_c: F64, view_T_o_c: F64) -> Rays | None:
@@ -99,7 +99,7 @@ def linearised(state: FilterState, track: Track, T_o_c: F64, view_T_o_c: F64) ->
 def rays_meet(state: FilterState, rays: Rays, gate: float) -> bool:
     """True if rays meet as well as the state's covariance allows, by chi-square over degrees of freedom."""
     spread = rays.H @ state.covariance(rays.columns) @ rays.H.T + np.eye(len(rays.H))
-    return bool(rays.told @ np.linalg.solve(spread, rays.told) <= gate * len(rays.H))
+    return bool(rays.residual @ np.linalg.solve(spread, rays.residual) <= gate * len(rays.H))
 
 
 def new_landmark(state: FilterState, rays: Rays) -> NewLandmark:

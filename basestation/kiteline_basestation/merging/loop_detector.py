@@ -237,7 +237,7 @@ class LoopDetector:
         best = max(chosen, key=lambda m: (m.inliers, m.new))
         if same_map and not consistency.within_drift(self._map, match, config):
             alone = len(chosen) == len(matches)  # one that sees two places speaks for neither
-            if new == old and alone and consistency.outvotes_drift(self._map, chosen, config):
+            if new == old and alone and consistency.exceeds_expected_drift(self._map, chosen, config):
                 self._matches[key] = []
                 return self._closure(best, chosen)
             self.rejected += 1

@@ -9,8 +9,8 @@ import pytest
 from kiteline_core.frame import Frame, ImuBatch
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import Lens, Rectifier
+from kiteline_hw.calibration.file_calibration import UNCALIBRATED
 from kiteline_hw.calibration.files import read_calibration
-from kiteline_hw.calibration.told import UNCALIBRATED
 from kiteline_hw.cameras.live_options import LiveOptions, read_rig
 from kiteline_hw.ports import SourceError
 from kiteline_hw.sources.open import open_source
@@ -122,12 +122,12 @@ def test_another_size_is_refused(data_dir: Path, tmp_path: Path) -> None:
 def test_own_calibration_of_a_recording_told_again_changes_nothing(data_dir: Path) -> None:
     root = data_dir / "euroc_v101_start"
     names = ",".join(str(root / "mav0" / n / "sensor.yaml") for n in ("cam0", "cam1", "imu0"))
-    plain, told = open_source(str(root)), open_source(str(root), calibration=names)
-    assert (told.rig.left, told.rig.right, told.imu) == (plain.rig.left, plain.rig.right, plain.imu)
-    assert told.rig.T_c_r is not None and plain.rig.T_c_r is not None
-    np.testing.assert_array_equal(told.rig.T_c_r, plain.rig.T_c_r)
-    np.testing.assert_allclose(told.rig.T_b_c, plain.rig.T_b_c, atol=1e-15)
-    np.testing.assert_array_equal(told.ground_truth.T_w_b, plain.ground_truth.T_w_b)
+    plain, given = open_source(str(root)), open_source(str(root), calibration=names)
+    assert (given.rig.left, given.rig.right, given.imu) == (plain.rig.left, plain.rig.right, plain.imu)
+    assert given.rig.T_c_r is not None and plain.rig.T_c_r is not None
+    np.testing.assert_array_equal(given.rig.T_c_r, plain.rig.T_c_r)
+    np.testing.assert_allclose(given.rig.T_b_c, plain.rig.T_b_c, atol=1e-15)
+    np.testing.assert_array_equal(given.ground_truth.T_w_b, plain.ground_truth.T_w_b)
 
 
 def test_truth_of_camera_poses_becomes_that_of_the_told_body(data_dir: Path, tmp_path: Path) -> None:
@@ -138,9 +138,11 @@ def test_truth_of_camera_poses_becomes_that_of_the_told_body(data_dir: Path, tmp
         "kiteline_calibration: 1\nleft: {width: 640, height: 480, fx: 517, fy: 516, cx: 318, cy: 255, lens: none}\n"
         f"T_b_c: {T_b_c.tolist()}\n"
     )
-    told = open_source(str(data_dir / "tum_rgbd_xyz"), calibration=str(file))
-    assert told.rig.has_depth and told.rig.has_body and plain.ground_truth is not None and told.ground_truth is not None
-    np.testing.assert_allclose(told.ground_truth.T_w_b @ T_b_c, plain.ground_truth.T_w_b, atol=1e-12)
+    given = open_source(str(data_dir / "tum_rgbd_xyz"), calibration=str(file))
+    assert (
+        given.rig.has_depth and given.rig.has_body and plain.ground_truth is not None and given.ground_truth is not None
+    )
+    np.testing.assert_allclose(given.ground_truth.T_w_b @ T_b_c, plain.ground_truth.T_w_b, atol=1e-12)
 
 
 def test_a_bag_without_calibration(tmp_path: Path) -> None:
@@ -167,7 +169,7 @@ def test_a_live_pair_by_a_calibration_file(tmp_path: Path) -> None:
     chain.write_text(CHAIN)
     options = LiveOptions(calibration=str(chain))
     by_option = read_rig("v4l2", options, stereo=True)
-    by_flag = read_rig("v4l2", LiveOptions(calibration="none.yaml"), stereo=True, told=read_calibration(str(chain)))
+    by_flag = read_rig("v4l2", LiveOptions(calibration="none.yaml"), stereo=True, given=read_calibration(str(chain)))
     for rig in (by_option, by_flag):
         assert rig.right.fx == 190.44236969414825 and rig.has_body
     assert read_rig("v4l2", options, stereo=False).right is None
@@ -175,8 +177,8 @@ def test_a_live_pair_by_a_calibration_file(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match="one camera"):
         read_rig("v4l2", options, stereo=True)
     with pytest.raises(SourceError, match="size of the images is not known"):
-        read_rig("v4l2", LiveOptions(), stereo=True, told=UNCALIBRATED)
+        read_rig("v4l2", LiveOptions(), stereo=True, given=UNCALIBRATED)
     rough = tmp_path / "camera.yaml"
     rough.write_text("fx: 1\nfy: 1\ncx: 1\ncy: 1\nwidth: 640\nheight: 480\nbaseline_m: 0.1\n")
-    rig = read_rig("v4l2", LiveOptions(calibration=str(rough)), stereo=True, told=UNCALIBRATED)
+    rig = read_rig("v4l2", LiveOptions(calibration=str(rough)), stereo=True, given=UNCALIBRATED)
     assert rig.right is not None and (rig.left.width, rig.left.height) == (640, 480)

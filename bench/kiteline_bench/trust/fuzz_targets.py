@@ -1,4 +1,4 @@
-"""The doors of kiteline beyond packets: questions, stores, and files of each kind; each with valid input to mutate."""
+"""Readers of outside bytes beyond packets: questions, stores and files; each with valid input to mutate."""
 
 import contextlib
 import json
@@ -42,7 +42,7 @@ _SENSOR = (
 
 
 @dataclass(frozen=True, slots=True)
-class Door:
+class FuzzTarget:
     """Takes bytes, and raises one of ERRORS or nothing. samples: valid bytes."""
 
     name: str
@@ -50,7 +50,7 @@ class Door:
     samples: tuple[bytes, ...]
 
 
-def doors(folder: Path) -> list[Door]:
+def fuzz_targets(folder: Path) -> list[FuzzTarget]:
     """All of them. folder: for files."""
     images = {ending: _image(ending) for ending in (".png", ".jpg", ".bmp", ".pgm", ".tiff", ".webp")}
     flight, table = folder / "flight" / "mav0" / "cam0", folder / "rgbd"
@@ -75,22 +75,26 @@ def doors(folder: Path) -> list[Door]:
     mapper = Mapper(BaseConfig())
     sensors = (_SENSOR.encode(), b"[" * 4000, b"{a: " * 4000)
     return [
-        Door("question", lambda data, draw: _ask(mapper, data, draw), _questions()),
-        Door("saved map", lambda data, draw: unpack(data), (_packed(),)),
-        Door("store", by_file(f"fuzzed/{FILE}", read), (store,)),
-        Door("store's rows", by_file(f"rows/{FILE}", read), tuple(_odd_rows(folder / "odd", store))),
-        Door("log", by_file("fuzzed.mcap", _read_log), (log,)),
-        Door("log as a source", by_file("source.mcap", _open_log), (log,)),
-        Door("ROS 2 bag", by_file("bag.db3", _open_log), (_sqlite_bag(), _computed_bag())),
-        Door("log to import", by_file("import.mcap", lambda path: import_map(path, _no_station)), (log,)),
-        Door("rig", lambda data, draw: rig_from_json(_json(data)), (rig,)),
-        Door("image", lambda data, draw: decode_grey(EncodedImage(data, "png")), tuple(images.values())),
-        Door("depth image", lambda data, draw: decode_depth(EncodedImage(data, "png/1000")), tuple(images.values())),
-        Door("calibration", by_file("c.yaml", lambda path: read_calibration(str(path))), sensors),
-        Door("sensor file", by_file("s.yaml", lambda path: read_yaml(path, "a sensor")), sensors),
-        Door("EuRoC's listing", by_file("flight/mav0/cam0/data.csv", lambda _: _frames(euroc, flight.parent.parent)),
-             (b"1,1.png\n2,1.png\n",)),
-        Door("TUM's listing", by_file("rgbd/rgb.txt", lambda _: _frames(tum, table)), (b"1.0 rgb/1.png\n",)),
+        FuzzTarget("question", lambda data, draw: _ask(mapper, data, draw), _questions()),
+        FuzzTarget("saved map", lambda data, draw: unpack(data), (_packed(),)),
+        FuzzTarget("store", by_file(f"fuzzed/{FILE}", read), (store,)),
+        FuzzTarget("store's rows", by_file(f"rows/{FILE}", read), tuple(_odd_rows(folder / "odd", store))),
+        FuzzTarget("log", by_file("fuzzed.mcap", _read_log), (log,)),
+        FuzzTarget("log as a source", by_file("source.mcap", _open_log), (log,)),
+        FuzzTarget("ROS 2 bag", by_file("bag.db3", _open_log), (_sqlite_bag(), _computed_bag())),
+        FuzzTarget("log to import", by_file("import.mcap", lambda path: import_map(path, _no_station)), (log,)),
+        FuzzTarget("rig", lambda data, draw: rig_from_json(_json(data)), (rig,)),
+        FuzzTarget("image", lambda data, draw: decode_grey(EncodedImage(data, "png")), tuple(images.values())),
+        FuzzTarget(
+            "depth image", lambda data, draw: decode_depth(EncodedImage(data, "png/1000")), tuple(images.values())
+        ),
+        FuzzTarget("calibration", by_file("c.yaml", lambda path: read_calibration(str(path))), sensors),
+        FuzzTarget("sensor file", by_file("s.yaml", lambda path: read_yaml(path, "a sensor")), sensors),
+        FuzzTarget(
+            "EuRoC's listing", by_file("flight/mav0/cam0/data.csv", lambda _: _frames(euroc, flight.parent.parent)),
+            (b"1,1.png\n2,1.png\n",),
+        ),
+        FuzzTarget("TUM's listing", by_file("rgbd/rgb.txt", lambda _: _frames(tum, table)), (b"1.0 rgb/1.png\n",)),
     ]  # fmt: skip
 
 

@@ -14,12 +14,12 @@ from kiteline_hw.ports import SourceError
 
 
 @dataclass(frozen=True, slots=True)
-class ToldCalibration:
+class FileCalibration:
     """A calibration read from files.
 
     cameras: none, the left one, or left and right. T_c_r: (4,4) right camera in the left one. T_b_c: (4,4) left camera
-    in the body, which is the IMU; None: not told. topics: of the cameras in a bag, "" where not told. known: False for
-    a stand-in where nothing is calibrated yet, whose size is that of the images.
+    in the body, which is the IMU; None: not given. topics: of the cameras in a bag, "" where not given. known: False
+    for a stand-in where nothing is calibrated yet, whose size is that of the images.
     """
 
     where: str
@@ -57,7 +57,7 @@ class ToldCalibration:
 
 
 # Opens sources whose images are to be calibrated.
-UNCALIBRATED = ToldCalibration(
+UNCALIBRATED = FileCalibration(
     "no calibration", (CameraModel(1, 1, 1.0, 1.0, 0.0, 0.0),) * 2, se3.from_rt(np.eye(3), np.array([0.1, 0.0, 0.0])),
     known=False,
 )  # fmt: skip
@@ -68,18 +68,18 @@ class FilePart:
     """Content of one file. T_s_c: camera in a frame that all files share; P: (3,4) of a rectified pair, with its R."""
 
     where: str
-    calibration: ToldCalibration
+    calibration: FileCalibration
     T_s_c: F64 | None = None
     T_s_i: F64 | None = None
     rectified: tuple[F64, F64] | None = None  # R (3,3), P (3,4)
 
 
-def joined(parts: Sequence[FilePart]) -> ToldCalibration:
+def joined(parts: Sequence[FilePart]) -> FileCalibration:
     """One calibration of several files: left camera first, right camera second, an IMU anywhere. Raises SourceError."""
     if len(parts) == 1:
         only = parts[0]
-        told = only.calibration
-        return told if only.T_s_c is None else replace(told, T_b_c=only.T_s_c)
+        given = only.calibration
+        return given if only.T_s_c is None else replace(given, T_b_c=only.T_s_c)
     where = ", ".join(p.where for p in parts)
     eyes = [p for p in parts if p.calibration.cameras]
     imus = [p for p in parts if p.calibration.imu is not None]
@@ -88,7 +88,7 @@ def joined(parts: Sequence[FilePart]) -> ToldCalibration:
         raise SourceError(f"{where}: {count} cameras and {len(imus)} IMUs: expected a left and a right camera, one IMU")
     imu = imus[0].calibration.imu if imus else None
     if not eyes:
-        return ToldCalibration(where, imu=imu)
+        return FileCalibration(where, imu=imu)
     first = eyes[0].calibration
     T_b_c = first.T_b_c
     T_s_i = next((p.T_s_i for p in imus if p.T_s_i is not None), None)
@@ -99,7 +99,7 @@ def joined(parts: Sequence[FilePart]) -> ToldCalibration:
     left, right = eyes
     T_c_r = _between(left, right)
     cameras, topics = (left.calibration.cameras + right.calibration.cameras), (first.topics + right.calibration.topics)
-    return ToldCalibration(where, cameras, T_c_r, T_b_c, imu, topics)
+    return FileCalibration(where, cameras, T_c_r, T_b_c, imu, topics)
 
 
 def _between(left: FilePart, right: FilePart) -> F64 | None:
