@@ -1,126 +1,22 @@
-"""The offset of disparities is found on board, by the parallax of landmarks; kernels against numpy."""
+"""The offset of disparities is found on board, by the parallax of landmarks."""
 
 import math
-from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from kiteline_agent.config import AgentConfig, DisparityConfig, LocalMapConfig
+from kiteline_agent.config import AgentConfig, DisparityConfig
 from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_agent.governor.cost_model import Work
-from kiteline_agent.local_map import disparity_kernels as kernels
-from kiteline_agent.local_map.disparity_alignment import DisparityAlignment
-from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.mapping.right_camera import RightCamera
-from kiteline_codec.schema import KeyframeHeader
-from kiteline_core.arrays import F64, I64
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
-from kiteline_core.geometry.cameras import CameraModel, CameraRig, RectifiedCamera, Rectifier
+from kiteline_core.geometry.cameras import CameraModel, CameraRig, Rectifier
 from kiteline_core.geometry.disparity_offset import TERMS, terms
-from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId
-from tests.agent.plain_landmarks import plain_landmarks
-
-CAMERA = RectifiedCamera(752, 480, 430.0, 430.0, 376.0, 240.0, 0.11, True, np.eye(4))
-WORN = np.array([-0.6, 0.1, -0.3, -0.5, 0.3])
-NOTHING = np.zeros(5)
-
-
-def intrinsics() -> F64:
-    return np.array([CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy, CAMERA.bf])
-
-
-def normalised(uv: F64) -> F64:
-    return np.asarray((uv - [CAMERA.cx, CAMERA.cy]) / [CAMERA.fx, CAMERA.fy])
-
-
-def residuals(uv: F64, disparity: F64, seen: F64, T: F64, offset: F64, rho: F64) -> F64:
-    """(n,4) px: of the first disparity, then of u, v and disparity in the second frame; 0 if not measured."""
-    q = np.column_stack([normalised(uv), np.ones(len(uv))]) @ T[:3, :3].T + rho[:, None] * T[:3, 3]
-    found = q[:, :2] / q[:, 2:] * [CAMERA.fx, CAMERA.fy] + [CAMERA.cx, CAMERA.cy]
-    far = CAMERA.bf * rho / q[:, 2] + terms(normalised(seen[:, :2])) @ offset - seen[:, 2]
-    return np.column_stack([
-        CAMERA.bf * rho + terms(normalised(uv)) @ offset - disparity, found - seen[:, :2],
-        np.where(seen[:, 2] >= 0.0, far, 0.0),
-    ])  # fmt: skip
-
-
-@settings(max_examples=15, deadline=None)
-@given(seed=st.integers(0, 10_000))
-def test_the_normal_equations_are_those_of_numpy(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    n = 12
-    uv = rng.uniform([40, 40], [710, 440], (n, 2))
-    rho, offset = rng.uniform(0.1, 0.6, n), rng.normal(0, 0.3, 5)
-    T = se3.exp(rng.normal(0, 0.1, 6))
-    found = residuals(uv, np.zeros(n), np.zeros((n, 3)), T, offset, rho)
-    seen = np.column_stack([found[:, 1:3], CAMERA.bf * rho]) + rng.normal(0, 0.3, (n, 3))
-    seen[::5, 2] = -1.0
-    disparity, sigma = CAMERA.bf * rho + rng.normal(0, 0.3, n), rng.uniform(0.5, 1.0, n)
-
-    def all_residuals(x: F64) -> F64:
-        X = se3.exp(np.concatenate([np.zeros(3), x[3:6]])) @ T
-        X[:3, 3] += x[:3]
-        return (residuals(uv, disparity, seen, X, offset + x[6:11], rho + x[11:]) / sigma[:, None]).ravel()
-
-    step = 1e-6
-    jac = np.stack([(all_residuals(step * e) - all_residuals(-step * e)) / (2 * step) for e in np.eye(11 + n)], 1)
-    e = all_residuals(np.zeros(11 + n)).reshape(n, 4)
-    square = np.sum(e**2, 1)
-    root = np.repeat(np.sqrt(np.where(square > 9.0, 9.0 / np.maximum(square, 1e-9), 1.0)), 4)
-    jac, e_all = jac * root[:, None], e.ravel() * root
-    h, b = jac.T @ jac, -jac.T @ e_all
-    eliminate = np.linalg.solve(h[11:, 11:], h[11:, :11]).T
-    system, point = np.empty((11, 12)), np.empty((n, 12))
-    mean = kernels.linearise_pair(uv, disparity, sigma, seen, T, intrinsics(), offset, rho, system, point)
-    want = h[:11, :11] - eliminate @ h[11:, :11]
-    assert np.allclose(system[:, :11], want, rtol=1e-4, atol=1e-3 * np.abs(want).max())
-    side = b[:11] - eliminate @ b[11:]
-    assert np.allclose(system[:, 11], side, rtol=1e-4, atol=1e-3 * max(np.abs(side).max(), 1.0))
-    assert mean == pytest.approx(float(np.minimum(square, 9.0).mean()))
-    x = rng.normal(0, 1e-3, 11)
-    moved = rho.copy()
-    kernels.move_points(point, x, 1e-4, moved)
-    assert np.allclose(moved - rho, np.linalg.solve(h[11:, 11:], b[11:] - h[11:, :11] @ x), rtol=1e-3, atol=1e-6)
-
-
-class Flight:
-    """A camera that moves before a cloud; its disparities are off."""
-
-    def __init__(self, offset: F64, seed: int, step: F64) -> None:
-        self.rng, self.offset, self.step = np.random.default_rng(seed), offset, step
-        self.period_ns = 50_000_000
-        self.map = LocalMap(CAMERA, LocalMapConfig(keyframes=8))
-        self.alignment = DisparityAlignment(self.map, DisparityConfig())
-        uv = self.rng.uniform([40, 40], [710, 440], (160, 2))
-        self.depth = self.rng.uniform(2.0, 12.0, len(uv))
-        self.xyz = np.column_stack([normalised(uv), np.ones(len(uv))]) * self.depth[:, None]
-        disparity = CAMERA.bf / self.depth + terms(normalised(uv)) @ offset + self.rng.normal(0, 0.2, len(uv))
-        header = KeyframeHeader(KeyframeId(0), 0, NO_KEYFRAME, np.eye(4), len(uv))
-        self.map.add(header, np.eye(4), plain_landmarks(uv, np.maximum(disparity, 0.1) / CAMERA.bf, 0.01), 0)
-
-    def frames(self, count: int) -> Iterator[tuple[int, F64, I64, F64]]:
-        """Times, poses, rows and observations of frames."""
-        for k in range(count):
-            T = se3.inverse(se3.exp(np.concatenate([k * self.step, [0.0, 0.002 * k, 0.0]])))
-            q = se3.transform(T, self.xyz)
-            uv = q[:, :2] / q[:, 2:] * [CAMERA.fx, CAMERA.fy] + [CAMERA.cx, CAMERA.cy]
-            inside = (q[:, 2] > 0.3) & (uv > 10).all(1) & (uv < [740, 470]).all(1)
-            disparity = CAMERA.bf / q[:, 2] + terms(normalised(uv)) @ self.offset - self.map.offset_px(uv)
-            seen = np.column_stack([uv, disparity]) + self.rng.normal(0, 0.2, (len(uv), 3))
-            yield k * self.period_ns, T, np.flatnonzero(inside), seen[inside]
-
-    def fly(self, frames: int) -> list[F64]:
-        """Changes of the map's offset."""
-        changes = (self.alignment.add(*frame) for frame in self.frames(frames))
-        return [change for change in changes if change is not None]
-
-
-SIDEWAYS, AHEAD = np.array([0.03, 0.01, 0.02]), np.array([0.0, 0.0, 0.04])
+from kiteline_core.ids import AgentId
+from tests.agent.disparity_flights import AHEAD, CAMERA, NOTHING, SIDEWAYS, WORN, Flight, normalised
 
 
 @pytest.mark.parametrize("seed", range(4))
