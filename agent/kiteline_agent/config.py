@@ -157,7 +157,7 @@ class DepthFromMotionConfig:
 
 
 @dataclass(frozen=True, slots=True)
-class DisparityConfig:
+class DisparityAlignmentConfig:
     """Estimation of a worn stereo rig's disparity offset on board."""
 
     on: bool = True  # False: only the base estimates it
@@ -288,7 +288,7 @@ class AgentConfig:
     detector: DetectorConfig = field(default_factory=DetectorConfig)
     stereo: StereoConfig = field(default_factory=StereoConfig)
     rows: RowConfig = field(default_factory=RowConfig)
-    disparities: DisparityConfig = field(default_factory=DisparityConfig)
+    disparities: DisparityAlignmentConfig = field(default_factory=DisparityAlignmentConfig)
     known_rig: KnownRigConfig = field(default_factory=KnownRigConfig)
     align: AlignConfig = field(default_factory=AlignConfig)
     pose: PoseConfig = field(default_factory=PoseConfig)

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from typing import ClassVar
 
-from kiteline_core.ground.config import GroundConfig as ScanConfig
+from kiteline_core.ground.config import GroundConfig
 from kiteline_core.imaging.matching import MatchConfig
 from kiteline_core.optimisation.bundle import BundleConfig
 from kiteline_core.pose.pnp import RansacConfig
@@ -120,7 +120,7 @@ class GraphConfig:
 
 
 @dataclass(frozen=True, slots=True)
-class DisparityConfig:
+class DisparityCalibrationConfig:
     """Calibration of each agent's disparity offset by bundles of a whole map."""
 
     tail: float = 6.0  # standard deviations, inflated: beyond two of the prior's own it yields to the data
@@ -164,7 +164,7 @@ class PublishConfig:
 
 
 @dataclass(frozen=True, slots=True)
-class MapCacheConfig:
+class MapCachePlannerConfig:
     """Keyframes that are sent to an agent for its map cache."""
 
     MAY_BE_ZERO: ClassVar = ("max_keyframes",)
@@ -199,7 +199,7 @@ class TileConfig:
 
 
 @dataclass(frozen=True, slots=True)
-class GroundConfig:
+class GroundHeightConfig:
     """Estimation of the ground height."""
 
     camera_above_m: float = 0.1  # m; ground points are at least this far below every camera that observes them
@@ -277,7 +277,7 @@ class GridConfig:
     band_files: bool = False  # True: a file for each height band, too
     binary_files: bool = False  # True: a file in which one view occupies a cell for good, too (Segfloor)
     resident_tiles: int = 512  # tiles that stay inflated, 24 kB each: what a dozen drones draw on at a time
-    ground: GroundConfig = field(default_factory=GroundConfig)
+    ground: GroundHeightConfig = field(default_factory=GroundHeightConfig)
 
 
 @dataclass(frozen=True, slots=True)
@@ -294,9 +294,9 @@ class BaseConfig:
     inertial_scale: InertialScaleConfig = field(default_factory=InertialScaleConfig)
     loops: LoopConfig = field(default_factory=LoopConfig)
     graph: GraphConfig = field(default_factory=GraphConfig)
-    disparity: DisparityConfig = field(default_factory=DisparityConfig)
+    disparity: DisparityCalibrationConfig = field(default_factory=DisparityCalibrationConfig)
     publish: PublishConfig = field(default_factory=PublishConfig)
-    map_cache: MapCacheConfig = field(default_factory=MapCacheConfig)
+    map_cache: MapCachePlannerConfig = field(default_factory=MapCachePlannerConfig)
     grid: GridConfig = field(default_factory=GridConfig)
-    scan: ScanConfig = field(default_factory=ScanConfig)
+    scan: GroundConfig = field(default_factory=GroundConfig)
     tiles: TileConfig = field(default_factory=TileConfig)

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from kiteline_agent.config import DisparityConfig, LocalMapConfig
+from kiteline_agent.config import DisparityAlignmentConfig, LocalMapConfig
 from kiteline_agent.local_map.disparity_alignment import DisparityAlignment
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_codec.schema import KeyframeHeader
@@ -35,7 +35,7 @@ class Flight:
         self.rng, self.offset, self.step = np.random.default_rng(seed), offset, step
         self.period_ns = 50_000_000
         self.map = LocalMap(CAMERA, LocalMapConfig(keyframes=8))
-        self.alignment = DisparityAlignment(self.map, DisparityConfig())
+        self.alignment = DisparityAlignment(self.map, DisparityAlignmentConfig())
         uv = self.rng.uniform([40, 40], [710, 440], (160, 2))
         self.depth = self.rng.uniform(2.0, 12.0, len(uv))
         self.xyz = np.column_stack([normalised(uv), np.ones(len(uv))]) * self.depth[:, None]

@@ -232,7 +232,10 @@ def test_ctrl_c_ends_an_agent_that_opens_its_source_or_compiles(
 ) -> None:
     """A long recording without an index, and kernels that no folder keeps, took minutes in which it was not heard."""
 
+    begun: list[str] = []
+
     def slow(*given: object, **named: object) -> None:
+        begun.append(what)
         os.kill(os.getpid(), signal.SIGINT)
         time.sleep(5.0)
         raise AssertionError
@@ -246,3 +249,4 @@ def test_ctrl_c_ends_an_agent_that_opens_its_source_or_compiles(
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+    assert begun == [what]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from kiteline_agent.inertial.calibration import self_calibration
-from kiteline_agent.inertial.calibration.pose_chain import Link, PoseChain
+from kiteline_agent.inertial.calibration.pose_chain import PoseChain, SampledMotion
 from kiteline_agent.inertial.calibration.turn_scatter import added_variance
 from kiteline_agent.inertial.sample_buffer import SampleBuffer
 from kiteline_core.arrays import F64
@@ -33,7 +33,7 @@ def added(f: Flight, matrix: F64, bias: F64) -> list[float]:
         done = end
         chain.add(int(t_ns), T)
         link = chain.take(buffer, 0.0)
-        if isinstance(link, Link):
+        if isinstance(link, SampledMotion):
             out.append(added_variance(link, buffer, matrix, bias, IMAGE_RAD, CALIBRATION.gyro_noise))
     return out
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from kiteline_agent.exchange.correction_batches import CorrectionBatches as Holder
+from kiteline_agent.exchange.correction_batches import ReceivedBatches as Holder
 from kiteline_basestation.config import BaseConfig, PublishConfig
 from kiteline_basestation.exchange.correction_batches import MEMBERS, CorrectionBatches
 from kiteline_basestation.job_kinds import run_job

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from kiteline_basestation.config import BaseConfig, MapCacheConfig
+from kiteline_basestation.config import BaseConfig, MapCachePlannerConfig
 from kiteline_basestation.exchange.map_cache_planner import MapCachePlanner
 from kiteline_basestation.intake.intake import Intake
 from kiteline_basestation.map.sparse_map import SparseMap
@@ -43,7 +43,7 @@ class Base:
         for flight in flights:
             intake.take(flight.agent, (CameraIntrinsics(flight.agent, flight.camera), *flight.all_records()), 0)
         self.agent = flights[0].agent
-        config = replace(MapCacheConfig(), **options)
+        config = replace(MapCachePlannerConfig(), **options)
         self.map_cache_planner = MapCachePlanner(config, replace(BaseConfig().loops, share=share), self.map)
         self.here, self.there = plain_pair()
         self.received: list[Record] = []

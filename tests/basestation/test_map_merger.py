@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from kiteline_agent.exchange.correction_batches import CorrectionBatches
+from kiteline_agent.exchange.correction_batches import ReceivedBatches
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.job_kinds import run_job
 from kiteline_basestation.jobs import JobDone
@@ -200,7 +200,7 @@ def test_the_place_of_a_merged_map_waits_for_no_corrections(make_flight: MakeFli
     records = theirs.receive((), 0)  # the first time: until now nothing had arrived
     placed = [r for r in records if isinstance(r, SubmapPlacement) and r.recognised]
     assert placed and {(r.submap, r.batch) for r in placed} == {(young, 0)}
-    applied = CorrectionBatches().take(records, ())
+    applied = ReceivedBatches().take(records, ())
     assert placed[0] in applied and all(r in applied for r in records if isinstance(r, KeyframePose))
 
 

@@ -20,7 +20,7 @@ from kiteline_hw.calibration.file_calibration import FileCalibration
 from kiteline_hw.ports import SourceError
 from kiteline_hw.sources.open import open_source
 from kiteline_lab.calibration import calibrate, imu
-from kiteline_lab.calibration.imu import NoImu
+from kiteline_lab.calibration.imu import ImuMissing
 from kiteline_lab.calibration.imu_guide import ImuProgress, rotation_deg
 
 Look = tuple[ImuProgress, KnownRigConfig | None]
@@ -83,7 +83,7 @@ def test_a_camera_that_was_mounted_by_a_ruler_is_found_by_turns(
 
 
 def test_a_recording_without_an_imu_is_refused(recording: Path, tmp_path: Path) -> None:
-    with pytest.raises(NoImu, match="has no IMU"):
+    with pytest.raises(ImuMissing, match="has no IMU"):
         calibrate.main(["imu", str(recording), "--rig", str(tmp_path / "rig.toml")])
     assert not (tmp_path / "rig.toml").exists()
 

@@ -41,7 +41,7 @@ def project(xy: F64, T_o_c: F64, point: F64) -> tuple[F64, F64, F64]:
 
 
 @dataclass(frozen=True, slots=True)
-class Track:
+class RayTrack:
     """Observations of one track. views: (v,) past views. xy: (v,2) x/z, y/z in them, or (v+1,2) with the camera of now
     at the end. sigma: deviation of these.
     """
@@ -68,7 +68,7 @@ class Rays:
     residual: F64
 
 
-def linearised(state: FilterState, track: Track, T_o_c: F64, view_T_o_c: F64) -> Rays | None:
+def linearised(state: FilterState, track: RayTrack, T_o_c: F64, view_T_o_c: F64) -> Rays | None:
     """The rays of a track with the camera now at T_o_c (4,4) and past views (n,4,4); None if they do not meet ahead."""
     views, is_seen_now = track.views, len(track.xy) > len(track.views)
     poses = np.concatenate([view_T_o_c[views], T_o_c[None]]) if is_seen_now else view_T_o_c[views]

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from kiteline_agent.ekf.filter_state import FilterState
-from kiteline_agent.ekf.ray_initialisation import Rays, Track, linearised
+from kiteline_agent.ekf.ray_initialisation import Rays, RayTrack, linearised
 from kiteline_core.arrays import F64, I64
 
 _ITERATIONS = 3
@@ -19,7 +19,7 @@ _SETTLED = 0.1  # deviations of the state by which another iteration would have 
 _MANY = 3.0  # deviations over degrees of freedom at which a track counts half: Cauchy's weights
 
 
-def update_by_rays(state: FilterState, tracks: Sequence[Track]) -> None:
+def update_by_rays(state: FilterState, tracks: Sequence[RayTrack]) -> None:
     """Correct the state by tracks; those that contradict the others count less."""
     columns = state.view_columns(state.used_views)
     P = state.rows(columns)

@@ -23,7 +23,7 @@ from kiteline_lab.calibration.best_lens import best_lens
 from kiteline_lab.calibration.boards import Board, parse_board
 from kiteline_lab.calibration.picture import residual_picture
 from kiteline_lab.calibration.solve import Calibrated
-from kiteline_lab.calibration.verdict import Finding, judge, overall
+from kiteline_lab.calibration.verdict import CalibrationFinding, judge, overall
 from kiteline_lab.calibration.views import ViewCollector
 from kiteline_lab.flights.out_file import whole_file, write_whole
 from kiteline_lab.flights.progress import Progress
@@ -56,7 +56,7 @@ def collect(
 
 def calibrated(
     collector: ViewCollector, board: Board, lens: str, coefficients: int
-) -> tuple[Calibrated, list[Finding]]:
+) -> tuple[Calibrated, list[CalibrationFinding]]:
     """The cameras of the collected views, and what the result is worth. Raises KitelineError."""
     sizes = [c.size for c in collector.coverage]
     result = best_lens(board.points_m, collector.views, sizes, lens, coefficients)
@@ -156,7 +156,9 @@ def _described(board: Board) -> str:
     return f"a {kind} of {board.columns}x{board.rows} squares of {1000 * board.square_m:g} mm"
 
 
-def _summary(out: Path, result: Calibrated, findings: list[Finding], collector: ViewCollector) -> dict[str, Any]:
+def _summary(
+    out: Path, result: Calibrated, findings: list[CalibrationFinding], collector: ViewCollector
+) -> dict[str, Any]:
     return {
         "file": str(out),
         "verdict": overall(findings),

@@ -15,7 +15,7 @@ from kiteline_hw.mavlink.coordinate_frames import R_L_O, mounting
 from kiteline_hw.mavlink.messages import Heartbeat
 from kiteline_hw.mavlink.watch.attitude import CANDIDATES, attitude_rotation
 from kiteline_hw.mavlink.watch.controller_watch import ControllerWatch
-from kiteline_hw.mavlink.watch.findings import Finding, FindingLog, Level
+from kiteline_hw.mavlink.watch.findings import Finding, FindingLevel, FindingLog
 from kiteline_hw.mavlink.watch.latency import LatencyWatch
 from kiteline_hw.ports import PoseSample
 from kiteline_hw.sim.autopilot import Faults, ModelledAutopilot
@@ -92,7 +92,7 @@ def test_a_good_flight_says_each_thing_once(kind: str) -> None:
     bench = Bench(ModelledAutopilot(kind, system=7))  # type: ignore[arg-type]
     bench.run(25.0)
     assert sorted(f.topic for _, f in bench.found) == ["axes", "controller", "latency", "poses"]
-    assert {f.level for _, f in bench.found} == {Level.INFO}
+    assert {f.level for _, f in bench.found} == {FindingLevel.INFO}
     name = {"ardupilot": "ArduPilot", "px4": "PX4"}[kind]
     assert bench.topic("controller")[0].text == f"flight controller: found: {name} 4.6.3, quadrotor, system 7"
     assert "axes flu are right" in bench.topic("axes")[0].text
@@ -121,9 +121,9 @@ def test_wrong_axes_are_named_within_five_seconds_of_motion(true: str) -> None:
         bench.run(5.0)
         said = bench.topic("axes")
         if used == true:
-            assert not said or (said[-1].level is Level.INFO and used in said[-1].text)
+            assert not said or (said[-1].level is FindingLevel.INFO and used in said[-1].text)
         else:
-            assert said[-1].level is Level.ERROR
+            assert said[-1].level is FindingLevel.ERROR
             assert said[-1].remedy.endswith(f"--axes {true}")
             assert f"--axes {used} are wrong" in said[-1].text
 
@@ -131,7 +131,7 @@ def test_wrong_axes_are_named_within_five_seconds_of_motion(true: str) -> None:
 def test_wrong_axes_hold_poses_back_until_they_fit_and_arming_does_not_change_that() -> None:
     bench = Bench(ModelledAutopilot("ardupilot"), used="flu", true="lbu")
     bench.run(6.0)
-    assert bench.topic("held")[-1].level is Level.ERROR
+    assert bench.topic("held")[-1].level is FindingLevel.ERROR
     sent = bench.session.counters.odometry
     bench.controller.armed = True
     bench.run(6.0)
@@ -139,7 +139,7 @@ def test_wrong_axes_hold_poses_back_until_they_fit_and_arming_does_not_change_th
     bench.T_b_f = mounting("flu")  # the camera is turned
     bench.run(40.0)
     assert bench.session.counters.odometry > sent + 100
-    assert [f.level for f in bench.topic("held")] == [Level.ERROR, Level.INFO]
+    assert [f.level for f in bench.topic("held")] == [FindingLevel.ERROR, FindingLevel.INFO]
 
 
 def test_a_controller_that_restarts_does_not_release_poses_by_wrong_axes() -> None:
@@ -152,7 +152,7 @@ def test_a_controller_that_restarts_does_not_release_poses_by_wrong_axes() -> No
     bench.run(10.0)
     assert len(bench.topic("restart")) == 1
     assert bench.session.counters.odometry == sent
-    assert [f.level for f in bench.topic("held")] == [Level.ERROR]
+    assert [f.level for f in bench.topic("held")] == [FindingLevel.ERROR]
 
 
 def test_a_vehicle_that_flies_goes_on_getting_poses_by_wrong_axes() -> None:
@@ -185,7 +185,7 @@ def test_a_hovering_vehicle_tells_its_axes_by_small_tilts() -> None:
     assert bench.topic("axes")[-1].remedy.endswith("--axes lbu")
     right = Bench(ModelledAutopilot("ardupilot"), motion=hover)
     right.run(25.0)
-    assert [f.level for f in right.topic("axes")] == [Level.INFO]
+    assert [f.level for f in right.topic("axes")] == [FindingLevel.INFO]
 
 
 def test_a_jump_of_the_controllers_heading_is_no_wrong_axis() -> None:
@@ -197,7 +197,7 @@ def test_a_jump_of_the_controllers_heading_is_no_wrong_axis() -> None:
     bench.run(2.0)
     bench.R_l_n = np.asarray(se3.so3_exp(np.array([0.0, 0.0, -0.7])))
     bench.run(20.0)
-    assert [f.level for f in bench.topic("axes")] == [Level.INFO]
+    assert [f.level for f in bench.topic("axes")] == [FindingLevel.INFO]
 
 
 def test_a_tilted_camera_is_told_from_wrong_axes() -> None:
@@ -205,7 +205,7 @@ def test_a_tilted_camera_is_told_from_wrong_axes() -> None:
     bench.T_b_f = bench.T_b_f @ se3.from_rt(se3.so3_exp(np.array([0.0, radians(20.0), 0.0])), np.zeros(3))
     bench.run(10.0)
     (said,) = bench.topic("axes")
-    assert said.level is Level.WARNING and "20 degrees off" in said.text
+    assert said.level is FindingLevel.WARNING and "20 degrees off" in said.text
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -214,7 +214,7 @@ def test_ignored_poses_are_said_and_so_is_their_acceptance(kind: str) -> None:
     bench = Bench(ModelledAutopilot(kind, parameters=wrong))  # type: ignore[arg-type]
     bench.run(12.0)
     (said,) = bench.topic("poses")
-    assert said.level is Level.ERROR and "ignores them" in said.text
+    assert said.level is FindingLevel.ERROR and "ignores them" in said.text
     assert ("EK3_SRC1_POSXY" if kind == "ardupilot" else "EKF2_EV_CTRL") in said.remedy
     bench.controller._values.update({"EK3_SRC1_POSXY": 6, "EKF2_EV_CTRL": 15})
     bench.run(8.0)
@@ -225,7 +225,7 @@ def test_rejected_poses_are_said() -> None:
     bench = Bench(ModelledAutopilot("px4", faults=Faults(rejects=True)))
     bench.run(8.0)
     (said,) = bench.topic("poses")
-    assert said.level is Level.ERROR and "rejects" in said.text and "1.7 times" in said.text
+    assert said.level is FindingLevel.ERROR and "rejects" in said.text and "1.7 times" in said.text
 
 
 def test_poses_of_failed_tracking_are_not_called_ignored() -> None:

@@ -5,7 +5,7 @@ import pytest
 from kiteline_hw.mavlink.codec import MavlinkCodec
 from kiteline_hw.mavlink.messages import Heartbeat, RadioStatus
 from kiteline_hw.mavlink.watch import messages as wire
-from kiteline_hw.mavlink.watch.findings import Finding, Level
+from kiteline_hw.mavlink.watch.findings import Finding, FindingLevel
 from kiteline_hw.mavlink.watch.messages import ParamValue, StatusText
 from kiteline_hw.mavlink.watch.presence import LinkState
 from kiteline_hw.mavlink.watch.stream_rates import StreamRate
@@ -52,7 +52,7 @@ def topic(found: list[Finding], name: str) -> list[Finding]:
 def test_a_controller_that_is_set_up_well(kind: str, lost: int) -> None:
     model = ModelledAutopilot(kind, system=3)  # type: ignore[arg-type]
     found = survey(model, lost=lost)
-    assert {f.level for f in found} == {Level.INFO}, found
+    assert {f.level for f in found} == {FindingLevel.INFO}, found
     assert "system 3" in topic(found, "heartbeat")[0].text
     count = {"ardupilot": 15, "px4": 9}[kind]
     assert topic(found, "parameters")[0].text == f"{count} are as kiteline needs them"
@@ -62,21 +62,21 @@ def test_a_controller_that_is_set_up_well(kind: str, lost: int) -> None:
 
 
 WRONG = [
-    ("ardupilot", {"VISO_TYPE": 0}, Level.ERROR),
-    ("ardupilot", {"VISO_TYPE": 2}, Level.WARNING),
-    ("ardupilot", {"EK3_SRC1_POSXY": 3}, Level.ERROR),
-    ("ardupilot", {"AHRS_EKF_TYPE": 2}, Level.ERROR),
-    ("ardupilot", {"VISO_ORIENT": 4}, Level.ERROR),
-    ("ardupilot", {"VISO_DELAY_MS": 220}, Level.WARNING),
-    ("px4", {"EKF2_EV_CTRL": 0}, Level.ERROR),
-    ("px4", {"EKF2_EV_CTRL": 9}, Level.WARNING),
-    ("px4", {"EKF2_EV_DELAY": 175.0}, Level.WARNING),
-    ("px4", {"EKF2_HGT_REF": 1}, Level.WARNING),
+    ("ardupilot", {"VISO_TYPE": 0}, FindingLevel.ERROR),
+    ("ardupilot", {"VISO_TYPE": 2}, FindingLevel.WARNING),
+    ("ardupilot", {"EK3_SRC1_POSXY": 3}, FindingLevel.ERROR),
+    ("ardupilot", {"AHRS_EKF_TYPE": 2}, FindingLevel.ERROR),
+    ("ardupilot", {"VISO_ORIENT": 4}, FindingLevel.ERROR),
+    ("ardupilot", {"VISO_DELAY_MS": 220}, FindingLevel.WARNING),
+    ("px4", {"EKF2_EV_CTRL": 0}, FindingLevel.ERROR),
+    ("px4", {"EKF2_EV_CTRL": 9}, FindingLevel.WARNING),
+    ("px4", {"EKF2_EV_DELAY": 175.0}, FindingLevel.WARNING),
+    ("px4", {"EKF2_HGT_REF": 1}, FindingLevel.WARNING),
 ]
 
 
 @pytest.mark.parametrize(("kind", "wrong", "level"), WRONG)
-def test_each_wrong_parameter_is_named_with_its_value(kind: str, wrong: dict[str, float], level: Level) -> None:
+def test_each_wrong_parameter_is_named_with_its_value(kind: str, wrong: dict[str, float], level: FindingLevel) -> None:
     found = survey(ModelledAutopilot(kind, parameters=wrong))  # type: ignore[arg-type]
     ((name, value),) = wrong.items()
     (said,) = topic(found, name)
@@ -92,11 +92,15 @@ def test_parameters_that_the_firmware_lacks_are_named() -> None:
 def test_forwarding_to_the_radio() -> None:
     old = survey(ModelledAutopilot("ardupilot", parameters={"SERIAL2_OPTIONS": 0}))
     (said,) = topic(old, "forwarding")
-    assert said.level is Level.WARNING and "1024 of SERIALx_OPTIONS" in said.remedy and "mavlink: link" in said.remedy
+    assert (
+        said.level is FindingLevel.WARNING
+        and "1024 of SERIALx_OPTIONS" in said.remedy
+        and "mavlink: link" in said.remedy
+    )
     new = survey(ModelledAutopilot("ardupilot", parameters={"SERIAL2_OPTIONS": 0, "MAV1_OPTIONS": 0}))
     assert "bit 2 of MAVn_OPTIONS" in topic(new, "forwarding")[0].remedy
     quiet = survey(ModelledAutopilot("ardupilot", parameters={"SERIAL2_OPTIONS": 0, "MAV2_OPTIONS": 2}))
-    assert topic(quiet, "forwarding")[0].level is Level.INFO
+    assert topic(quiet, "forwarding")[0].level is FindingLevel.INFO
     px4 = survey(ModelledAutopilot("px4", parameters={"MAV_1_FORWARD": 1}))
     assert "MAV_1_FORWARD is 1" in topic(px4, "forwarding")[0].text
     one = survey(ModelledAutopilot("ardupilot", parameters={"SERIAL2_PROTOCOL": 1}))
@@ -107,16 +111,16 @@ def test_forwarding_to_the_radio() -> None:
 
 def test_faults_of_the_link() -> None:
     silent = survey(ModelledAutopilot("px4", faults=Faults(silent=True)))
-    assert [f.level for f in silent] == [Level.ERROR] and "not found" in silent[0].text
+    assert [f.level for f in silent] == [FindingLevel.ERROR] and "not found" in silent[0].text
     deaf = survey(ModelledAutopilot("px4", faults=Faults(deaf=True)))
-    assert topic(deaf, "timesync")[0].level is Level.ERROR
+    assert topic(deaf, "timesync")[0].level is FindingLevel.ERROR
     assert topic(deaf, "parameters")[0].text == "no parameter was told"
     fixed = survey(ModelledAutopilot("ardupilot", faults=Faults(fixed_rates=True)))
     assert all("the request was refused" in f.text for f in topic(fixed, "streams"))
     late = survey(ModelledAutopilot("px4"), delay_steps=8)
-    assert topic(late, "timesync")[0].level is Level.WARNING
+    assert topic(late, "timesync")[0].level is FindingLevel.WARNING
     mute = survey(ModelledAutopilot("ardupilot", faults=Faults(no_timesync=True)))
-    assert topic(mute, "timesync")[0].level is Level.WARNING
+    assert topic(mute, "timesync")[0].level is FindingLevel.WARNING
 
 
 def test_an_armed_vehicle_is_only_listened_to() -> None:
@@ -129,7 +133,7 @@ def test_an_armed_vehicle_is_only_listened_to() -> None:
 def test_radio_and_texts() -> None:
     radio, auto = MavlinkCodec(51, 68), MavlinkCodec(1, 1)
     good = survey(ModelledAutopilot("px4"), radio.encode(RadioStatus(90, 180, 170, 40)))
-    assert topic(good, "radio")[0].level is Level.INFO
+    assert topic(good, "radio")[0].level is FindingLevel.INFO
     full = survey(ModelledAutopilot("px4"), radio.encode(RadioStatus(10, 180, 170, 40)))
     assert "overloaded" in topic(full, "radio")[0].remedy
     weak = survey(ModelledAutopilot("px4"), radio.encode(RadioStatus(90, 50, 170, 40)))

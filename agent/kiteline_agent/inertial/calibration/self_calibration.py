@@ -16,7 +16,7 @@ from kiteline_agent.inertial.calibration.gyro_calibration import GyroCalibration
 from kiteline_agent.inertial.calibration.known_imu import KnownImuConfig, is_plausible, known_axes
 from kiteline_agent.inertial.calibration.lever_search import LeverSearch, LeverSearchConfig
 from kiteline_agent.inertial.calibration.mounting_search import Mounting, MountingSearch, MountingSearchConfig
-from kiteline_agent.inertial.calibration.pose_chain import Link, PoseChain
+from kiteline_agent.inertial.calibration.pose_chain import PoseChain, SampledMotion
 from kiteline_agent.inertial.calibration.turn_scatter import added_variance
 from kiteline_agent.inertial.calibration.window import Window
 from kiteline_agent.inertial.preintegration import Samples
@@ -90,7 +90,9 @@ class SelfCalibration:
         self._lever_m = np.zeros(3)  # origin of the body, as the calibration places it, in the IMU
         self.restarted = False  # True after an `update` that found a calibration: what was integrated before is void
         self.turned = False  # True after one that found a rotation: so is the vertical
-        self._before: tuple[Window, Link, float, float] | None = None  # last window of moves: density, `_unsteady`
+        self._before: tuple[Window, SampledMotion, float, float] | None = (
+            None  # last window of moves: density, `_unsteady`
+        )
         self._added = 0.0  # rad^2, of the rotation by images in the last window of turns, beside turn_sigma_rad
         self._unsteady = 1.0  # factor on the variance of poses by images, since the last window of moves
         self.offset_s = config.offset_s  # applied: camera stamp + offset = IMU time
@@ -220,7 +222,7 @@ class SelfCalibration:
         """
         self.restarted = self.turned = False
         turn = self._turns.take(buffer, self.gyro.offset_s)
-        if isinstance(turn, Link):
+        if isinstance(turn, SampledMotion):
             offset_s, density = self.gyro.offset_s, float(self._density(turn)[0])
             added = added_variance(
                 turn, buffer, self.gyro.matrix, self.gyro.bias, self._config.turn_sigma_rad, density
@@ -241,7 +243,7 @@ class SelfCalibration:
             if not self.accel.has_vertical:
                 self.accel.set_vertical(gravity)
             move = self._moves.take(buffer, self.gyro.offset_s)
-            if isinstance(move, Link):
+            if isinstance(move, SampledMotion):
                 self._add_move(move)
                 self._test_accel()
                 self._search_lever()
@@ -354,7 +356,7 @@ class SelfCalibration:
             change = step @ buffer.last_accel
         return change
 
-    def _add_move(self, link: Link) -> None:
+    def _add_move(self, link: SampledMotion) -> None:
         window, density = self._integrate(link, self.gyro), float(self._density(link)[1])
         if self._before is not None:
             first, before, density_before, unsteady = self._before
@@ -368,12 +370,12 @@ class SelfCalibration:
             self.accel.add((first, window), poses, self._p_b_c, variance, self._lever)
         self._before, self._unsteady = (window, link, density, self._unsteady), 1.0
 
-    def _integrate(self, link: Link, gyro: GyroCalibration) -> Window:
+    def _integrate(self, link: SampledMotion, gyro: GyroCalibration) -> Window:
         matrix, bias = gyro.matrix, gyro.bias
         rates = link.rates @ matrix.T - bias
         return Window.of(link.samples, matrix, bias, rates[0], rates[1])
 
-    def _density(self, link: Link) -> F64:
+    def _density(self, link: SampledMotion) -> F64:
         """(2,) noise density of gyro and accelerometer in a window."""
         calibrated = np.array([self._calibration.gyro_noise, self._calibration.accel_noise])
         measured = link.samples.density
