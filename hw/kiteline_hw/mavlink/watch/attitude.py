@@ -187,7 +187,8 @@ class AttitudeWatch:
         if fits and level and float(others.min()) - float(chi2[self._in_use]) > c.sure_chi2:
             self._log.say(
                 TOPIC, "good", FindingLevel.INFO,
-                f"attitude: agrees with the flight controller's, axes {used} are right", f"kiteline: axes {used} are right",
+                f"attitude: agrees with the flight controller's, axes {used} are right",
+                f"kiteline: axes {used} are right",
             )  # fmt: skip
 
     def _say_wrong(self, used: str, fitting: list[str]) -> None:
