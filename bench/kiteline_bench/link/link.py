@@ -21,7 +21,7 @@ from kiteline_hw.sources.open import open_source
 from kiteline_lab.flights.plan import flight_starts
 from kiteline_lab.flights.processes import free_endpoint
 
-TITLE = "The thin line"
+TITLE = "The thin link"
 
 _FLIGHT = "room_flight.mcap"
 
