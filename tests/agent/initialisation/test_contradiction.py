@@ -18,8 +18,8 @@ from kiteline_agent.initialisation.corner_tracks import CornerObservations
 from kiteline_agent.initialisation.inertial_start import InertialStart
 from kiteline_agent.initialisation.window_noise import WindowNoise
 from kiteline_core.arrays import F64
-from tests.agent.test_inertial_bundle import CALIBRATION, PRIOR, window
-from tests.agent.test_inertial_start import CAMERA, Tracks
+from tests.agent.initialisation.test_inertial_bundle import CALIBRATION, PRIOR, window
+from tests.agent.initialisation.test_inertial_start import CAMERA, Tracks
 
 Change = Callable[[CornerObservations, list[Samples]], tuple[CornerObservations, list[Samples]]]
 

@@ -10,7 +10,14 @@ from kiteline_agent.inertial.sample_buffer import SampleBuffer
 from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuBatch
 from kiteline_core.geometry import se3
-from tests.agent.test_imu_self_calibration import CALIBRATION, GYRO, Flight, applied, calibrated, flight
+from tests.agent.inertial.calibration.test_imu_self_calibration import (
+    CALIBRATION,
+    GYRO,
+    Flight,
+    applied,
+    calibrated,
+    flight,
+)
 
 IMAGE_RAD = 4e-4
 

@@ -15,7 +15,7 @@ from kiteline_core.config import ConfigError, apply
 from kiteline_lab.tools import config as command
 from kiteline_lab.tools.options import as_markdown, as_toml, sections
 
-PAGE = Path(__file__).parents[2] / "docs" / "reference" / "configuration.md"
+PAGE = Path(__file__).parents[3] / "docs" / "reference" / "configuration.md"
 
 
 def count(config: object) -> int:

@@ -33,7 +33,7 @@ from kiteline_hw.ports import SourceError
 from kiteline_hw.sources.open import open_source
 from kiteline_hw.system import kernel_cache
 from kiteline_hw.system.process import StopSignal
-from tests.agent.test_flight_parts import estimate
+from tests.agent.runtime.test_flight_parts import estimate
 from tests.entries import entries_of
 
 

@@ -57,7 +57,7 @@ def test_install_writes_the_files_with_the_path_of_the_program(tmp_path: Path) -
 
 
 def test_compiled_kernels_are_where_the_unit_looks_for_them() -> None:
-    shipped = (Path(__file__).parents[2] / "systemd" / "kiteline-agent.service").read_text()
+    shipped = (Path(__file__).parents[3] / "systemd" / "kiteline-agent.service").read_text()
     assert f"NUMBA_CACHE_DIR={Place(False).cache} " in shipped
 
 
@@ -176,7 +176,7 @@ def test_files_go_into_a_mounted_image(tmp_path: Path, capsys: pytest.CaptureFix
 
 @pytest.mark.parametrize("role", ["agent", "base"])
 def test_the_sample_settings_are_arguments_of_the_program(role: str) -> None:
-    text = (Path(__file__).parents[2] / "systemd" / f"{role}.env").read_text()
+    text = (Path(__file__).parents[3] / "systemd" / f"{role}.env").read_text()
     (line,) = (line for line in text.splitlines() if line.startswith("KITELINE_"))
     assert not re.search(r"[\"'$\\]", line)  # systemd would take them out
     words = line.partition("=")[2].split()

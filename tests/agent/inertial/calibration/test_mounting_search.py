@@ -10,7 +10,16 @@ from kiteline_agent.inertial.calibration.self_calibration import SelfCalibration
 from kiteline_agent.inertial.preintegration import Samples
 from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
-from tests.agent.test_imu_self_calibration import ACCEL, CALIBRATION, GYRO, P_B_C, Flight, applied, calibrated, flight
+from tests.agent.inertial.calibration.test_imu_self_calibration import (
+    ACCEL,
+    CALIBRATION,
+    GYRO,
+    P_B_C,
+    Flight,
+    applied,
+    calibrated,
+    flight,
+)
 
 
 def turned(axis: tuple[float, float, float], degrees: float) -> F64:

@@ -24,7 +24,7 @@ def test_every_plain_dependency_is_checked() -> None:
     import re
     import tomllib
 
-    project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
+    project = tomllib.loads((Path(__file__).parents[3] / "pyproject.toml").read_text())["project"]
 
     def names(specs: list[str]) -> set[str]:
         return {re.split(r"[<>=!~\[ ]", s)[0] for s in specs}
