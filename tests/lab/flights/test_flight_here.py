@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from kiteline_bench.harness.contract import check_contract
 from kiteline_hw.logs.mcap_log_read import LogReader
-from kiteline_lab.flights.contract import check_contract
 from kiteline_lab.flights.flight_report import without_timing
 from kiteline_lab.flights.fly import fly, main
 from kiteline_lab.flights.plan import Options

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from kiteline_bench.harness.contract import check_contract
 from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import KeyframeId, SubmapId
 from kiteline_lab.flights import flight_report
-from kiteline_lab.flights.contract import check_contract
 from kiteline_lab.flights.flight_report import statistic, table, without_timing, write_tum
 from kiteline_lab.flights.fly import fly
 from kiteline_lab.flights.plan import Options

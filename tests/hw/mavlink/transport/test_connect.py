@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pymavlink.dialects.v20 import common
-from tests.hw.mavlink.transport.test_signing import signed
 
 from kiteline_core.geometry.cameras import CameraModel, CameraRig
 from kiteline_hw.mavlink.connect import ControllerOptions, connect
@@ -18,6 +17,7 @@ from kiteline_hw.mavlink.pose_sink import MavlinkPoseSink
 from kiteline_hw.ports import LinkError, PoseSample, SourceReport
 from kiteline_hw.sim.autopilot import ModelledAutopilot
 from kiteline_hw.system.clock import MonotonicClock
+from tests.hw.mavlink.transport.test_signing import signed
 from tests.hw.processes import free_port
 
 RIG, CLOCK = CameraRig(CameraModel(64, 48, 50.0, 50.0, 31.5, 23.5), None, np.eye(4), None), MonotonicClock()

@@ -5,8 +5,8 @@ import os
 import socket
 import time
 
+from kiteline_bench.link.relay import UdpRelay
 from kiteline_hw.sim.links.link_model import LinkModel, LinkModelConfig
-from kiteline_hw.sim.links.relay import UdpRelay
 from kiteline_hw.sim.links.serial_pair import SerialPair
 
 MS = 1_000_000
