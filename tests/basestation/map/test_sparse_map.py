@@ -254,3 +254,17 @@ def test_descriptors_are_held_for_landmarks_alone() -> None:
     top = table._top
     table.put(every[: top - 1], plain[: top - 1])
     assert table._top == top  # freed rows serve again
+
+
+def test_a_camera_holds_for_keyframes_of_its_agent_so_far_and_later() -> None:
+    sparse_map = SparseMap()
+    mine, other = kf(0), keyframe_id(submap_id(4, 0, 0), 0)
+    for keyframe in (mine, other):
+        sparse_map.add_keyframe(keyframe, 0, NO_KEYFRAME, np.eye(4), 6)
+    another = RectifiedCamera(640, 480, 500.0, 510.0, 310.0, 230.0, 0.2, True, np.eye(4))
+    sparse_map.set_camera(AgentId(3), CAMERA)
+    sparse_map.set_camera(AgentId(4), another)
+    sparse_map.add_keyframe(kf(1), 10, mine, np.eye(4), 6)
+    cameras = sparse_map.keyframes.camera
+    for keyframe, camera in ((mine, CAMERA), (kf(1), CAMERA), (other, another)):
+        np.testing.assert_allclose(cameras[sparse_map.rows[keyframe]][:4], [camera.fx, camera.fy, camera.cx, camera.cy])
