@@ -13,7 +13,7 @@ from kiteline_agent.governor.cost_model import Work
 from kiteline_agent.inertial.preintegration import Samples
 from kiteline_agent.inertial_start_config import ContradictionConfig
 from kiteline_agent.initialisation import inertial_start
-from kiteline_agent.initialisation.contradiction import ContradictionWatch, accuses_imu, contradicts
+from kiteline_agent.initialisation.contradiction import ContradictionWatch, contradicts, exceeds_lens_errors
 from kiteline_agent.initialisation.corner_tracks import CornerObservations
 from kiteline_agent.initialisation.inertial_start import InertialStart
 from kiteline_agent.initialisation.window_noise import WindowNoise
@@ -138,7 +138,7 @@ def test_the_imu_is_given_up_for_what_it_shows_and_for_a_lens_alone_much_later()
     # windows as starts show them: the real flight backward, whose lens is off; two axes negated; accelerations in g
     for gyro_noise, bias_m_s2, imu in ((0.2, 0.16, False), (7.4, 0.1, True), (0.2, 8.3, True)):
         solution: Any = SimpleNamespace(bias=np.array([0.0, 0.0, 0.0, 0.0, bias_m_s2, 0.0]))
-        assert accuses_imu(solution, gyro_noise, PRIOR, config) is imu
+        assert exceeds_lens_errors(solution, gyro_noise, PRIOR, config) is imu
 
 
 def test_a_contradiction_is_told_once_it_lasts_and_again_after_an_end() -> None:
