@@ -78,7 +78,9 @@ def test_seconds_end_a_flight_early(recording: Path, tmp_path: Path) -> None:
 
 def test_the_table_goes_to_stdout(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([str(recording), "--out", str(tmp_path), "--mode", "local", "--seconds", "0.5"]) == 0
-    out = capsys.readouterr().out
+    said = capsys.readouterr()
+    out = said.out
+    assert said.err.rstrip().splitlines()[-1].startswith("flying: 11 frames")
     assert "ATE live" in out
     assert str(tmp_path / "trajectory.png") in out
     assert "digests equal" in out

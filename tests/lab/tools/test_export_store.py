@@ -82,6 +82,7 @@ def test_graph_holds_every_keyframe_and_parent(mapper: Mapper, tmp_path: Path) -
 def test_ply_and_grid_are_readable(mapper: Mapper, tmp_path: Path) -> None:
     made = files(mapper, "pgm", "plan.pgm") | files(mapper, "ply", "a.ply")
     assert sorted(made) == ["a.ply", "plan.pgm", "plan.yaml"]
+    assert b"image: plan.pgm\n" in made["plan.yaml"]  # no quotes, which simple readers keep
     for name, content in made.items():
         (tmp_path / name).write_bytes(content)
     assert read_grid(tmp_path / "plan.yaml").cell_m == mapper.config.grid.cell_m

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from kiteline_codec.transport.seal import fingerprint
 from kiteline_core.ids import MAX_AGENTS
 from kiteline_hw.ports import LinkError
 from kiteline_hw.system.key_store import new_key, read_file
@@ -24,6 +25,27 @@ def test_a_base_that_pairs_before_its_first_start_has_the_keys_of_all(
     keys.main(["pair", "4", "--file", str(base)])
     again = read_file(base)
     assert again.agents[4] != held.agents[4] and {**again.agents, 4: held.agents[4]} == held.agents
+
+
+def test_keys_are_shown_as_fingerprints_and_on_demand_as_lines_of_the_file(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "keys"
+    for agent in ("7", keys.MAPS):
+        assert keys.main(["--file", str(file), "new", agent]) == 0
+        capsys.readouterr()
+        held = read_file(file)
+        assert keys.main(["--file", str(file), "show"]) == 0
+        shown = capsys.readouterr().out.splitlines()
+        named = {"agent 7": held.agents[7]} | ({} if held.maps is None else {"the right to change maps": held.maps})
+        assert [line.split("  ")[1] for line in shown] == [fingerprint(key) for key in named.values()]
+        assert not any(key.hex() in "".join(shown) for key in named.values())
+    assert held.maps is not None
+    assert keys.main(["--file", str(file), "show", "--secret", keys.MAPS]) == 0
+    assert capsys.readouterr().out == f"{keys.MAPS} {held.maps.hex()}\n"
+    with pytest.raises(SystemExit):
+        keys.main(["--file", str(file), "show", "--secret", "8"])
+    assert "agent 8 has no key" in capsys.readouterr().err
 
 
 def test_no_file_is_made_for_an_agent_that_cannot_be(tmp_path: Path) -> None:
