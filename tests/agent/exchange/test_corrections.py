@@ -1,6 +1,7 @@
 """What the agent knows of how its submaps lie to each other, from the placements that a base sends."""
 
 import copy
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from kiteline_agent.config import AgentConfig, SmoothingConfig
 from kiteline_agent.exchange.corrections import Corrections
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.relocalisation.map_cache import MapCache
-from kiteline_codec.schema import GravityAlignment, Key, SubmapPlacement
+from kiteline_codec.schema import DisparityCalibration, GravityAlignment, Key, SubmapPlacement
 from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.geometry.cameras import RectifiedCamera
@@ -21,11 +22,28 @@ FAR = se3.exp(np.array([1.3, -0.6, 0.1, 0.0, 0.0, 0.4]))
 
 @pytest.fixture
 def corrections() -> Corrections:
+    return made(None)
+
+
+def made(calibrate: Callable[[DisparityCalibration], list[str]] | None) -> Corrections:
     camera, config = RectifiedCamera(752, 480, 450.0, 450.0, 370.0, 240.0, 0.11, True, np.eye(4)), AgentConfig()
     local_map = LocalMap(camera, config.local_map)
     local_map.activate(FIRST)
     cache = MapCache(camera, config.map_cache, config.matching, config.ransac, None)
-    return Corrections(local_map, cache, config.smoothing)
+    return Corrections(local_map, cache, config.smoothing, calibrate)
+
+
+def test_an_offset_of_disparities_goes_to_the_right_camera_if_there_is_one() -> None:
+    taken: list[DisparityCalibration] = []
+    record = DisparityCalibration(AgentId(0), np.full(5, 0.25), 0.1)
+
+    def calibrate(given: DisparityCalibration) -> list[str]:
+        taken.append(given)
+        return ["the rig is worn"]
+
+    moved, events = made(calibrate).take([record], [])
+    assert taken == [record] and events == ["the rig is worn"] and not moved
+    assert made(None).take([record], []) == (False, [])
 
 
 def test_a_placement_by_odometry_recognises_nothing_however_far_it_lies(corrections: Corrections) -> None:
