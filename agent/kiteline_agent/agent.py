@@ -223,7 +223,7 @@ class Agent:
             # 7. Make a keyframe if the policy needs one.
             events += self._keyframes.add_if_needed(ctx, track)
             events += self._scan(ctx)
-            # 8. Join an older submap, continue one without ids in another, or a monocular one in metres.
+            # 8. Join an older submap that is recognised, or continue in a new one.
             events += self._submaps.join_older(ctx, track)
             continued = self._submaps.continue_full(ctx, track) or self._submaps.restart_in_metres(ctx, track)
             if continued:

@@ -1,7 +1,7 @@
 """Configuration of the onboard half: one frozen section per stage."""
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import ClassVar, Literal
 
 from kiteline_agent.ekf_config import EkfConfig
 from kiteline_agent.imaging.features import DetectorConfig
@@ -62,6 +62,8 @@ class PyramidConfig:
 class StereoConfig:
     """Depth from disparities along the image row."""
 
+    MAY_BE_ZERO: ClassVar = ("points",)
+
     min_depth_m: float = 0.25  # m: nearest surface; bounds the search along the row
     search_px: float = 3.0  # px of the level: range around the predicted disparity
     points: int = 240  # disparities measured in a frame, spread over the landmarks found; 0: none
@@ -72,11 +74,13 @@ class StereoConfig:
 class AlignConfig:
     """Template alignment."""
 
+    MAY_BE_ZERO: ClassVar = ("fine_from",)
+
     coarse_points: int = 80  # landmarks of the coarse pass, which corrects the prediction
     points: int = 240  # landmarks of the fine pass; more cost time and gain little
     cell_px: int = 32  # px: candidates are spread over cells of this size
     iterations: int = 8  # Gauss-Newton steps a level
-    fine_from: int = 1  # template level at which the fine pass begins; 0 is cheaper and converges from less far
+    fine_from: int = 1  # template level at which the fine pass begins; 0: cheaper, and converges from less far
     fine_step_px: float = 3.0  # px of the fine level: error that the coarse pass leaves
     min_ncc: float = 0.80  # correlation of template and patch
     sigma_px: float = 0.30  # px at octave 0: standard deviation of an aligned coordinate
@@ -153,7 +157,7 @@ class DepthFromMotionConfig:
 
 
 @dataclass(frozen=True, slots=True)
-class DisparityConfig:
+class DisparityAlignmentConfig:
     """Estimation of a worn stereo rig's disparity offset on board."""
 
     on: bool = True  # False: only the base estimates it
@@ -217,6 +221,11 @@ class MapCacheConfig:
 class SmoothingConfig:
     """How corrections reach the live pose in the world. They never move the odometry frame."""
 
+    MAY_BE_ZERO: ClassVar = (
+        "max_m_s",
+        "whole_rad",
+    )
+
     max_m_s: float = 0.03  # m/s at which the odometry frame moves in w: 3 mm a frame at 10 Hz; 0: at once
     onboard_m: float = 0.0028  # m a frame by which live poses follow what the agent itself finds of its map
     time_s: float = 10.0  # s for all but an e-th of a correction that is larger, or whose lengths accelerations told
@@ -230,6 +239,8 @@ class SmoothingConfig:
 @dataclass(frozen=True, slots=True)
 class PredictionConfig:
     """Poses of frames that the governor skips, and between frames."""
+
+    MAY_BE_ZERO: ClassVar = ("rate_hz",)
 
     rate_hz: float = 30.0  # 1/s: poses to a flight controller, predicted to the time of sending; 0: frames only
     least_cpu_percent: float = 10.0  # of a core: with less, predictions of skipped frames would take half of the budget
@@ -261,6 +272,8 @@ class GovernorConfig:
 class LogConfig:
     """Images in the log. Images that the source delivers encoded are logged as they come."""
 
+    MAY_BE_ZERO: ClassVar = ("every",)
+
     every: int = 1  # frames; of so many, the images of one are logged, 0: none. Only a log with all can be replayed
     compressed: bool = True  # PNG of half an image's size for some 2.7 ms of a fast core, else stored for 0.25 ms
     apart: bool = True  # live flights encode in another process: 0.2 ms of the agent's CPU time for a pair, not 5
@@ -275,7 +288,7 @@ class AgentConfig:
     detector: DetectorConfig = field(default_factory=DetectorConfig)
     stereo: StereoConfig = field(default_factory=StereoConfig)
     rows: RowConfig = field(default_factory=RowConfig)
-    disparities: DisparityConfig = field(default_factory=DisparityConfig)
+    disparities: DisparityAlignmentConfig = field(default_factory=DisparityAlignmentConfig)
     known_rig: KnownRigConfig = field(default_factory=KnownRigConfig)
     align: AlignConfig = field(default_factory=AlignConfig)
     pose: PoseConfig = field(default_factory=PoseConfig)

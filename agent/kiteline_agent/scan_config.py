@@ -1,19 +1,27 @@
 """Configuration of scans and of the local grid."""
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 
 @dataclass(frozen=True, slots=True)
 class ScanConfig:
     """When images are scanned for ground and obstacles; `ground` says how."""
 
+    MAY_BE_ZERO: ClassVar = (
+        "moved_m",
+        "turned_rad",
+    )
+
     on: bool = True  # False: the agent makes no scans
     by_base: bool = False  # True: of a stereo pair the base makes them from images, while the link carries these
     jpeg_quality: int = (
         90  # of these images: 27 kB of a textured room; 75 (17 kB) costs 6 points of recall, 97 gains none
     )
-    moved_m: float = 0.2  # m; motion since the last scan: one sees a wall at 3 m anew from an angle of 4 degrees
-    turned_rad: float = 0.17  # rad; rotation since the last scan: a tenth of the field of view is new
+    moved_m: float = (
+        0.2  # m; motion since the last scan: it sees a wall at 3 m from another angle, by 4 degrees; 0: any
+    )
+    turned_rad: float = 0.17  # rad; rotation since the last scan: a tenth of the field of view is new; 0: any
     again_s: float = 0.5  # s; a camera that stays where it is scans again for the local grid: people walk in
     part_s: float = (
         0.05  # s between frames in which a stripe is matched: two at 10 Hz, so that every keyframe can be scanned

@@ -1,8 +1,9 @@
 """Configuration of the base station: one frozen section per stage."""
 
 from dataclasses import dataclass, field
+from typing import ClassVar
 
-from kiteline_core.ground.config import GroundConfig as ScanConfig
+from kiteline_core.ground.config import GroundConfig
 from kiteline_core.imaging.matching import MatchConfig
 from kiteline_core.optimisation.bundle import BundleConfig
 from kiteline_core.pose.pnp import RansacConfig
@@ -97,8 +98,8 @@ class LoopConfig:
     agree_scale: float = 0.05  # difference of the logarithms of two scales that agree
     drift_m: float = 0.3  # m; correction of a loop that drift explains
     drift_path: float = 0.02  # added share of the path between the two keyframes
-    drift_votes: int = 12  # keyframes in a row, none against them, that outvote this expectation in one submap
-    most_drift: float = 5.0  # times the expected drift; no votes suffice beyond: two storeys that look alike
+    drift_votes: int = 12  # keyframes in a row, none against them, that refute this expectation in one submap
+    most_drift: float = 5.0  # times the expected drift; beyond, no number of them does: two storeys that look alike
     tilt_rad: float = 0.05  # rad; by which gravity of two maps may differ that are merged: cameras on worn mounts
     monocular_drift_path: float = 0.05  # share of the path instead of drift_path if the scale drifts too
 
@@ -119,7 +120,7 @@ class GraphConfig:
 
 
 @dataclass(frozen=True, slots=True)
-class DisparityConfig:
+class DisparityCalibrationConfig:
     """Calibration of each agent's disparity offset by bundles of a whole map."""
 
     tail: float = 6.0  # standard deviations, inflated: beyond two of the prior's own it yields to the data
@@ -163,10 +164,12 @@ class PublishConfig:
 
 
 @dataclass(frozen=True, slots=True)
-class MapCacheConfig:
+class MapCachePlannerConfig:
     """Keyframes that are sent to an agent for its map cache."""
 
-    max_keyframes: int = 24  # keyframes in an agent's cache, 0 none; they cover two views of a room and the way there
+    MAY_BE_ZERO: ClassVar = ("max_keyframes",)
+
+    max_keyframes: int = 24  # keyframes in an agent's cache, 0: none; they cover two views of a room and the way there
     period_s: float = 1.0  # s between two plans
     horizon_s: float = 2.0  # s that the motion is predicted: what a thin link takes to carry two keyframes
     local_keyframes: int = 48  # newest keyframes of its own that an agent keeps in its local map
@@ -180,7 +183,9 @@ class MapCacheConfig:
 class TileConfig:
     """Tiles of the grid that are sent to an agent."""
 
-    max_tiles: int = 96  # tiles that an agent holds, 0 none: 4 kB each on board; a disc of 15 m radius at 0.05 m has 70
+    MAY_BE_ZERO: ClassVar = ("max_tiles",)
+
+    max_tiles: int = 96  # tiles that an agent holds, 0: none; 4 kB each on board; a disc of 15 m radius has 70
     period_s: float = 1.0  # s between two plans
     horizon_s: float = 3.0  # s that the motion is predicted: what lies ahead is of use before the agent is there
     reach_m: float = 14.0  # m; tiles whose centres are nearer are sent: distances are told up to 10 m
@@ -194,7 +199,7 @@ class TileConfig:
 
 
 @dataclass(frozen=True, slots=True)
-class GroundConfig:
+class GroundHeightConfig:
     """Estimation of the ground height."""
 
     camera_above_m: float = 0.1  # m; ground points are at least this far below every camera that observes them
@@ -272,7 +277,7 @@ class GridConfig:
     band_files: bool = False  # True: a file for each height band, too
     binary_files: bool = False  # True: a file in which one view occupies a cell for good, too (Segfloor)
     resident_tiles: int = 512  # tiles that stay inflated, 24 kB each: what a dozen drones draw on at a time
-    ground: GroundConfig = field(default_factory=GroundConfig)
+    ground: GroundHeightConfig = field(default_factory=GroundHeightConfig)
 
 
 @dataclass(frozen=True, slots=True)
@@ -289,9 +294,9 @@ class BaseConfig:
     inertial_scale: InertialScaleConfig = field(default_factory=InertialScaleConfig)
     loops: LoopConfig = field(default_factory=LoopConfig)
     graph: GraphConfig = field(default_factory=GraphConfig)
-    disparity: DisparityConfig = field(default_factory=DisparityConfig)
+    disparity: DisparityCalibrationConfig = field(default_factory=DisparityCalibrationConfig)
     publish: PublishConfig = field(default_factory=PublishConfig)
-    map_cache: MapCacheConfig = field(default_factory=MapCacheConfig)
+    map_cache: MapCachePlannerConfig = field(default_factory=MapCachePlannerConfig)
     grid: GridConfig = field(default_factory=GridConfig)
-    scan: ScanConfig = field(default_factory=ScanConfig)
+    scan: GroundConfig = field(default_factory=GroundConfig)
     tiles: TileConfig = field(default_factory=TileConfig)

@@ -27,7 +27,7 @@ from kiteline_basestation.map.map_tables import CULLED, LANDMARK
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.mapper_state import MapperCounts, MapperState, map_state, restore_map
 from kiteline_basestation.merging.graph_job import POSE_GRAPH
-from kiteline_basestation.merging.map_merger import MapMerger, MergerState
+from kiteline_basestation.merging.map_merger import NO_CLOSURES, MapMerger, MergerState
 from kiteline_basestation.merging.merges import NOTHING, MergeResult
 from kiteline_basestation.refinement import culling, landmark_matching, triangulation
 from kiteline_basestation.refinement.bundle_job import FULL_BUNDLE, LOCAL_BUNDLE
@@ -266,9 +266,7 @@ class Mapper:
             "agents": agents,
             "submaps_placed": len(self.placements),
             "refused_records": self._intake.refused,
-            "loops": merger.loops if merger else 0,
-            "merges": len(merger.merges) if merger else 0,
-            "merges_undone": merger.undone if merger else 0,
+            **(merger.counts if merger else NO_CLOSURES),
             "maps": len({self.map.map_id(s) for s in submaps}),
             "jobs_open": pending,
             "jobs_failed": self.jobs_failed,

@@ -103,7 +103,7 @@ def load(config: T, text: str | bytes, root: str, name: str) -> T:
     """`config` with the values of the table [root] of a TOML text, as people write it.
 
     The text may have the tables [agent] and [base]. name: of the file, for error texts. Raises ConfigError as `apply`
-    does, and for a number that is not finite, or negative where the default is not.
+    does, and for a number that is out of range (`in_range`).
     """
     table = parse(text, name)
     if unknown := set(table) - ROOTS:
@@ -129,7 +129,12 @@ def of_log(config: T, text: str) -> T:
 
 
 def in_range(config: T, default: T, path: str) -> T:
-    """`config`, if all its numbers are finite and not negative where those of `default` are not; else ConfigError."""
+    """`config`, if its numbers are finite and have the signs of those of `default`; else ConfigError.
+
+    0 stands for a positive number only where a section names it in `MAY_BE_ZERO`: what an option counts, divides by or
+    weighs with cannot be nothing.
+    """
+    may_be_zero = getattr(type(config), "MAY_BE_ZERO", ())
     for f in fields(config):  # type: ignore[arg-type]
         value, normal, inner = getattr(config, f.name), getattr(default, f.name), f"{path}.{f.name}"
         if is_dataclass(value):
@@ -139,6 +144,8 @@ def in_range(config: T, default: T, path: str) -> T:
                 raise ConfigError(f"{inner}: found {_shown(value)}, expected a finite number")
             if value < 0 <= normal:
                 raise ConfigError(f"{inner}: found {_shown(value)}, expected a number that is not negative")
+            if value == 0 < normal and f.name not in may_be_zero:
+                raise ConfigError(f"{inner}: found {_shown(value)}, expected a number above 0")
     return config
 
 

@@ -2,16 +2,19 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import pytest
 
+from kiteline_basestation.station import Station
 from kiteline_codec.schema import CameraIntrinsics, KeyframeHeader, NewLandmarks, Observations, Record
 from kiteline_core.arrays import F64, I64, U8
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, keyframe_id, point_id, submap_id
 from kiteline_core.places.place_index import Vocabulary, nodes
+from tests.basestation.saved_flights import ELSEWHERE, Agents, MakeFlight, new_station
 
 
 @dataclass
@@ -266,3 +269,15 @@ def papered() -> tuple[Scene, Scene]:
 def half_papered() -> tuple[Scene, Scene]:
     """Two rooms that share half of what hangs on their walls."""
     return two_rooms(0.5, 40)
+
+
+@pytest.fixture(scope="module")
+def joined(make_flight: MakeFlight, words: Any) -> tuple[Agents, Station]:
+    """Two agents whose maps have become one, and a third that is alone."""
+    a = make_flight(keyframes=20, turns=0.6)
+    b = make_flight(keyframes=20, turns=0.6, start=0.3, variant=1, agent=1, T_w_m=ELSEWHERE)
+    c = make_flight(keyframes=8, turns=0.1, seed=9, agent=2)
+    agents, station = Agents([a, b, c]), new_station(words)
+    agents.fly(station, 0, 45)
+    assert station.mapper.summary()["merges"] == 1
+    return agents, station

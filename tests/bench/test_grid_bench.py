@@ -305,3 +305,5 @@ def test_the_truth_on_turned_cells_frees_fewer_of_them_as_a_whole() -> None:
     assert not (whole[(x > 3.0 - 0.02) & known] == FREE).any()  # a corner reaches 0.031 m from the centre
     assert (whole[known & (x < 3.0 - 0.035) & (x > 0.2)] == FREE).mean() > 0.9
     assert not ((whole == FREE) & (centres != FREE)).any()
+    assert (whole[centres == OCCUPIED] == OCCUPIED).all()  # any part of a cell makes it occupied
+    assert not (whole[known & (x < 3.0 - 0.035)] == OCCUPIED).any()

@@ -16,11 +16,11 @@ from kiteline_agent.runtime.options import AgentOptions
 from kiteline_bench.vehicle import guided
 from kiteline_core.geometry import se3
 from kiteline_hw.calibration import own
-from kiteline_hw.calibration.told import ToldCalibration
+from kiteline_hw.calibration.file_calibration import FileCalibration
 from kiteline_hw.ports import SourceError
 from kiteline_hw.sources.open import open_source
 from kiteline_lab.calibration import calibrate, imu
-from kiteline_lab.calibration.imu import NoImu
+from kiteline_lab.calibration.imu import ImuMissing
 from kiteline_lab.calibration.imu_guide import ImuProgress, rotation_deg
 
 Look = tuple[ImuProgress, KnownRigConfig | None]
@@ -49,7 +49,7 @@ def test_a_camera_that_was_mounted_by_a_ruler_is_found_by_turns(
     assert source.rig.right is not None and source.rig.T_c_r is not None
     T_b_c = source.rig.T_b_c.copy()
     T_b_c[:3, :3] = T_b_c[:3, :3] @ se3.so3_exp(np.radians([1.5, -1.0, 1.5]))
-    told = ToldCalibration("", (source.rig.left, source.rig.right), source.rig.T_c_r, T_b_c, source.imu)
+    told = FileCalibration("", (source.rig.left, source.rig.right), source.rig.T_c_r, T_b_c, source.imu)
     calibration, rig = tmp_path / "calibration.yaml", tmp_path / "rig.toml"
     calibration.write_text(own.texts(told)["calibration.yaml"])
     command = ["imu", str(flight), "--calibration", str(calibration), "--rig", str(rig)]
@@ -83,7 +83,7 @@ def test_a_camera_that_was_mounted_by_a_ruler_is_found_by_turns(
 
 
 def test_a_recording_without_an_imu_is_refused(recording: Path, tmp_path: Path) -> None:
-    with pytest.raises(NoImu, match="has no IMU"):
+    with pytest.raises(ImuMissing, match="has no IMU"):
         calibrate.main(["imu", str(recording), "--rig", str(tmp_path / "rig.toml")])
     assert not (tmp_path / "rig.toml").exists()
 

@@ -1,5 +1,6 @@
 """The shape of the sources is measured: sizes, import circles, also those of types alone."""
 
+from collections import Counter
 from pathlib import Path
 
 from kiteline_bench.benchmark import BENCHMARKS, parts
@@ -63,3 +64,12 @@ def test_each_benchmark_is_found() -> None:
 def test_the_suite_is_timed_as_make_runs_it() -> None:
     runs = runs_of_make_test((ROOT / "Makefile").read_text(encoding="utf-8"))
     assert [run[-2:] for run in runs] == [["-m", "not alone"], ["-m", "alone"]]
+
+
+def test_tests_are_small_files_in_small_folders() -> None:
+    folders: Counter[Path] = Counter()
+    for path in (ROOT / "tests").glob("**/*.py"):
+        folders[path.parent] += 1
+        assert len(path.read_text(encoding="utf-8").splitlines()) <= 400, path
+    assert len(folders) > 20
+    assert [str(folder) for folder, count in folders.items() if count > 14] == []

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from kiteline_bench.trust import fuzz
-from kiteline_bench.trust.doors import Door, doors
+from kiteline_bench.trust.fuzz_targets import FuzzTarget, fuzz_targets
 from kiteline_codec.schema import Key, messages
 
 HERE = Path(__file__).parent
@@ -20,7 +20,7 @@ def values() -> list[tuple[Key, bytes]]:
 def test_nothing_but_refusals(tmp_path: Path) -> None:
     corpus = fuzz.read_corpus(HERE / "corpus")
     assert len(corpus) > 20
-    found = fuzz.fuzz(corpus, values(), 5_000, seed=1, others=doors(tmp_path))
+    found = fuzz.fuzz(corpus, values(), 5_000, seed=1, others=fuzz_targets(tmp_path))
     assert found.failures == []
     assert found.refused > 1_400
     assert found.accepted > 40
@@ -38,12 +38,12 @@ def test_it_would_find_a_crash(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "IndexError" in found.failures[0]
 
 
-def test_doors_that_cost_less_are_fed_more_often() -> None:
+def test_targets_that_cost_less_are_fed_more_often() -> None:
     taken: list[str] = []
 
-    def door(name: str) -> Door:
-        return Door(name, lambda data, draw: taken.append(name), (b"1",))
+    def target(name: str) -> FuzzTarget:
+        return FuzzTarget(name, lambda data, draw: taken.append(name), (b"1",))
 
-    others = [door("slow"), door("fast")]
+    others = [target("slow"), target("fast")]
     fuzz.fuzz([b"1"], values(), 2 * (7 + 1 + 4), seed=1, others=others, turns={"fast": 4})
     assert (taken.count("slow"), taken.count("fast")) == (30 + 2, 30 + 8)  # 30 before memory is measured

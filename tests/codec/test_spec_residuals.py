@@ -156,9 +156,9 @@ def test_observations(held: Callable[[Key], bool]) -> None:
 
 def test_new_landmarks() -> None:
     values = coded(flight(7, keyframes=1, landmarks=40))
-    for key, (_, code) in values.items():
-        if key.kind != NewLandmarks.KIND:
-            continue
+    landmarks = {key: code for key, (_, code) in values.items() if key.kind == NewLandmarks.KIND}
+    assert landmarks
+    for key, code in landmarks.items():
         form = ResidualCoder().compress(key, code, {}.get, {}.get)
         assert form is not None
         s = Source(form)

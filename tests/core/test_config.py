@@ -1,7 +1,7 @@
 import tomllib
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import Literal
+from typing import ClassVar, Literal
 
 import pytest
 from hypothesis import given
@@ -40,6 +40,8 @@ class Inner:
 
 @dataclass(frozen=True, slots=True)
 class Config:
+    MAY_BE_ZERO: ClassVar = ("rate_hz",)
+
     rate_hz: float = 20.0
     inner: Inner = field(default_factory=Inner)
 
@@ -51,6 +53,19 @@ def test_a_table_overrides_nested_values_and_leaves_the_rest() -> None:
     assert isinstance(out.rate_hz, float)
     assert out.inner.gain == 0.5
     assert Config() == Config(20.0)  # the original is untouched
+
+
+@pytest.mark.parametrize(
+    ("value", "words"), [("0", "above 0"), ("-1", "not negative"), ("nan", "finite"), ("inf", "finite")]
+)
+def test_numbers_out_of_range_are_refused_in_files(value: str, words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        load(Config(), f"[agent.inner]\ngain = {value}\n", "agent", "rig.toml")
+    assert apply(Config(), {"inner": {"gain": 0.0}}).inner.gain == 0.0  # code may: it knows what it does
+
+
+def test_a_section_says_which_numbers_may_be_zero() -> None:
+    assert load(Config(), "[agent]\nrate_hz = 0\n", "agent", "rig.toml").rate_hz == 0.0
 
 
 def test_unknown_key_names_key_section_and_what_is_known() -> None:

@@ -19,6 +19,7 @@ import pytest
 from kiteline_basestation.store.checksums import StoreError
 from kiteline_basestation.store.integrity import check
 from kiteline_basestation.store.store import FILE, read
+from kiteline_bench.harness.contract import check_contract
 from kiteline_cli.main import main as kiteline
 from kiteline_codec.schema import KeyframeHeader, record_log
 from kiteline_core.frame import EncodedImage
@@ -27,7 +28,6 @@ from kiteline_hw.logs.mcap_log import LEFT, RIG, RIGHT, LogReader, LogWriter, re
 from kiteline_hw.logs.rig_json import rig_from_json
 from kiteline_hw.system.key_store import new_key
 from kiteline_hw.system.start_numbers import numbers_in
-from kiteline_lab.flights.contract import check_contract
 from kiteline_lab.flights.fly import fly
 from kiteline_lab.flights.plan import Options
 from kiteline_lab.flights.processes import free_endpoint

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
+from kiteline_bench.harness.contract import check_contract
 from kiteline_hw.ports import LinkError, SourceError
 from kiteline_lab.flights.children import ChildProcesses, Event
-from kiteline_lab.flights.contract import check_contract
 from kiteline_lab.flights.flight_report import without_timing
 from kiteline_lab.flights.fly import fly
 from kiteline_lab.flights.plan import Options

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from kiteline_agent.ekf import landmark_update
-from kiteline_agent.ekf.filter_state import FilterState, Motion
+from kiteline_agent.ekf.filter_state import FilterState, OdometryMotion
 from kiteline_agent.ekf.ray_initialisation import (
-    Track,
+    RayTrack,
     distance_share,
     largest_parallax,
     linearised,
@@ -69,7 +69,7 @@ class EkfSlam:
         self._way = 0.0
         self._frame = 0
 
-    def predict(self, motion: Motion) -> None:
+    def predict(self, motion: OdometryMotion) -> None:
         """Move by odometry."""
         self.state.propagate(motion)
         self._way += float(np.linalg.norm(motion.T_c0_c1[:3, 3]))
@@ -140,7 +140,7 @@ class EkfSlam:
         used = self.state.view_used
         return not used.any() or self._way - float(self._view_way[used].max()) >= _VIEW_M
 
-    def _enter(self, ids: I64, xy: F64, coarse: F64, ended: list[Track]) -> I64:
+    def _enter(self, ids: I64, xy: F64, coarse: F64, ended: list[RayTrack]) -> I64:
         """Correct the state by new landmarks and ended tracks, and let the former in; returns their ids.
 
         ids, xy, coarse: (n,), (n,2), (n,) tracks that are no landmarks, see `update`.
@@ -163,7 +163,7 @@ class EkfSlam:
         self._tracks.drop(np.array([k for k, _ in new], np.int64))
         return out
 
-    def _positioned(self, ids: I64, xy: F64, coarse: F64) -> list[tuple[int, Track]]:
+    def _positioned(self, ids: I64, xy: F64, coarse: F64) -> list[tuple[int, RayTrack]]:
         """Places in `ids` of tracks whose rays meet under enough parallax, widest first, with what agrees of each."""
         config, state = self._config, self.state
         known, rows = self._tracks.find(ids)
@@ -189,10 +189,10 @@ class EkfSlam:
         for k in order[enough[order]][:_ENTRIES].tolist():
             views = np.flatnonzero(agrees[k, :-1])
             observations = points[k, np.append(views, config.views)]
-            out.append((int(known[k]), Track(views, observations, self._sigma * float(coarse[known[k]]))))
+            out.append((int(known[k]), RayTrack(views, observations, self._sigma * float(coarse[known[k]]))))
         return out
 
-    def _may_enter(self, track: Track) -> bool:
+    def _may_enter(self, track: RayTrack) -> bool:
         """True if the rays of a track intersect well enough to give its distance."""
         state = self.state
         rays = linearised(state, track, state.T_o_c, state.view_T_o_c)
@@ -200,18 +200,18 @@ class EkfSlam:
             return False
         return distance_share(state, rays) <= _DEPTH_SHARE
 
-    def _ended(self, ids: I64) -> list[Track]:
+    def _ended(self, ids: I64) -> list[RayTrack]:
         """Tracks that are followed no more, were seen often enough, and whose rays meet. ids: (n,) followed ones."""
         tracks = self._tracks
         ended = np.flatnonzero(~np.isin(tracks.ids, ids))
-        out: list[Track] = []
+        out: list[RayTrack] = []
         for row in ended[tracks.seen[ended].sum(axis=1) >= _LEAST_RAYS].tolist():
             if len(out) == _ENDED_TRACKS:
                 break
             views = np.flatnonzero(tracks.seen[row])
             views = views[np.argsort(self._view_way[views], kind="stable")]
             views = views[np.unique(np.linspace(0, len(views) - 1, _ENDED_RAYS).round().astype(np.int64))]
-            track = Track(views, tracks.xy[row, views], self._sigma * float(tracks.coarse[row]))
+            track = RayTrack(views, tracks.xy[row, views], self._sigma * float(tracks.coarse[row]))
             rays = linearised(self.state, track, self.state.T_o_c, self.state.view_T_o_c)
             if rays is not None and rays_meet(self.state, rays, self._config.residual_gate):
                 out.append(track)

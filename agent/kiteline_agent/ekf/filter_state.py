@@ -20,7 +20,7 @@ _VIEWS = 7  # first row of the past views, six each
 
 
 @dataclass(frozen=True, slots=True)
-class Motion:
+class OdometryMotion:
     """Motion of the camera between two frames by odometry.
 
     T_c0_c1: (4,4). scaled: (3,) m in c0, the part of the translation that the odometry's scale multiplies. cov: (6,6)
@@ -80,7 +80,7 @@ class FilterState:
 
     # changes
 
-    def propagate(self, motion: Motion) -> None:
+    def propagate(self, motion: OdometryMotion) -> None:
         """Move the camera by odometry."""
         n, R0 = self._size, self.T_o_c[:3, :3]
         moved = motion.T_c0_c1.copy()

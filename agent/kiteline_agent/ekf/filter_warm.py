@@ -3,7 +3,7 @@
 import numpy as np
 
 from kiteline_agent.ekf.ekf_slam import EkfSlam
-from kiteline_agent.ekf.filter_state import Motion
+from kiteline_agent.ekf.filter_state import OdometryMotion
 from kiteline_agent.ekf_config import EkfConfig
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
@@ -19,7 +19,7 @@ def warm_filter() -> None:
     x, y = np.meshgrid(np.arange(-1.0, 2.0, 0.5), np.arange(-1.0, 1.5, 0.5))
     wall = np.stack([x.ravel(), y.ravel(), np.full(x.size, 4.0)], axis=1)
     step = np.array([_STEP_M, 0.0, 0.0])
-    motion = Motion(se3.from_rt(np.eye(3), step), step, 1e-6 * np.eye(6))
+    motion = OdometryMotion(se3.from_rt(np.eye(3), step), step, 1e-6 * np.eye(6))
     for k in range(_STEPS):
         if k > 0:
             slam.predict(motion)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from kiteline_agent.ekf.filter_state import Motion
+from kiteline_agent.ekf.filter_state import OdometryMotion
 from kiteline_agent.ekf_config import EkfConfig
 from kiteline_agent.motion.odometer_samples import MeanVelocity, OdometerSamples
 from kiteline_core.arrays import F64
@@ -33,7 +33,7 @@ class OdometerMotion:
         """Take samples."""
         self._samples.add(batch)
 
-    def between(self, from_ns: int, to_ns: int) -> Motion:
+    def between(self, from_ns: int, to_ns: int) -> OdometryMotion:
         """The camera's motion between two frames."""
         dt_s, mean = (to_ns - from_ns) * 1e-9, self._samples.between(from_ns, to_ns)
         self.measured = mean is not None
@@ -77,7 +77,7 @@ def _bounded(cov: F64, sigma: float) -> F64:
     return np.diag(np.where(diagonal < _MEASURED, diagonal, sigma**2))
 
 
-def camera_motion(T_b0_b1: F64, cov: F64, T_b_c: F64) -> Motion:
+def camera_motion(T_b0_b1: F64, cov: F64, T_b_c: F64) -> OdometryMotion:
     """The camera's motion by that of the body. cov: (6,6) of the white error, along b0's axes and about b1's."""
     T_c_b = se3.inverse(T_b_c)
     R_c_b = T_c_b[:3, :3]
@@ -85,4 +85,4 @@ def camera_motion(T_b0_b1: F64, cov: F64, T_b_c: F64) -> Motion:
     to_camera = np.zeros((6, 6))
     to_camera[:3, :3] = to_camera[3:, 3:] = R_c_b
     to_camera[:3, 3:] = -R_c_b @ T_b0_b1[:3, :3] @ se3.skew(T_b_c[:3, 3])
-    return Motion(T_c_b @ T_b0_b1 @ T_b_c, R_c_b @ T_b0_b1[:3, 3], to_camera @ cov @ to_camera.T)
+    return OdometryMotion(T_c_b @ T_b0_b1 @ T_b_c, R_c_b @ T_b0_b1[:3, 3], to_camera @ cov @ to_camera.T)

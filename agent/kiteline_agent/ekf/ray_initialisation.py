@@ -41,7 +41,7 @@ def project(xy: F64, T_o_c: F64, point: F64) -> tuple[F64, F64, F64]:
 
 
 @dataclass(frozen=True, slots=True)
-class Track:
+class RayTrack:
     """Observations of one track. views: (v,) past views. xy: (v,2) x/z, y/z in them, or (v+1,2) with the camera of now
     at the end. sigma: deviation of these.
     """
@@ -55,9 +55,9 @@ class Track:
 class Rays:
     """A track's rays, linearised and split by the point where they meet, in deviations of an observation.
 
-    0 = by_point error of the point + by_state error of the state + white noise, and told = H error of the state + white
-    noise, where the point is eliminated. point: (3,). columns: (k,) of the state. by_point: (3,3). by_state: (3,k). H:
-    (m,k). told: (m,).
+    0 = by_point error of the point + by_state error of the state + white noise, and residual = H error of the state +
+    white noise, where the point is eliminated. point: (3,). columns: (k,) of the state. by_point: (3,3). by_state:
+    (3,k). H: (m,k). residual: (m,).
     """
 
     point: F64
@@ -65,10 +65,10 @@ class Rays:
     by_point: F64
     by_state: F64
     H: F64
-    told: F64
+    residual: F64
 
 
-def linearised(state: FilterState, track: Track, T_o_c: F64, view_T_o_c: F64) -> Rays | None:
+def linearised(state: FilterState, track: RayTrack, T_o_c: F64, view_T_o_c: F64) -> Rays | None:
     """The rays of a track with the camera now at T_o_c (4,4) and past views (n,4,4); None if they do not meet ahead."""
     views, is_seen_now = track.views, len(track.xy) > len(track.views)
     poses = np.concatenate([view_T_o_c[views], T_o_c[None]]) if is_seen_now else view_T_o_c[views]
@@ -99,7 +99,7 @@ def linearised(state: FilterState, track: Track, T_o_c: F64, view_T_o_c: F64) ->
 def rays_meet(state: FilterState, rays: Rays, gate: float) -> bool:
     """True if rays meet as well as the state's covariance allows, by chi-square over degrees of freedom."""
     spread = rays.H @ state.covariance(rays.columns) @ rays.H.T + np.eye(len(rays.H))
-    return bool(rays.told @ np.linalg.solve(spread, rays.told) <= gate * len(rays.H))
+    return bool(rays.residual @ np.linalg.solve(spread, rays.residual) <= gate * len(rays.H))
 
 
 def new_landmark(state: FilterState, rays: Rays) -> NewLandmark:

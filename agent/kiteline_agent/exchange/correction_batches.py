@@ -8,7 +8,7 @@ from kiteline_codec.schema.batches import checksum_of_keys
 _MAX_HELD = 4096  # values; a base makes a batch when the one before has arrived: more are a defect
 
 
-class CorrectionBatches:
+class ReceivedBatches:
     """Corrections in, in any order; out come those that wait for no other ones, and whole batches."""
 
     def __init__(self) -> None:

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from kiteline_agent.config import SmoothingConfig
-from kiteline_agent.exchange.correction_batches import CorrectionBatches
+from kiteline_agent.exchange.correction_batches import ReceivedBatches
 from kiteline_agent.exchange.correction_filter import CorrectionFilter
 from kiteline_agent.exchange.smoothing import Smoothing
 from kiteline_agent.exchange.whole_map_motion import WholeMapMotion
@@ -55,7 +55,7 @@ class Corrections:
         self._filter = CorrectionFilter(smoothing)
         self._whole = WholeMapMotion(smoothing)
         self._scale_sigma: dict[SubmapId, float] = {}  # relative deviation of lengths in w, by submap
-        self._batches = CorrectionBatches()
+        self._batches = ReceivedBatches()
         self._fused = FusedInMap(local_map)
         self._S_w_m: dict[SubmapId, F64] = {}
         self._recognised: set[SubmapId] = set()  # submaps whose placement rests on a merge at the base

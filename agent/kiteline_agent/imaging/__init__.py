@@ -1,1 +1,1 @@
-"""Images enter; pyramids, corners, descriptors and aligned templates leave."""
+"""Images enter; pyramids, corners, descriptors, aligned templates, disparities and offsets of rows leave."""

@@ -18,7 +18,7 @@ class FixedLagConfig:
     velocity_gate: float = 16.27  # 99.9 %: beyond it a velocity is rejected: wheels slip
     visual_inflation: float = 16.0  # of variance: errors of templates and points are correlated over frames
     imu_inflation: float = 3.0  # of noise densities: vibration, uncalibrated scale and axes, a bent map
-    length_inflation: float = 5.0  # of the deviation of the map's lengths, which lasts over the frames of an acceleration
+    length_inflation: float = 5.0  # of the deviation of lengths in the map: it lasts over an acceleration
     turn_floor_rad: float = 2e-5  # error of a preintegrated rotation that no noise density explains
     velocity_floor_m_s: float = 5e-4  # the same of velocity: interpolated ends of the interval
     position_floor_m: float = 2e-5  # the same of position

@@ -31,7 +31,9 @@ def contradicts(
     )
 
 
-def accuses_imu(solution: WindowSolution, gyro_noise: float, prior: BiasPrior, config: ContradictionConfig) -> bool:
+def exceeds_lens_errors(
+    solution: WindowSolution, gyro_noise: float, prior: BiasPrior, config: ContradictionConfig
+) -> bool:
     """True if a window that contradicts does so by more than its lens: a lens may be off beside a true IMU."""
     off = (solution.bias[3:] - prior.bias[3:]) / prior.sigma[3:]
     return bool(gyro_noise > config.both_gyro_noise or np.abs(off).max() > config.accel_bias)

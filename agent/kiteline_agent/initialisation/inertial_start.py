@@ -11,7 +11,7 @@ from kiteline_agent.governor.cost_model import Work
 from kiteline_agent.inertial.preintegration import BiasPrior, Samples, preintegrate
 from kiteline_agent.inertial.sample_buffer import SampleBuffer
 from kiteline_agent.initialisation import corner_tracks, lens_correction
-from kiteline_agent.initialisation.contradiction import ContradictionWatch, accuses_imu, contradicts
+from kiteline_agent.initialisation.contradiction import ContradictionWatch, contradicts, exceeds_lens_errors
 from kiteline_agent.initialisation.corner_tracks import CornerObservations, CornerTracks, TrackedKeyframe
 from kiteline_agent.initialisation.inertial_bundle import InertialBundle, lens_prior
 from kiteline_agent.initialisation.inertial_window import (
@@ -344,7 +344,7 @@ class InertialStart:
         gyro_noise, limits = noise.gyro / self._measured_noise().gyro, self._config.inertial_start.contradiction
         prior = self._default_prior()
         wrong = contradicts(solution, gyro_noise, prior, self._lens_prior, limits)
-        return wrong, wrong and accuses_imu(solution, gyro_noise, prior, limits)
+        return wrong, wrong and exceeds_lens_errors(solution, gyro_noise, prior, limits)
 
     def _note_contradiction(self, t_ns: int, *, contradicts: bool | None, by_imu: bool = True) -> None:
         self._warnings += self._contradiction.note(t_ns, contradicts=contradicts, by_imu=by_imu)

@@ -13,7 +13,7 @@ import math
 
 import numpy as np
 
-from kiteline_agent.config import DisparityConfig
+from kiteline_agent.config import DisparityAlignmentConfig
 from kiteline_agent.local_map import disparity_kernels as kernels
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_core.arrays import F64, I64
@@ -44,7 +44,7 @@ _FORWARD_GOOD_KEYFRAMES = 3  # the same of a good calibration's offset, which is
 class DisparityAlignment:
     """Information about the offset, by keyframe; and the offset that is applied."""
 
-    def __init__(self, local_map: LocalMap, config: DisparityConfig) -> None:
+    def __init__(self, local_map: LocalMap, config: DisparityAlignmentConfig) -> None:
         self._map, self._config = local_map, config
         camera = local_map.camera
         slots = len(local_map.keyframe)

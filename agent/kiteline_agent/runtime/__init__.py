@@ -1,1 +1,1 @@
-"""Runs one agent in a process: command line, source, log, link and flight controller around its steps."""
+"""One agent in a process: options, a source, packets and controller messages enter; poses and a log leave."""

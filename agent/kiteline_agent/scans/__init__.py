@@ -1,1 +1,1 @@
-"""Column scans: images of a keyframe in, what stands around the vehicle out, for the base and the vehicle itself."""
+"""Column scans: images enter; what stands around the vehicle leaves, for the base and the flight controller."""

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from kiteline_basestation.config import LoopConfig, MapCacheConfig
+from kiteline_basestation.config import LoopConfig, MapCachePlannerConfig
 from kiteline_basestation.exchange.agent_velocity import AgentVelocity
 from kiteline_basestation.exchange.sharing import SharingPolicy
 from kiteline_basestation.map.map_tables import CULLED, LANDMARK, NO_POSE
@@ -51,7 +51,7 @@ class _AgentCache:
 class MapCachePlanner:
     """The map caches of all agents."""
 
-    def __init__(self, config: MapCacheConfig, loops: LoopConfig, sparse_map: SparseMap) -> None:
+    def __init__(self, config: MapCachePlannerConfig, loops: LoopConfig, sparse_map: SparseMap) -> None:
         self._config = config
         self._map = sparse_map
         self._sharing = SharingPolicy(loops.share)

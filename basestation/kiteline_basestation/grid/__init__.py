@@ -1,1 +1,1 @@
-"""The occupancy grid: placed keyframes and landmarks enter; labelled landmarks, tiles and map_server files leave."""
+"""The occupancy grid: placed keyframes with column scans or landmarks enter; tiles and map_server files leave."""

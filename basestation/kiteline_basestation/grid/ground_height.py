@@ -6,12 +6,12 @@ a plane for each patch, fitted to the points near it in narrowing bands (a hard-
 
 import numpy as np
 
-from kiteline_basestation.config import GroundConfig
+from kiteline_basestation.config import GroundHeightConfig
 from kiteline_basestation.grid import ground_kernels as kernels
 from kiteline_core.arrays import F32, F64, I64, Bool
 
 
-def ground_heights(config: GroundConfig, points: F64, camera_z: F64) -> F64:
+def ground_heights(config: GroundHeightConfig, points: F64, camera_z: F64) -> F64:
     """z of the ground at each point (n,). points: (n,3) in w. camera_z: (n,) z of the lowest camera that observes it.
 
     NaN at all points if the histogram of heights below the cameras has no peak.
@@ -69,7 +69,7 @@ class _Patches:
         return out
 
 
-def _lowest_peaks(config: GroundConfig, patches: _Patches, z: F64, below: Bool) -> F64 | None:
+def _lowest_peaks(config: GroundHeightConfig, patches: _Patches, z: F64, below: Bool) -> F64 | None:
     """z (rows, columns) of the lowest peak in every patch; None if there is no peak."""
     if not below.any():
         return None
@@ -98,7 +98,7 @@ def _lowest_peaks(config: GroundConfig, patches: _Patches, z: F64, below: Bool) 
     return np.asarray(base + (ground.astype(np.float64) + 0.5) * config.height_bin_m)
 
 
-def _fit(config: GroundConfig, patches: _Patches, z: F64, near: Bool, planes: F64) -> F64:
+def _fit(config: GroundHeightConfig, patches: _Patches, z: F64, near: Bool, planes: F64) -> F64:
     """Least-squares planes (3, rows, columns) of the points `near` in every patch, with limited slope."""
     x, y = patches.xy.T
     n = patches.total(near, np.ones_like(x))
@@ -126,7 +126,7 @@ def _box3(values: F64, axis: int) -> F64:
     return out
 
 
-def _lowest_peak(count: F32, config: GroundConfig) -> int | None:
+def _lowest_peak(count: F32, config: GroundHeightConfig) -> int | None:
     """The lowest bin that is a peak with enough points and a share of the highest count; None without a peak."""
     after = np.append(count[1:], 0.0)
     need = max(config.peak_share * float(count.max()), config.min_peak_points)

@@ -1,1 +1,1 @@
-"""In: keyframe poses of maps, and what the agents know by their IMUs. Out: how long a metre is, and what is level."""
+"""A map's poses, and the inertial steps and gravity of its agents, enter; its scale and its vertical leave."""

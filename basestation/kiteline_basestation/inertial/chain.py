@@ -35,7 +35,7 @@ class Segment:
 
 
 @dataclass(frozen=True, slots=True)
-class Path:
+class MapPath:
     """Steps (n,) of all segments between nodes: step i leads from node `begin[i]` to the next one.
 
     R_w_b: (k,3,3) and camera: (k,3) m, at the nodes, lever: (k,3) m from body to camera, in w. fresh: (k,) True where
@@ -105,7 +105,7 @@ def _depths(problem: BundleProblem) -> F64:
     return np.array([float(np.median(part)) if len(part) else 1.0 for part in parts])
 
 
-def path_along(segments: tuple[Segment, ...], T_w_c: F64) -> Path:
+def path_along(segments: tuple[Segment, ...], T_w_c: F64) -> MapPath:
     """The path through keyframes at T_w_c (k,4,4).
 
     Between them it has the shape that the agent saw, bent so that it ends where the keyframes are.
@@ -128,7 +128,7 @@ def path_along(segments: tuple[Segment, ...], T_w_c: F64) -> Path:
     dt_s, velocity, position = (np.concatenate([getattr(s.steps, name) for s in segments]) for name in _BY_IMU)
     of_segment = zip(*((s.steps.noise, s.depth_m) for s in segments), strict=True)
     noise, depth_m = (np.repeat(values, sizes) for values in of_segment)
-    return Path(
+    return MapPath(
         np.concatenate(begin), np.concatenate(R), np.concatenate(camera), np.concatenate(lever),
         np.concatenate(fresh), dt_s, velocity, position, np.concatenate([_by_bias(s) for s in segments]), noise,
         depth_m,

@@ -13,7 +13,7 @@ import numpy as np
 
 from kiteline_basestation.config import InertialScaleConfig
 from kiteline_basestation.inertial import band_kernels
-from kiteline_basestation.inertial.chain import Path, Segment, path_along, told_units
+from kiteline_basestation.inertial.chain import MapPath, Segment, path_along, told_units
 from kiteline_basestation.inertial.scale_drift import ScaleDrift, bent, drift_along, shared_landmarks
 from kiteline_core.arrays import F64
 from kiteline_core.optimisation.bundle import BundleProblem, BundleResult
@@ -106,7 +106,7 @@ def map_scale(
 _MEDIAN_3 = 2.366  # of a chi-square with three degrees of freedom
 
 
-def _start(path: Path, drift: ScaleDrift, config: InertialScaleConfig) -> _State:
+def _start(path: MapPath, drift: ScaleDrift, config: InertialScaleConfig) -> _State:
     a, dt = path.begin, path.dt_s
     place = path.camera - path.lever
     velocity = np.zeros_like(place)
@@ -127,7 +127,7 @@ def _tangent(gravity: F64) -> F64:
 
 
 def _linearised(
-    path: Path, drift: ScaleDrift, state: _State, weight: F64, config: InertialScaleConfig
+    path: MapPath, drift: ScaleDrift, state: _State, weight: F64, config: InertialScaleConfig
 ) -> tuple[F64, F64, F64]:  # fmt: skip
     """Jacobians (n,12,20+m) of whitened errors by two nodes and the shared unknowns, errors (n,12), and the squared
     errors (n,) of the images in deviations.
@@ -174,7 +174,7 @@ def _linearised(
 
 
 def _solve(
-    path: Path, drift: ScaleDrift, state: _State, J: F64, e: F64, agent_units: float, config: InertialScaleConfig
+    path: MapPath, drift: ScaleDrift, state: _State, J: F64, e: F64, agent_units: float, config: InertialScaleConfig
 ) -> tuple[_State, float] | None:
     """A Gauss-Newton step, and the variance of the mean unit; None if the system has no solution."""
     k, shared = len(path.fresh), _SHARED + len(drift.mean)

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from kiteline_basestation.config import InertialScaleConfig
-from kiteline_basestation.inertial.chain import Path, Segment
+from kiteline_basestation.inertial.chain import MapPath, Segment
 from kiteline_core.arrays import F64, I64, Bool
 from kiteline_core.geometry import se3
 from kiteline_core.optimisation.bundle import BundleProblem, BundleResult
@@ -63,7 +63,7 @@ def shared_landmarks(problem: BundleProblem, inlier: Bool) -> F64:
 
 
 def drift_along(
-    segments: tuple[Segment, ...], path: Path, T_w_c: F64, shared: F64, config: InertialScaleConfig
+    segments: tuple[Segment, ...], path: MapPath, T_w_c: F64, shared: F64, config: InertialScaleConfig
 ) -> ScaleDrift:  # fmt: skip
     """The drift of scale along a path through keyframes T_w_c (k,4,4) that share landmarks (k,k)."""
     views = _views(path)
@@ -114,7 +114,7 @@ def bent(result: BundleResult, problem: BundleProblem, shared: F64, growth: F64,
     return replace(result, T_c_m=T_c_w, points=result.points + moves / observed)
 
 
-def _views(path: Path) -> F64:
+def _views(path: MapPath) -> F64:
     """How often the view has changed (k,) up to each node: by moving as far as what is seen, or by turning."""
     a, change = path.begin, np.full(len(path.camera) - 1, _CHAIN_VIEWS)
     turned = np.linalg.norm(_turns(path.R_w_b[a], path.R_w_b[a + 1]), axis=1)
@@ -134,7 +134,7 @@ def _interpolation(at: F64, knots: F64) -> F64:
     return np.column_stack([np.interp(at, knots, unit) for unit in np.eye(len(knots))])
 
 
-def _nodes_of_keyframes(segments: tuple[Segment, ...], path: Path) -> tuple[I64, I64, F64]:
+def _nodes_of_keyframes(segments: tuple[Segment, ...], path: MapPath) -> tuple[I64, I64, F64]:
     """Keyframes at which segments begin or end, the node of each, and the depth that is seen around it."""
     node: dict[int, tuple[int, float]] = {}
     step = 0

@@ -27,6 +27,7 @@ from kiteline_codec.schema import (
     SubmapScale,
     SubmapTie,
 )
+from kiteline_codec.schema.owners import submap_of
 from kiteline_core.ids import (
     NO_KEYFRAME,
     SEQUENCE_BITS,
@@ -274,10 +275,7 @@ def _submap_of(record: Record) -> SubmapId | None:
     """The submap that a record is of; None for one of the whole agent."""
     if isinstance(record, LivePose):
         return submap_of_keyframe(record.keyframe)
-    if record.ID is IdOf.AGENT:
-        return None
-    named = record.key().id
-    return SubmapId(named) if record.ID is IdOf.SUBMAP else submap_of_keyframe(KeyframeId(named))
+    return submap_of(record.key())
 
 
 def _is_own(agent: AgentId, record: Record) -> bool:

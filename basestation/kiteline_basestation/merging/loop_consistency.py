@@ -15,7 +15,7 @@ from kiteline_core.ids import KeyframeId, submap_of_keyframe
 _PLANE_ROUNDS = 4  # plane fits, each to the points near the last one
 _DRIFT_RAD = 0.1  # rad; correction of a loop that drift explains
 _DRIFT_RAD_M = 0.002  # rad/m; the same, added for each metre of the path
-_DRIFT_VOTES_APART = 1.0  # of the median depth; from the first to the farthest vote: they see other things
+_DRIFT_APART = 1.0  # of the median depth; from the first to the farthest of the matches: they see other things
 _TILT_DEVIATIONS = 4.0  # of what two agents know gravity to, added to the tilt between their maps
 _MAX_SCALE_DRIFT = 0.4  # logarithm of the scale drift along a loop
 _FUSE_M = 0.02  # m; smaller corrections need no pose graph: landmarks are fused at once
@@ -77,16 +77,16 @@ def within_drift(sparse_map: SparseMap, edge: LoopEdge, config: LoopConfig, time
     )
 
 
-def outvotes_drift(sparse_map: SparseMap, matches: Sequence[LoopMatch], config: LoopConfig) -> bool:
+def exceeds_expected_drift(sparse_map: SparseMap, matches: Sequence[LoopMatch], config: LoopConfig) -> bool:
     """True if matches in one submap that agree are so many, and so independent, that drift was larger than expected."""
     strong = [m for m in matches if m.inliers >= config.min_inliers_loop]
-    voters = sorted({m.new for m in strong})
-    if len(voters) < config.drift_votes or len({m.old for m in strong}) < config.drift_votes // 2:
+    keyframes = sorted({m.new for m in strong})
+    if len(keyframes) < config.drift_votes or len({m.old for m in strong}) < config.drift_votes // 2:
         return False
-    positions = sparse_map.keyframes.T_w_k[[sparse_map.rows[k] for k in voters], :3, 3]
+    positions = sparse_map.keyframes.T_w_k[[sparse_map.rows[k] for k in keyframes], :3, 3]
     apart = float(np.linalg.norm(positions - positions[0], axis=1).max())  # a path to and fro shows one thing often
     return (
-        apart >= _DRIFT_VOTES_APART * depth_of(sparse_map, strong[-1])
+        apart >= _DRIFT_APART * depth_of(sparse_map, strong[-1])
         and within_drift(sparse_map, strong[-1], config, config.most_drift)
         and keeps_level(sparse_map, strong[-1], config)
         and has_depth_relief(sparse_map, strong, config)

@@ -87,8 +87,8 @@ class LoopDetector:
         self._first_seen: dict[SubmapId, int] = {}  # order in which submaps were first seen
         self.kept_apart: list[tuple[frozenset[SubmapId], frozenset[SubmapId]]] = []  # maps that a user has split
         self.requested: set[SubmapPair] = set()  # maps that a user asked to merge: one match is sufficient
-        self.verified = 0
-        self.rejected = 0  # closures beyond the expected drift, or of ambiguous places
+        self.verified = 0  # matches that passed geometric verification
+        self.refused = 0  # of those: beyond the expected drift, of ambiguous places, or that would tilt a map
 
     def add(self, keyframe: KeyframeId) -> None:
         """Add a keyframe to the place index."""
@@ -230,17 +230,17 @@ class LoopDetector:
         self._matches[key] = matches
         same_map = self._map.map_id(new) == self._map.map_id(old)
         if not same_map and not consistency.keeps_level(self._map, match, config):
-            self.rejected += 1
+            self.refused += 1
             return None
         chosen = consistency.agreeing(self._map, matches, config)
         supporters = {m.new for m in chosen}
         best = max(chosen, key=lambda m: (m.inliers, m.new))
         if same_map and not consistency.within_drift(self._map, match, config):
             alone = len(chosen) == len(matches)  # one that sees two places speaks for neither
-            if new == old and alone and consistency.outvotes_drift(self._map, chosen, config):
+            if new == old and alone and consistency.exceeds_expected_drift(self._map, chosen, config):
                 self._matches[key] = []
                 return self._closure(best, chosen)
-            self.rejected += 1
+            self.refused += 1
             if new == old or len(supporters) < _MIN_KEYFRAMES:
                 return None
             self._contradicted[key] = self._contradicted.get(key, 0) + 1
@@ -255,7 +255,7 @@ class LoopDetector:
         if not enough or not (same_map or consistency.has_depth_relief(self._map, chosen, config)):
             return None
         if not same_map and any(self._is_ambiguous(k) for m in chosen[-_MIN_KEYFRAMES:] for k in (m.old, m.new)):
-            self.rejected += 1
+            self.refused += 1
             return None
         if same_map:
             self._matches[key] = []  # matches that merged maps stay, to be weighed against later ones

@@ -42,6 +42,7 @@ from kiteline_core.places.place_index import Vocabulary
 
 _LOOP_GAP = 30  # keyframes; landmarks observed again after so many count as a loop
 _REQUERIES = 2  # keyframes of merged maps that are matched to the other map in one step
+NO_CLOSURES = dict.fromkeys(("loops", "merges", "merges_undone", "loop_matches", "matches_refused"), 0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,6 +97,12 @@ class MapMerger:
     def pending_jobs(self) -> int:
         """Number of pending jobs."""
         return self._corrections.pending
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """What was found so far, with the keys of `NO_CLOSURES`."""
+        found, refused = self.detector.verified, self.detector.refused
+        return dict(zip(NO_CLOSURES, (self.loops, len(self.merges), self.undone, found, refused)))
 
     def is_busy(self, map_id: SubmapId) -> bool:
         """True if a correction of a map is due or pending."""

@@ -1,1 +1,1 @@
-"""New keyframes enter; landmarks are matched, triangulated and culled, and bundles refine poses and positions."""
+"""New keyframes enter; matched, triangulated and culled landmarks and bundle-adjusted poses leave."""

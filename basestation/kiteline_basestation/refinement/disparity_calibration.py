@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from kiteline_basestation.config import DisparityConfig
+from kiteline_basestation.config import DisparityCalibrationConfig
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_core.arrays import F64, I32, I64
 from kiteline_core.geometry.disparity_offset import TERMS, none, terms
@@ -39,7 +39,7 @@ def offsets(sparse_map: SparseMap, slots: I32) -> F64:
 
 
 def with_border(
-    sparse_map: SparseMap, slots: I32, problem: BundleProblem, config: DisparityConfig
+    sparse_map: SparseMap, slots: I32, problem: BundleProblem, config: DisparityCalibrationConfig
 ) -> tuple[BundleProblem, tuple[AgentId, ...]]:  # fmt: skip
     """Add the disparity offsets of a problem's agents as unknowns. Returns it and these agents, in order.
 
@@ -131,7 +131,7 @@ def reset_offsets(sparse_map: SparseMap, agents: tuple[AgentId, ...]) -> None:
                 sparse_map.disparity_sigma_px[agent] = sparse_map.onboard_sigma_px[agent]
 
 
-def is_significant(problem: BundleProblem, result: BundleResult, config: DisparityConfig) -> bool:
+def is_significant(problem: BundleProblem, result: BundleResult, config: DisparityCalibrationConfig) -> bool:
     """True if the estimate for at least one agent differs significantly from what was known (Mahalanobis distance)."""
     known = None if problem.border is None else problem.border.mean
     for g, offset in enumerate(result.offset if known is None else result.offset - known):
@@ -143,7 +143,7 @@ def is_significant(problem: BundleProblem, result: BundleResult, config: Dispari
 
 def set_offsets(
     sparse_map: SparseMap, agents: tuple[AgentId, ...], problem: BundleProblem, result: BundleResult,
-    config: DisparityConfig,
+    config: DisparityCalibrationConfig,
 ) -> None:  # fmt: skip
     """Set the offsets of agents from a bundle; an accurate one makes the agent's disparities count more."""
     border = problem.border

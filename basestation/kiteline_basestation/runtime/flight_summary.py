@@ -9,8 +9,8 @@ from kiteline_core.arrays import F64
 from kiteline_core.ids import KeyframeId
 
 _COUNTS = (
-    "keyframes", "loops", "merges", "found", "triangulated", "culled", "keyframes_culled", "bundles", "grids",
-    "refused_records",
+    "keyframes", "loops", "merges", "loop_matches", "matches_refused", "found", "triangulated", "culled",
+    "keyframes_culled", "bundles", "grids", "refused_records",
 )  # fmt: skip
 
 

@@ -95,15 +95,15 @@ class TerminalReporter:
         self._merges = list(merger.merges)
         return out
 
-    def _loop(self, proved: Sequence[LoopEdge]) -> str:
+    def _loop(self, edges: Sequence[LoopEdge]) -> str:
         """The position error that a loop closure corrects, and the length of the loop."""
         sparse_map = self._station.mapper.map
-        vote = max(proved, key=lambda v: v.inliers, default=None)
-        old, new = (None, None) if vote is None else (sparse_map.world_pose(vote.old), sparse_map.world_pose(vote.new))
-        if vote is None or old is None or new is None:
+        edge = max(edges, key=lambda e: e.inliers, default=None)
+        old, new = (None, None) if edge is None else (sparse_map.world_pose(edge.old), sparse_map.world_pose(edge.new))
+        if edge is None or old is None or new is None:
             return "landmarks matched where predicted"
-        error_m = float(np.linalg.norm((se3.inverse(new) @ old @ vote.T_old_new)[:3, 3]))
-        path_m = self._path_length_m(vote.old, vote.new)
+        error_m = float(np.linalg.norm((se3.inverse(new) @ old @ edge.T_old_new)[:3, 3]))
+        path_m = self._path_length_m(edge.old, edge.new)
         return f"error {error_m:.2f} m" + ("" if path_m is None else f" after {path_m:.0f} m")
 
     def _path_length_m(self, old: KeyframeId, new: KeyframeId) -> float | None:

@@ -11,17 +11,17 @@ from kiteline_bench.harness.result import FlownProcesses
 from kiteline_bench.link.arrivals import LinkUse, link_use, live_shift_ns
 from kiteline_bench.link.cpu import coding_ms, packet_ms
 from kiteline_bench.link.outage import fly_outage
+from kiteline_bench.link.relay import UdpController, UdpRelay
 from kiteline_codec.pacing.profiles import RADIO
 from kiteline_hw.mavlink.tunnel.tunnel_end import TunnelConfig, TunnelEnd
 from kiteline_hw.sim.links.link_model import LinkModelConfig
-from kiteline_hw.sim.links.relay import UdpController, UdpRelay
 from kiteline_hw.sim.links.serial_pair import SerialPair
 from kiteline_hw.sim.links.telemetry_radio import RoutingController, TelemetryConfig
 from kiteline_hw.sources.open import open_source
 from kiteline_lab.flights.plan import flight_starts
 from kiteline_lab.flights.processes import free_endpoint
 
-TITLE = "The thin line"
+TITLE = "The thin link"
 
 _FLIGHT = "room_flight.mcap"
 

@@ -1,1 +1,1 @@
-"""The experiments of the papers that kiteline builds on, beside its own figures."""
+"""The experiments of the papers that kiteline builds on: flights like theirs enter; bars leave."""

@@ -49,7 +49,7 @@ class Recorded:
 RECORDED = (
     Recorded("room_flight.mcap", "room_flight, stereo", False, False, (0.0, 1.0, 2.0)),
     Recorded("kitti_straight", "kitti_straight, stereo", False, False, (0.0, 0.5, 1.0)),
-    Recorded("euroc_mh01_air", "EuRoC MH_01 in the air, one eye and IMU", True, True, (0.0, 1.5, 3.0)),
+    Recorded("euroc_mh01_air", "EuRoC MH_01 in the air, one camera and IMU", True, True, (0.0, 1.5, 3.0)),
 )
 _PAPER = """The paper, largest absolute error and tracking time (EuRoC MH_01, whole, stereo):
 

@@ -77,7 +77,7 @@ def _recordings(bench: Bench) -> Iterator[tuple[str, Recording, Sequence[float]]
     yield "room_flight, no IMU", room.without_imu(), SHARES
     for name in NAMES:
         yield name, load(simulated(bench, name).recording, frames=frames), SHARES
-    yield "euroc_mh01_air, one eye and IMU", load(bench.source(_AIR), mono=True, frames=frames), _MONO_SHARES
+    yield "euroc_mh01_air, one camera and IMU", load(bench.source(_AIR), mono=True, frames=frames), _MONO_SHARES
 
 
 def compare(bench: Bench, name: str, recording: Recording, shares: Sequence[float] = SHARES) -> list[Outcome]:

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kiteline_agent.ekf.filter_state import FilterState, Motion
-from kiteline_agent.ekf.ray_initialisation import Track, linearised
+from kiteline_agent.ekf.filter_state import FilterState, OdometryMotion
+from kiteline_agent.ekf.ray_initialisation import RayTrack, linearised
 from kiteline_agent.ekf.ray_kernels import position_by_rays
 from kiteline_agent.ekf.ray_update import update_by_rays
 from kiteline_agent.ekf_config import EkfConfig
@@ -80,7 +80,7 @@ def compare(setting: Setting) -> Outcome:
 
 def _way(
     setting: Setting, model: vehicle.VehicleModel, poses: F64, rng: np.random.Generator
-) -> tuple[F64, F64, list[Motion]]:
+) -> tuple[F64, F64, list[OdometryMotion]]:
     """Camera poses (n,4,4) along a part of the loop, true and as they are told; n - 1 motions if odometry tells."""
     count = round(setting.way_m / _STEP_M) + 1
     begin = int(rng.integers(0, len(poses) - count))
@@ -97,7 +97,7 @@ def _way(
     return true, np.array(told) @ T_b_c, motions
 
 
-def _enters(motions: list[Motion], xy: F64, sigma: float, point: F64) -> bool:
+def _enters(motions: list[OdometryMotion], xy: F64, sigma: float, point: F64) -> bool:
     """Set the point (3,) with which the filter lets a landmark in; False if it does not.
 
     xy: (n,2) observations before, between and after n - 1 motions. Each frame is a view of the filter, whose poses the
@@ -108,7 +108,7 @@ def _enters(motions: list[Motion], xy: F64, sigma: float, point: F64) -> bool:
     for view, motion in enumerate(motions):
         state.add_view(view)
         state.propagate(motion)
-    track = Track(np.arange(count), xy, sigma)
+    track = RayTrack(np.arange(count), xy, sigma)
     update_by_rays(state, [track])
     rays = linearised(state, track, state.T_o_c, state.view_T_o_c)
     if rays is None:

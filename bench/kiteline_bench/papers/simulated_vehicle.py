@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from kiteline_agent.ekf.filter_state import Motion
+from kiteline_agent.ekf.filter_state import OdometryMotion
 from kiteline_agent.ekf.odometer_motion import camera_motion
 from kiteline_core.arrays import F64, I64
 from kiteline_core.geometry import se3
@@ -45,7 +45,7 @@ class SimulatedFrame:
     """True body pose, odometry since the frame before, and what the camera sees: ids increasing (n,), uv (n,2) px."""
 
     T_o_b: F64
-    motion: Motion | None
+    motion: OdometryMotion | None
     T_b0_b1: F64  # by odometry
     ids: I64
     uv: F64
@@ -104,7 +104,7 @@ def flight(model: VehicleModel, seed: int, laps: float = 1.0) -> list[SimulatedF
 
 def odometry(
     model: VehicleModel, before: F64, after: F64, scale: float, k: int, T_b_c: F64, rng: np.random.Generator
-) -> tuple[F64, Motion]:
+) -> tuple[F64, OdometryMotion]:
     """Body motion (4,4) that the odometry tells, and the camera's with its covariance. scale: true over told."""
     true = se3.inverse(before) @ after
     way = float(np.linalg.norm(true[:3, 3]))

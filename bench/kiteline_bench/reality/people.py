@@ -27,23 +27,24 @@ def run(bench: Bench) -> list[Bar]:
             for people in (_PEOPLE, 0)
         )
         for k, start_s in enumerate(_STARTS_S):
-            eyes = "monocular" if k >= len(_STARTS_S) - _MONOCULAR else "stereo"
-            pair = [flown(bench, f"flight {number} from {start_s:g} s, {eyes}, {what}",
-                          _part(recording, start_s, mono=eyes == "monocular"))
+            cameras = "monocular" if k >= len(_STARTS_S) - _MONOCULAR else "stereo"
+            pair = [flown(bench, f"flight {number} from {start_s:g} s, {cameras}, {what}",
+                          _part(recording, start_s, mono=cameras == "monocular"))
                     for what, recording in (("empty", empty), (f"{_PEOPLE} people", crowd))]  # fmt: skip
             found = _figures(*pair)
-            figures[eyes].append(found)
-            rows.append((number, start_s, eyes, *found))
+            figures[cameras].append(found)
+            rows.append((number, start_s, cameras, *found))
             bench.say("  live {:.3f} m, empty {:.3f}, base {:.3f}, empty {:.3f}".format(*found[:4]))
-    columns = ("flight", "start s", "eyes", "live m, people", "empty", "base m, people", "empty", "live over its bound",
+    columns = ("flight", "start s", "cameras", "live m, people", "empty", "base m, people", "empty",
+               "live over its bound",
                "base over its bound", "false metric %", "wrong merges")  # fmt: skip
     table(bench, "People", columns, rows)
     bars = []
-    for eyes, found_of in figures.items():
+    for cameras, found_of in figures.items():
         for name, column in (("live", 4), ("base", 5)):
             # Flights that get no scale in the empty scene either have nothing to compare with.
             ratios = [found[column] for found in found_of if not math.isnan(found[column])]
-            bars += spread(f"people, {eyes}: ATE {name} over the larger of {_TIMES:g} x empty and {_LEAST_M:g} m",
+            bars += spread(f"people, {cameras}: ATE {name} over the larger of {_TIMES:g} x empty and {_LEAST_M:g} m",
                            ratios, 1.0, "", 2)  # fmt: skip
     everything = [found for found_of in figures.values() for found in found_of]
     return [

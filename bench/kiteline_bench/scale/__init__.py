@@ -1,1 +1,1 @@
-"""Benchmarks of size: many agents, large maps, long days."""
+"""Benchmarks of size: many agents, large maps and long days enter, bars leave."""

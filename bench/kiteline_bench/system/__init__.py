@@ -1,1 +1,1 @@
-"""Benchmarks of the whole: the first flight, and the sources compared with an older build."""
+"""Benchmarks of the whole: the first flight, the sources, and an older build enter, bars leave."""

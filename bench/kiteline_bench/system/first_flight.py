@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 
 from kiteline_bench.harness.bars import Bar, Bench, FlightFailed, at_most, is_true, run_command
+from kiteline_bench.harness.contract import check_contract
 from kiteline_bench.harness.result import FlownProcesses
-from kiteline_lab.flights.contract import check_contract
 from kiteline_lab.flights.flight_report import without_timing
 from kiteline_lab.flights.fly import fly
 from kiteline_lab.flights.plan import Options

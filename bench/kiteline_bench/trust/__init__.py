@@ -1,1 +1,1 @@
-"""What may happen: hostile input at every door, disks that are full or alter bits, cards that are lost or cloned."""
+"""What may happen: hostile input, disks that are full or alter bits, and cloned cards enter, bars leave."""

@@ -1,4 +1,4 @@
-"""Random and mutated inputs for every door: packets, sealed packets, a sender with a key, questions, stores and files.
+"""Random and mutated inputs for every reader of outside bytes: packets, seals, questions, stores and files.
 
 Only the rooms' own errors may come of them, none may take long, and memory must not grow. `--inputs` sets how many.
 """
@@ -21,7 +21,7 @@ from zlib import crc32
 
 from kiteline_basestation.runtime.warm import warm
 from kiteline_bench.harness.bars import Bar, Bench, at_most
-from kiteline_bench.trust.doors import ERRORS, Door, doors
+from kiteline_bench.trust.fuzz_targets import ERRORS, FuzzTarget, fuzz_targets
 from kiteline_bench.trust.keyed_sender import KeyedSender
 from kiteline_codec import warm as codec_warm
 from kiteline_codec.residuals.residual_coding import ResidualCoder
@@ -37,17 +37,17 @@ from kiteline_hw.ports import SourceError
 
 TITLE = "Fuzzing"
 INPUTS = 200_000  # some minutes
-ROUND = 100_000  # inputs after which the doors begin anew; rounds run on all cores, and a run that is stopped goes on
+ROUND = 100_000  # inputs after which the targets begin anew; rounds run on all cores, and a run that is stopped goes on
 _TESTS = Path(__file__).resolve().parents[3] / "tests" / "codec"
 
-# Inputs of a door for each one of a door that opens files, which takes a millisecond: about the same time each.
+# Inputs of a target for each one of a target that opens files, which takes a millisecond: about the same time each.
 TURNS = {"record": 16, "packet": 16, "endpoint": 16, "residual": 16, "stream": 16, "saved map": 8, "sealed": 4,
          "question": 4, "depth image": 4, "image": 4, "rig": 4, "keyed": 2}  # fmt: skip
 
 _MAX_BYTES = 1400  # of an input
 _MAX_FILE_BYTES = 1 << 16
 _MOST_FAILURES = 20
-_FIRST = 30  # inputs of each door before memory is measured
+_FIRST = 30  # inputs of each target before memory is measured
 _KEY = bytes(32)
 _KINDS = tuple(sorted(RECORD_TYPES))
 
@@ -57,7 +57,7 @@ Target = Callable[[bytes, random.Random], object]
 @dataclass(slots=True)
 class FuzzResult:
     """Outcome of a run. failures: a line for each input that raised anything but an error of its room, with its bytes.
-    slowest_s: of CPU. grown_mib: over the memory after the first inputs of each door.
+    slowest_s: of CPU. grown_mib: over the memory after the first inputs of each target.
     """
 
     inputs: int
@@ -66,7 +66,7 @@ class FuzzResult:
     failures: list[str]
     slowest_s: float
     grown_mib: float
-    slowest: str = ""  # the door of the slowest input
+    slowest: str = ""  # the target of the slowest input
 
 
 def read_corpus(folder: Path) -> list[bytes]:
@@ -171,18 +171,18 @@ def mutate(data: bytes, draw: random.Random, most_bytes: int = _MAX_BYTES) -> by
 
 def fuzz(
     corpus: Sequence[bytes], values: Sequence[tuple[Key, bytes]], inputs: int, seed: int,
-    others: Sequence[Door] = (), turns: Mapping[str, int] | None = None,
+    others: Sequence[FuzzTarget] = (), turns: Mapping[str, int] | None = None,
 ) -> FuzzResult:  # fmt: skip
-    """Feed inputs drawn from a corpus to each decoder in turn, and to the other doors mutations of their samples.
+    """Feed inputs drawn from a corpus to each decoder in turn, and to the other targets mutations of their samples.
 
-    turns: inputs of a door, by name, in each round of all; 1 for those that are not named.
+    turns: inputs of a target, by name, in each round of all; 1 for those that are not named.
     """
     draw = random.Random(seed)
     targets = Targets(values)
     todo: list[tuple[str, Target, Sequence[bytes], int]] = [
         (target.__name__, target, corpus, _MAX_BYTES) for target in targets.all()
     ]
-    todo += [(door.name, door.take, door.samples, _MAX_FILE_BYTES) for door in others]
+    todo += [(target.name, target.take, target.samples, _MAX_FILE_BYTES) for target in others]
     sealer = Sealer(_KEY, 3, 1, Direction.UP, Suite.TAGGED)
 
     names = [name for name, *_ in todo]
@@ -208,14 +208,14 @@ def fuzz(
         before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         targets.accepted = refused = 0
         failures: list[str] = []
-        slowest, slowest_door = 0.0, ""
+        slowest, slowest_target = 0.0, ""
         for i in range(inputs):
             begin = time.thread_time()
             n = order[i % len(order)]
             name, outcome, data = one(n)
             took = time.thread_time() - begin
             if took > slowest:
-                slowest, slowest_door = took, name
+                slowest, slowest_target = took, name
             if outcome == "refused":
                 refused += 1
             elif outcome:
@@ -225,7 +225,7 @@ def fuzz(
             elif n >= len(todo) - len(others):
                 targets.accepted += 1
     grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
-    return FuzzResult(inputs, targets.accepted, refused, failures, slowest, grown, slowest_door)
+    return FuzzResult(inputs, targets.accepted, refused, failures, slowest, grown, slowest_target)
 
 
 @contextlib.contextmanager
@@ -282,12 +282,12 @@ class _Worker:
         self._corpus = read_corpus(_TESTS / "corpus")
         own = folder / str(os.getpid())
         own.mkdir()
-        self._doors = doors(own)
+        self._targets = fuzz_targets(own)
         self._grown_mib = 0.0
 
     def round(self, number: int, inputs: int) -> FuzzResult:
-        """Fuzz all doors with the seed of this round. grown_mib: in all rounds of this process."""
-        found = fuzz(self._corpus, self._values, inputs, seed=1 + number, others=self._doors, turns=TURNS)
+        """Fuzz all targets with the seed of this round. grown_mib: in all rounds of this process."""
+        found = fuzz(self._corpus, self._values, inputs, seed=1 + number, others=self._targets, turns=TURNS)
         self._grown_mib += found.grown_mib
         return replace(found, grown_mib=self._grown_mib)
 
@@ -305,7 +305,7 @@ def _round(folder: Path, number: int, inputs: int) -> tuple[int, FuzzResult, flo
 
 
 def run(bench: Bench) -> list[Bar]:
-    """Feed all doors in turn, on all cores; the corpus of packets and codes is that of the tests. With `--keep DIR` a
+    """Feed all targets in turn, on all cores; the corpus of packets and codes is that of the tests. With `--keep DIR` a
     run that was stopped goes on where it was: rounds have seeds of their own.
     """
     if not _TESTS.is_dir():
@@ -330,11 +330,11 @@ def run(bench: Bench) -> list[Bar]:
     total = joined([rounds[n] for n in sorted(rounds)])
     for failure in total.failures:
         bench.say(failure)
-    names = [target.__name__ for target in Targets([]).all()] + [door.name for door in doors(folder)]
+    names = [target.__name__ for target in Targets([]).all()] + [target.name for target in fuzz_targets(folder)]
     turns = {name: TURNS.get(name, 1) for name in names}
     each = ", ".join(f"{name} {total.inputs * n // sum(turns.values()):,}" for name, n in sorted(turns.items()))
     rate = f" {flown / cpu_s:,.0f} a second of CPU." if cpu_s else ""
-    bench.more.append(f"Inputs of each door, about: {each}.{rate}")
+    bench.more.append(f"Inputs of each target, about: {each}.{rate}")
     return [
         at_most("inputs that were neither read nor refused", len(total.failures), 0, "", 0),
         at_most("memory of a process, grown", total.grown_mib, 64, "MiB", 1),

@@ -1,1 +1,1 @@
-"""kiteline on a vehicle: live cameras, flight controllers modelled and in software in the loop, services."""
+"""Vehicles: modelled cameras, flight controllers, services and ArduCopter in the loop enter, bars leave."""

@@ -17,7 +17,7 @@ from kiteline_hw.mavlink.controller_session import ControllerSession
 from kiteline_hw.mavlink.coordinate_frames import R_L_O, mounting
 from kiteline_hw.mavlink.watch.attitude import CANDIDATES, attitude_rotation
 from kiteline_hw.mavlink.watch.controller_watch import ControllerWatch
-from kiteline_hw.mavlink.watch.findings import Level
+from kiteline_hw.mavlink.watch.findings import FindingLevel
 from kiteline_hw.ports import PoseSample
 from kiteline_hw.sim.autopilot import ModelledAutopilot
 from kiteline_hw.sim.flight_controller import FlightController, UdpFlightController, VisionSample
@@ -113,7 +113,7 @@ def _named_s(kind: Literal["ardupilot", "px4"], used: str, true: str) -> float:
             for answer in session.receive(data, now_ns, datagram=True):
                 model.receive(answer, now_ns)
         for finding in watch.take():
-            if finding.topic == "axes" and finding.level == Level.ERROR and f"--axes {true}" in finding.remedy:
+            if finding.topic == "axes" and finding.level == FindingLevel.ERROR and f"--axes {true}" in finding.remedy:
                 return max(0.0, now_ns / _S - 1.0 - _STILL_S)
     return math.inf
 

@@ -1,4 +1,4 @@
-"""Whose values are whose, and the memory that they claim where they are used: what an endpoint checks at its door."""
+"""The owner of each value, and the memory that it takes where it is used: what an endpoint checks on arrival."""
 
 from kiteline_codec.coding.packing import WireError
 from kiteline_codec.schema import messages

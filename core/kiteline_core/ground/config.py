@@ -1,14 +1,17 @@
 """Thresholds of ground segmentation."""
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 
 @dataclass(frozen=True, slots=True)
 class GroundConfig:
     """Ground segmentation and column scans. Pixels are those of the half-size image."""
 
-    wider: float = 0.085  # of the rectified width that scans see more of to both sides: 64 px of the 70 to 110 cut off
-    lower: float = 0.067  # of its height by which their view lies lower: 32 of 480 px, of 15 to 70 that are cut off
+    MAY_BE_ZERO: ClassVar = ("wider", "lower")
+
+    wider: float = 0.085  # of the rectified width that scans see more of to both sides: 64 px of 70 to 110; 0: no more
+    lower: float = 0.067  # of its height by which their view lies lower: 32 of 480 px, of 15 to 70; 0: not lower
     disparities: int = 48  # px searched, a multiple of 16: from 0.5 m on with 0.11 m of baseline; less CPU if fewer
     block_px: int = 7  # px, side of a matched block: smaller ones are noisier, larger ones widen obstacles
     small_step: int = 1  # cost of a step of one pixel of disparity, times the block's pixels: slanted ground has many

@@ -7,9 +7,9 @@ from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraModel, Lens
 from kiteline_hw.calibration.checks import checked_camera, checked_readout, checked_rigid, parse_lens
+from kiteline_hw.calibration.file_calibration import FileCalibration, FilePart
 from kiteline_hw.calibration.kalibr import IMU_KEYS, imu_numbers
 from kiteline_hw.calibration.nodes import Node
-from kiteline_hw.calibration.told import FilePart, ToldCalibration
 
 _IMU_KEYS = IMU_KEYS | {"rate_hz": "rate_hz"}
 
@@ -28,7 +28,7 @@ def read_imu(node: Node) -> FilePart:
     """An IMU; noise that the file lacks has its default. Raises SourceError."""
     imu = ImuCalibration(**imu_numbers(node, _IMU_KEYS))
     where = str(node.path)
-    return FilePart(where, ToldCalibration(where, imu=imu), T_s_i=_read_place(node))
+    return FilePart(where, FileCalibration(where, imu=imu), T_s_i=_read_place(node))
 
 
 def read_camera(node: Node) -> FilePart:
@@ -52,16 +52,16 @@ def read_camera(node: Node) -> FilePart:
         readout_s = node.get("line_delay").number("s between two rows") * height
     model = CameraModel(width, height, fx, fy, cx, cy, lens, coefficients, checked_readout(readout_s, where))
     return FilePart(
-        where, ToldCalibration(where, (checked_camera(model, where),), topics=("",)), T_s_c=_read_place(node)
+        where, FileCalibration(where, (checked_camera(model, where),), topics=("",)), T_s_c=_read_place(node)
     )
 
 
-def texts(told: ToldCalibration) -> dict[str, str]:
+def texts(given: FileCalibration) -> dict[str, str]:
     """The files of a calibration by name: cam0/sensor.yaml, cam1/sensor.yaml, imu0/sensor.yaml."""
-    T_b_c = told.rig().T_b_c
+    T_b_c = given.rig().T_b_c
     out: dict[str, str] = {}
-    for k, model in enumerate(told.cameras):
-        T = T_b_c if k == 0 or told.T_c_r is None else T_b_c @ told.T_c_r
+    for k, model in enumerate(given.cameras):
+        T = T_b_c if k == 0 or given.T_c_r is None else T_b_c @ given.T_c_r
         name = "equidistant" if model.lens is Lens.EQUIDISTANT else "radial-tangential"
         d = list(model.distortion) or [0.0] * 4
         readout = f"readout_s: {model.readout_s!r}\n" if model.readout_s else ""
@@ -70,8 +70,8 @@ def texts(told: ToldCalibration) -> dict[str, str]:
             f"camera_model: pinhole\nintrinsics: {[model.fx, model.fy, model.cx, model.cy]}\n"
             f"distortion_model: {name}\ndistortion_coefficients: {[float(v) for v in d]}\n{readout}"
         )
-    if told.imu is not None:
-        numbers = "".join(f"{key}: {getattr(told.imu, field)!r}\n" for field, key in _IMU_KEYS.items())
+    if given.imu is not None:
+        numbers = "".join(f"{key}: {getattr(given.imu, field)!r}\n" for field, key in _IMU_KEYS.items())
         out["imu0/sensor.yaml"] = f"sensor_type: imu\n{_place(se3.inverse(T_b_c) @ T_b_c)}{numbers}"
     return out
 

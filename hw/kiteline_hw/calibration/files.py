@@ -4,8 +4,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from kiteline_hw.calibration import euroc, kalibr, opencv, own
+from kiteline_hw.calibration.file_calibration import FileCalibration, FilePart, joined
 from kiteline_hw.calibration.nodes import Node, read_nodes
-from kiteline_hw.calibration.told import FilePart, ToldCalibration, joined
 from kiteline_hw.ports import SourceError
 from kiteline_hw.system.process import home_path
 
@@ -19,7 +19,7 @@ _READERS: tuple[tuple[Callable[[Node], bool], Callable[[Node], FilePart]], ...] 
     (kalibr.is_imu, kalibr.read_imu),
 )
 
-FORMS: dict[str, Callable[[ToldCalibration], dict[str, str]]] = {
+FORMS: dict[str, Callable[[FileCalibration], dict[str, str]]] = {
     "kiteline": own.texts,
     "kalibr": kalibr.texts,
     "euroc": euroc.texts,
@@ -28,7 +28,7 @@ FORMS: dict[str, Callable[[ToldCalibration], dict[str, str]]] = {
 }
 
 
-def read_calibration(text: str) -> ToldCalibration:
+def read_calibration(text: str) -> FileCalibration:
     """The calibration of FILE[,FILE…]: left camera first. Raises SourceError."""
     names = [name for name in text.split(",") if name]
     if not names:

@@ -9,8 +9,8 @@ from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraModel, Lens
 from kiteline_hw.calibration.checks import checked_camera, checked_readout, checked_rigid, parse_lens
+from kiteline_hw.calibration.file_calibration import FileCalibration, FilePart
 from kiteline_hw.calibration.nodes import Node
-from kiteline_hw.calibration.told import FilePart, ToldCalibration
 from kiteline_hw.ports import SourceError
 
 IMU_KEYS = {
@@ -47,7 +47,7 @@ def read_chain(node: Node) -> FilePart:
             T_c_r = T_c_i[0] @ se3.inverse(T_c_i[1])
     T_b_c = None if T_c_i[0] is None else se3.inverse(T_c_i[0])
     where = str(node.path)
-    return FilePart(where, ToldCalibration(where, cameras, T_c_r, T_b_c, None, topics))
+    return FilePart(where, FileCalibration(where, cameras, T_c_r, T_b_c, None, topics))
 
 
 def read_imu(node: Node) -> FilePart:
@@ -57,7 +57,7 @@ def read_imu(node: Node) -> FilePart:
         raise table.get("T_i_b").error("the identity: the body frame is that of the first IMU")
     imu = ImuCalibration(**imu_numbers(table, IMU_KEYS))
     where = str(node.path)
-    return FilePart(where, ToldCalibration(where, imu=imu))
+    return FilePart(where, FileCalibration(where, imu=imu))
 
 
 def imu_numbers(table: Node, keys: dict[str, str]) -> dict[str, float]:
@@ -69,18 +69,18 @@ def imu_numbers(table: Node, keys: dict[str, str]) -> dict[str, float]:
     }
 
 
-def texts(told: ToldCalibration) -> dict[str, str]:
+def texts(given: FileCalibration) -> dict[str, str]:
     """The files of a calibration by name: camchain.yaml (camchain-imucam.yaml with the IMU's place), imu.yaml."""
     out: dict[str, str] = {}
     lines: list[str] = []
-    for k, model in enumerate(told.cameras):
-        topic = told.topics[k] if k < len(told.topics) and told.topics[k] else f"/cam{k}/image_raw"
+    for k, model in enumerate(given.cameras):
+        topic = given.topics[k] if k < len(given.topics) and given.topics[k] else f"/cam{k}/image_raw"
         radtan = model.lens is not Lens.EQUIDISTANT
         d = (*model.distortion, 0.0, 0.0, 0.0, 0.0)[:4] if len(model.distortion) < 4 else model.distortion
         if radtan and any(d[4:]):
             raise SourceError(
-                f"{told.where}: camera {k} has {len(d)} radial-tangential coefficients, Kalibr's form has 4: calibrate "
-                "with `--coefficients 4`, or use another form"
+                f"{given.where}: camera {k} has {len(d)} radial-tangential coefficients, Kalibr's form has 4: "
+                "calibrate with `--coefficients 4`, or use another form"
             )
         four = _list((model.fx, model.fy, model.cx, model.cy))
         lines += [f"cam{k}:", "  camera_model: pinhole", f"  intrinsics: {four}",
@@ -89,15 +89,15 @@ def texts(told: ToldCalibration) -> dict[str, str]:
                   f"  resolution: [{model.width}, {model.height}]", f"  rostopic: {json.dumps(topic)}"]  # fmt: skip
         if model.readout_s:
             lines.append(f"  line_delay: {model.readout_s / model.height!r}")
-        if told.T_b_c is not None:
-            T_b = told.T_b_c if k == 0 or told.T_c_r is None else told.T_b_c @ told.T_c_r
+        if given.T_b_c is not None:
+            T_b = given.T_b_c if k == 0 or given.T_c_r is None else given.T_b_c @ given.T_c_r
             lines += ["  T_cam_imu:", *_rows(se3.inverse(T_b))]
-        if k == 1 and told.T_c_r is not None:
-            lines += ["  T_cn_cnm1:", *_rows(se3.inverse(told.T_c_r))]
+        if k == 1 and given.T_c_r is not None:
+            lines += ["  T_cn_cnm1:", *_rows(se3.inverse(given.T_c_r))]
     if lines:
-        out["camchain.yaml" if told.T_b_c is None else "camchain-imucam.yaml"] = "\n".join(lines) + "\n"
-    if told.imu is not None:
-        imu = [f"{key}: {getattr(told.imu, field)!r}" for field, key in IMU_KEYS.items()]
+        out["camchain.yaml" if given.T_b_c is None else "camchain-imucam.yaml"] = "\n".join(lines) + "\n"
+    if given.imu is not None:
+        imu = [f"{key}: {getattr(given.imu, field)!r}" for field, key in IMU_KEYS.items()]
         out["imu.yaml"] = "\n".join([*imu, "rostopic: /imu0"]) + "\n"
     return out
 

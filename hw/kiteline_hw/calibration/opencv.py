@@ -6,8 +6,8 @@ from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraModel, Lens, Rectifier
 from kiteline_hw.calibration.checks import checked_camera, checked_rigid, parse_lens
+from kiteline_hw.calibration.file_calibration import FileCalibration, FilePart
 from kiteline_hw.calibration.nodes import Node
-from kiteline_hw.calibration.told import FilePart, ToldCalibration
 
 _FISHEYE_KEYS = ("fisheye_model", "fisheye")
 _LONGEST_BASELINE_M = 5.0  # beyond it, T is in the units of some board's squares
@@ -41,7 +41,7 @@ def read_camera(node: Node) -> FilePart:
         r = node.get("rectification_matrix").matrix((3, 3), "a 3x3 rotation")
         p = node.get("projection_matrix").matrix((3, 4), "a 3x4 matrix")
         rectified = checked_rigid(se3.from_rt(r, np.zeros(3)), f"{where}: rectification_matrix")[:3, :3], p
-    return FilePart(where, ToldCalibration(where, (model,), topics=("",)), rectified=rectified)
+    return FilePart(where, FileCalibration(where, (model,), topics=("",)), rectified=rectified)
 
 
 def read_pair(node: Node) -> FilePart:
@@ -62,32 +62,32 @@ def read_pair(node: Node) -> FilePart:
         if len(t) != 3 or not np.linalg.norm(t) < _LONGEST_BASELINE_M:
             raise table.error("3 numbers in metres (calibrate with the squares of the board in metres)")
         T_c_r = se3.inverse(checked_rigid(se3.from_rt(r, t), f"{where}: R"))
-    return FilePart(where, ToldCalibration(where, cameras, T_c_r, topics=("", "")))
+    return FilePart(where, FileCalibration(where, cameras, T_c_r, topics=("", "")))
 
 
-def texts(told: ToldCalibration) -> dict[str, str]:
+def texts(given: FileCalibration) -> dict[str, str]:
     """OpenCV's file of a calibration: opencv.yaml."""
-    fisheye = any(model.lens is Lens.EQUIDISTANT for model in told.cameras)
-    first = told.cameras[0]
+    fisheye = any(model.lens is Lens.EQUIDISTANT for model in given.cameras)
+    first = given.cameras[0]
     lines = ["%YAML:1.0", "---", f"image_width: {first.width}", f"image_height: {first.height}",
              f"fisheye_model: {int(fisheye)}"]  # fmt: skip
-    for i, model in enumerate(told.cameras, 1):
+    for i, model in enumerate(given.cameras, 1):
         d = np.array(model.distortion or (0.0, 0.0, 0.0, 0.0), np.float64)
-        k_name, d_name = ("camera_matrix", "distortion_coefficients") if len(told.cameras) == 1 else (f"M{i}", f"D{i}")
+        k_name, d_name = ("camera_matrix", "distortion_coefficients") if len(given.cameras) == 1 else (f"M{i}", f"D{i}")
         lines += [*_storage(k_name, model.matrix()), *_storage(d_name, d[:, None])]
-    if told.T_c_r is not None and len(told.cameras) == 2:
-        T_r_c = se3.inverse(told.T_c_r)
+    if given.T_c_r is not None and len(given.cameras) == 2:
+        T_r_c = se3.inverse(given.T_c_r)
         lines += [*_storage("R", T_r_c[:3, :3]), *_storage("T", T_r_c[:3, 3:])]
     return {"opencv.yaml": "\n".join(lines) + "\n"}
 
 
-def ros_texts(told: ToldCalibration) -> dict[str, str]:
+def ros_texts(given: FileCalibration) -> dict[str, str]:
     """ROS' camera_info files of a calibration: left.yaml, right.yaml. P and R are those of the pair's rectification."""
-    rig = told.rig()
+    rig = given.rig()
     out: dict[str, str] = {}
     rectified = Rectifier(rig).camera
     T_l = se3.inverse(rectified.T_b_c) @ rig.T_b_c  # left camera in the rectified left one
-    for k, model in enumerate(told.cameras):
+    for k, model in enumerate(given.cameras):
         T_rect = T_l if k == 0 or rig.T_c_r is None else T_l @ rig.T_c_r
         p = np.array([[rectified.fx, 0.0, rectified.cx, 0.0], [0.0, rectified.fy, rectified.cy, 0.0], [0, 0, 1.0, 0]])
         if k == 1:

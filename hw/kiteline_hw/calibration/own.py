@@ -7,9 +7,9 @@ from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry.cameras import CameraModel
 from kiteline_hw.calibration.checks import checked_camera, checked_readout, checked_rigid, parse_lens
+from kiteline_hw.calibration.file_calibration import FileCalibration, FilePart
 from kiteline_hw.calibration.kalibr import imu_numbers
 from kiteline_hw.calibration.nodes import Node
-from kiteline_hw.calibration.told import FilePart, ToldCalibration
 
 HEAD = "kiteline_calibration"
 _VERSION = 1
@@ -33,26 +33,26 @@ def read_own(node: Node) -> FilePart:
     imu = ImuCalibration(**imu_numbers(node.get("imu"), _IMU_KEYS)) if "imu" in node.keys else None
     topics = tuple(node.get(s).get("topic").text() if "topic" in node.get(s).keys else "" for s in sides)
     where = str(node.path)
-    return FilePart(where, ToldCalibration(where, cameras, T_c_r, T_b_c, imu, topics))
+    return FilePart(where, FileCalibration(where, cameras, T_c_r, T_b_c, imu, topics))
 
 
-def texts(told: ToldCalibration, comments: tuple[str, ...] = ()) -> dict[str, str]:
+def texts(given: FileCalibration, comments: tuple[str, ...] = ()) -> dict[str, str]:
     """The file of a calibration: calibration.yaml. comments: lines for its head."""
     lines = [f"# {line}" for line in comments]
     lines += [f"{HEAD}: {_VERSION}"]
-    for k, model in enumerate(told.cameras):
+    for k, model in enumerate(given.cameras):
         lines += [f"{('left', 'right')[k]}:"]
         lines += [f"  {key}: {getattr(model, key)!r}" for key in ("width", "height", "fx", "fy", "cx", "cy")]
         lines += [f"  lens: {model.lens.value}", f"  distortion: {list(model.distortion)}"]
         lines += [f"  readout_s: {model.readout_s!r}"] if model.readout_s else []
-        lines += [f"  topic: {json.dumps(told.topics[k])}"] if k < len(told.topics) and told.topics[k] else []
-    for name, T, about in (("T_c_r", told.T_c_r, "right camera in the left one"),
-                           ("T_b_c", told.T_b_c, "left camera in the body, that of the IMU")):  # fmt: skip
+        lines += [f"  topic: {json.dumps(given.topics[k])}"] if k < len(given.topics) and given.topics[k] else []
+    for name, T, about in (("T_c_r", given.T_c_r, "right camera in the left one"),
+                           ("T_b_c", given.T_b_c, "left camera in the body, that of the IMU")):  # fmt: skip
         if T is not None:
             lines += [f"{name}:  # {about}; x right, y down, z forward; m"]
             lines += ["  - [" + ", ".join(repr(float(v)) for v in row) + "]" for row in T]
-    if told.imu is not None:
-        lines += ["imu:", *(f"  {name}: {getattr(told.imu, name)!r}" for name in _IMU_KEYS)]
+    if given.imu is not None:
+        lines += ["imu:", *(f"  {name}: {getattr(given.imu, name)!r}" for name in _IMU_KEYS)]
     return {"calibration.yaml": "\n".join(lines) + "\n"}
 
 

@@ -8,9 +8,9 @@ import numpy as np
 
 from kiteline_core.geometry.cameras import CameraRig, Lens
 from kiteline_hw.calibration.checks import checked_baseline
+from kiteline_hw.calibration.file_calibration import FileCalibration
 from kiteline_hw.calibration.files import read_calibration
 from kiteline_hw.calibration.nodes import read_nodes
-from kiteline_hw.calibration.told import ToldCalibration
 from kiteline_hw.ports import SourceError
 from kiteline_hw.sources.calibration import camera_from_yaml
 from kiteline_hw.sources.open import open_source
@@ -64,11 +64,11 @@ def _value(kind: type, text: str) -> Any:
     return float(text) if kind is float else text
 
 
-def read_rig(scheme: str, options: LiveOptions, *, stereo: bool, told: ToldCalibration | None = None) -> CameraRig:
-    """The rig of a live camera. told: it goes first. Raises SourceError."""
-    if told is not None and told.known:
-        return told.rig_of_images(scheme, 1 + stereo, (told.cameras[0].height, told.cameras[0].width))
-    if told is not None and not options.calibration:
+def read_rig(scheme: str, options: LiveOptions, *, stereo: bool, given: FileCalibration | None = None) -> CameraRig:
+    """The rig of a live camera. given: it goes first. Raises SourceError."""
+    if given is not None and given.known:
+        return given.rig_of_images(scheme, 1 + stereo, (given.cameras[0].height, given.cameras[0].width))
+    if given is not None and not options.calibration:
         raise SourceError(
             f"{scheme}: the size of the images is not known: expected {scheme}:…?calibration=FILE, a camera.yaml with "
             "width and height (fx, fy, cx, cy, baseline_m are not used to calibrate), or recorded images"
@@ -90,7 +90,7 @@ def read_rig(scheme: str, options: LiveOptions, *, stereo: bool, told: ToldCalib
         finally:
             recorded.close()
     if "fx" not in read_nodes(path).keys:
-        return read_rig(scheme, options, stereo=stereo, told=read_calibration(str(path)))
+        return read_rig(scheme, options, stereo=stereo, given=read_calibration(str(path)))
     table = read_yaml(path, "fx, fy, cx, cy, width, height")
     camera = camera_from_yaml(table, path)
     if not stereo:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from kiteline_hw.calibration.told import ToldCalibration
+from kiteline_hw.calibration.file_calibration import FileCalibration
 from kiteline_hw.cameras import live_options
 from kiteline_hw.cameras.camera import CameraError, Capture
 from kiteline_hw.cameras.live_source import CameraSource
@@ -97,15 +97,15 @@ class PiCamera:
                 camera.close()
 
 
-def open_source(argument: str, mono: bool, imu: bool, told: ToldCalibration | None = None) -> CameraSource:
-    """Open cameras by number, left first. Raises SourceError. told: as of `v4l2:`."""
+def open_source(argument: str, mono: bool, imu: bool, given: FileCalibration | None = None) -> CameraSource:
+    """Open cameras by number, left first. Raises SourceError. given: as of `v4l2:`."""
     del imu
     text, options = live_options.parse("picamera", argument)
     numbers = [number for number in text.split(",") if number]
     if not 1 <= len(numbers) <= 2 or not all(number.isdecimal() for number in numbers) or options.side_by_side:
         raise SourceError(f"picamera:{argument}: expected the number of a camera, or two (left,right), such as 0,1")
     stereo = len(numbers) == 2 and not mono
-    rig = live_options.read_rig("picamera", options, stereo=stereo, told=told)
+    rig = live_options.read_rig("picamera", options, stereo=stereo, given=given)
     models = [rig.left, rig.right or rig.left][: 1 + stereo]
     cameras = [
         PiCamera(int(number), PiSettings(model.width, model.height, options.fps, options.exposure_ms, options.gain))

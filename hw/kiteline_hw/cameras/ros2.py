@@ -12,8 +12,8 @@ from typing import Any
 
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration, Trajectory
 from kiteline_core.geometry.cameras import CameraRig
+from kiteline_hw.calibration.file_calibration import FileCalibration
 from kiteline_hw.calibration.files import read_calibration
-from kiteline_hw.calibration.told import ToldCalibration
 from kiteline_hw.cameras import live_options
 from kiteline_hw.cameras.camera import Capture
 from kiteline_hw.cameras.live_options import LiveOptions
@@ -197,18 +197,18 @@ class RosSource:
         self._node.close()
 
 
-def open_source(argument: str, mono: bool, imu: bool, told: ToldCalibration | None = None) -> RosSource:
+def open_source(argument: str, mono: bool, imu: bool, given: FileCalibration | None = None) -> RosSource:
     """Subscribe to topics, left first; one that nobody publishes is awaited in flight. Raises SourceError.
 
-    imu: take the samples of the topic `?imu=` too. told: calibration in place of the one that the options name.
+    imu: take the samples of the topic `?imu=` too. given: calibration in place of the one that the options name.
     """
     imu_topic, text, options = _parse(argument)
     topics = [topic for topic in text.split(",") if topic]
     if not 1 <= len(topics) <= 2 or (options.side_by_side and len(topics) == 2):
         raise SourceError(f"ros2:{argument}: expected one topic, or two (left,right) without side_by_side")
     stereo = (len(topics) == 2 or options.side_by_side) and not mono
-    rig = live_options.read_rig("ros2", options, stereo=stereo, told=told)
-    calibration = _imu_of(options, told) if imu and imu_topic and rig.has_body else None
+    rig = live_options.read_rig("ros2", options, stereo=stereo, given=given)
+    calibration = _imu_of(options, given) if imu and imu_topic and rig.has_body else None
     if imu and imu_topic and calibration is None:
         raise SourceError(
             f"ros2:{argument}: the IMU's noise and its place are not known: expected calibration=FILE with both (a "
@@ -231,9 +231,9 @@ def _parse(argument: str) -> tuple[str, str, LiveOptions]:
     return imu, *live_options.parse("ros2", f"{topics}{mark}{rest}")
 
 
-def _imu_of(options: LiveOptions, told: ToldCalibration | None) -> ImuCalibration | None:
-    if told is not None and told.imu is not None:
-        return told.imu
+def _imu_of(options: LiveOptions, given: FileCalibration | None) -> ImuCalibration | None:
+    if given is not None and given.imu is not None:
+        return given.imu
     if not options.calibration:
         return None
     if options.calibration.rpartition(".")[2] in ("yaml", "yml"):

@@ -2,7 +2,7 @@
 
 import shlex
 
-from kiteline_hw.calibration.told import ToldCalibration
+from kiteline_hw.calibration.file_calibration import FileCalibration
 from kiteline_hw.cameras import live_options
 from kiteline_hw.cameras.live_options import LiveOptions
 from kiteline_hw.cameras.live_source import CameraSource
@@ -13,15 +13,15 @@ from kiteline_hw.ports import SourceError
 _NO_DELAY = ("-fflags", "nobuffer", "-flags", "low_delay", "-probesize", "500000", "-analyzeduration", "500000")
 
 
-def open_source(argument: str, mono: bool, imu: bool, told: ToldCalibration | None = None) -> CameraSource:
-    """Open streams; one that is away is awaited in flight. told: their calibration. Raises SourceError."""
+def open_source(argument: str, mono: bool, imu: bool, given: FileCalibration | None = None) -> CameraSource:
+    """Open streams; one that is away is awaited in flight. given: their calibration. Raises SourceError."""
     del imu
     text, options = _split(argument)
     urls = [url for url in text.split(",") if url]
     if not 1 <= len(urls) <= 2 or (options.side_by_side and len(urls) == 2):
         raise SourceError(f"stream:{argument}: expected one URL, or two (left,right) without side_by_side")
     stereo = (len(urls) == 2 or options.side_by_side) and not mono
-    rig = live_options.read_rig("stream", options, stereo=stereo, told=told)
+    rig = live_options.read_rig("stream", options, stereo=stereo, given=given)
     cameras = [
         PipeCamera(url, ffmpeg_command(url), f"check its address, for instance with `ffplay {shlex.quote(url)}`")
         for url in (urls[:1] if mono else urls)

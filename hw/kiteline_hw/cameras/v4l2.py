@@ -1,6 +1,6 @@
 """`v4l2:DEV[,DEV]`: one camera, two, or one whose images hold both views side by side (`?side_by_side=1`)."""
 
-from kiteline_hw.calibration.told import ToldCalibration
+from kiteline_hw.calibration.file_calibration import FileCalibration
 from kiteline_hw.cameras import live_options
 from kiteline_hw.cameras.camera import CameraError
 from kiteline_hw.cameras.live_source import CameraSource
@@ -11,10 +11,10 @@ from kiteline_hw.ports import SourceError
 KERNEL: Kernel = LinuxKernel()  # a modelled device takes its place in tests
 
 
-def open_source(argument: str, mono: bool, imu: bool, told: ToldCalibration | None = None) -> CameraSource:
+def open_source(argument: str, mono: bool, imu: bool, given: FileCalibration | None = None) -> CameraSource:
     """Open cameras. One that is away is awaited in flight; one that cannot do what is asked raises SourceError.
 
-    told: calibration in place of the one that the options name.
+    given: calibration in place of the one that the options name.
     """
     del imu  # cameras come without one; `--imu controller` flies on the flight controller's
     text, options = live_options.parse("v4l2", argument)
@@ -22,7 +22,7 @@ def open_source(argument: str, mono: bool, imu: bool, told: ToldCalibration | No
     if not 1 <= len(devices) <= 2 or (options.side_by_side and len(devices) == 2):
         raise SourceError(f"v4l2:{argument}: expected one device, or two (left,right) without side_by_side")
     stereo = (len(devices) == 2 or options.side_by_side) and not mono
-    rig = live_options.read_rig("v4l2", options, stereo=stereo, told=told)
+    rig = live_options.read_rig("v4l2", options, stereo=stereo, given=given)
     if mono:
         devices = devices[:1]
     width = rig.left.width * (2 if options.side_by_side else 1)

@@ -14,7 +14,7 @@ class PacketSealer(Protocol):
     def seal(self, packet: bytes) -> bytes: ...
 
 
-class PacketDoor(Protocol):
+class PacketChecker(Protocol):
     """Takes incoming packets of an agent's link: agent number and content, or None for a packet that is refused; and an
     answer to be sent back, or None.
     """
@@ -33,9 +33,9 @@ class SealedLink:
     strangers beyond the first few: to open one costs as much as a sound packet.
     """
 
-    def __init__(self, link: ByteLink, agent: int, sealer: PacketSealer | None, door: PacketDoor) -> None:
+    def __init__(self, link: ByteLink, agent: int, sealer: PacketSealer | None, checker: PacketChecker) -> None:
         """sealer: None where packets are not sealed."""
-        self._link, self._agent, self._sealer, self._door = link, agent, sealer, door
+        self._link, self._agent, self._sealer, self._checker = link, agent, sealer, checker
         self.unopened = 0
         self.heard = False  # whether a packet of the agent has opened
 
@@ -47,12 +47,12 @@ class SealedLink:
         """The packets that have arrived and opened without fault."""
         packets, strangers = [], 0
         for arrived in self._link.receive():
-            if not self._door.is_familiar(self._agent, arrived):
+            if not self._checker.is_familiar(self._agent, arrived):
                 strangers += 1
                 if strangers > _STRANGERS:
                     self.unopened += 1
                     continue
-            opened, answer = self._door.take(self._agent, arrived)
+            opened, answer = self._checker.take(self._agent, arrived)
             if answer is not None:
                 self._link.send(answer)
             if opened is None or opened[0] != self._agent:
@@ -69,8 +69,8 @@ class SealedLink:
 class SealedHub:
     """A LinkHub that seals per agent. Agents for which `sealer` returns None are left out, and told so."""
 
-    def __init__(self, hub: LinkHub, sealer: Callable[[int], PacketSealer | None], door: PacketDoor) -> None:
-        self._hub, self._sealer, self._door = hub, sealer, door
+    def __init__(self, hub: LinkHub, sealer: Callable[[int], PacketSealer | None], checker: PacketChecker) -> None:
+        self._hub, self._sealer, self._checker = hub, sealer, checker
         self._links: dict[int, SealedLink] = {}
 
     def links(self) -> Mapping[int, ByteLink]:
@@ -79,9 +79,9 @@ class SealedHub:
             if agent not in self._links:
                 sealer = self._sealer(agent)
                 if sealer is not None:
-                    self._links[agent] = SealedLink(link, agent, sealer, self._door)
+                    self._links[agent] = SealedLink(link, agent, sealer, self._checker)
                 else:
-                    SealedLink(link, agent, None, self._door).receive()
+                    SealedLink(link, agent, None, self._checker).receive()
         return self._links
 
     def renew(self, agent: int) -> None:
@@ -120,8 +120,8 @@ class _LineEnd:
 class SealedLineHub:
     """A LinkHub of a cable, a radio or a tunnel, that seals. Its agent is the one that sound packets name last."""
 
-    def __init__(self, hub: LinkHub, sealer: Callable[[int], PacketSealer | None], door: PacketDoor) -> None:
-        self._hub, self._sealer, self._door = hub, sealer, door
+    def __init__(self, hub: LinkHub, sealer: Callable[[int], PacketSealer | None], checker: PacketChecker) -> None:
+        self._hub, self._sealer, self._checker = hub, sealer, checker
         self._ends: dict[int, _LineEnd] = {}
         self._agent: int | None = None
 
@@ -129,7 +129,7 @@ class SealedLineHub:
         """The link of the agent, once it was heard."""
         for line in self._hub.links().values():
             for arrived in line.receive():
-                opened, answer = self._door.take(None, arrived)
+                opened, answer = self._checker.take(None, arrived)
                 if answer is not None:
                     line.send(answer)
                 if opened is not None:
@@ -161,17 +161,17 @@ class SealedLineHub:
 
 
 class WatchedHub:
-    """A LinkHub without seals, whose packets pass a door."""
+    """A LinkHub without seals, whose packets are checked."""
 
-    def __init__(self, hub: LinkHub, door: PacketDoor) -> None:
-        self._hub, self._door = hub, door
+    def __init__(self, hub: LinkHub, checker: PacketChecker) -> None:
+        self._hub, self._checker = hub, checker
         self._links: dict[int, SealedLink] = {}
 
     def links(self) -> Mapping[int, ByteLink]:
         """The links of all agents, by agent number."""
         for agent, link in self._hub.links().items():
             if agent not in self._links:
-                self._links[agent] = SealedLink(link, agent, None, self._door)
+                self._links[agent] = SealedLink(link, agent, None, self._checker)
         return self._links
 
     def alive(self) -> frozenset[int]:

@@ -17,9 +17,9 @@ from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraModel, CameraRig
 from kiteline_hw.calibration.checks import checked_baseline
 from kiteline_hw.calibration.euroc import read_camera, read_imu
+from kiteline_hw.calibration.file_calibration import FileCalibration, FilePart
 from kiteline_hw.calibration.files import read_calibration
 from kiteline_hw.calibration.nodes import Node, read_nodes
-from kiteline_hw.calibration.told import FilePart, ToldCalibration
 from kiteline_hw.ports import SourceError, SourceReport
 from kiteline_hw.sensors.frames import EncodedFrame, pair_by_time, pair_tolerance_ns
 from kiteline_hw.sensors.images import ImageFile
@@ -36,19 +36,19 @@ _CAMERA_KEYS = (
 _IMU_KEYS = "T_BS (data: 16 numbers) and the noise of an IMU"
 
 
-def open_source(folder_name: str, mono: bool, imu: bool, told: ToldCalibration | None = None) -> Recording:
+def open_source(folder_name: str, mono: bool, imu: bool, given: FileCalibration | None = None) -> Recording:
     """Open an ASL folder (it holds mav0, or is mav0).
 
-    told: used where no sensor.yaml is, or none that can be read. Raises SourceError.
+    given: used where no sensor.yaml is, or none that can be read. Raises SourceError.
     """
     folder = Path(folder_name)
     mav = folder / "mav0" if (folder / "mav0").is_dir() else folder
     if not (mav / "cam0").is_dir():
         raise SourceError(f"{folder}: expected EuRoC's layout, mav0/cam0/sensor.yaml and mav0/cam0/data; no cam0 there")
     if not (mav / "cam0" / "sensor.yaml").is_file():
-        told = _chain_beside(folder, mav) or told  # what is told is put over it
-        if told is not None:
-            return _open_told(folder, mav, told, mono, imu)
+        given = _chain_beside(folder, mav) or given  # what is given is put over it
+        if given is not None:
+            return _open_given(folder, mav, given, mono, imu)
         raise SourceError(
             f"{mav / 'cam0' / 'sensor.yaml'}: no such file: expected the camera's calibration, for TUM-VI's folders "
             "camchain.yaml beside mav0 or in dso, or --calibration FILE"
@@ -56,9 +56,9 @@ def open_source(folder_name: str, mono: bool, imu: bool, told: ToldCalibration |
     try:
         return _open_by_sensor_files(folder, mav, mono, imu)
     except _UnreadableSensor:
-        if told is None or not told.cameras:
+        if given is None or not given.cameras:
             raise
-        return _open_told(folder, mav, told, mono, imu)
+        return _open_given(folder, mav, given, mono, imu)
 
 
 class _UnreadableSensor(SourceError):
@@ -83,7 +83,7 @@ def _open_by_sensor_files(folder: Path, mav: Path, mono: bool, imu: bool) -> Rec
     )  # fmt: skip
 
 
-def _chain_beside(folder: Path, mav: Path) -> ToldCalibration | None:
+def _chain_beside(folder: Path, mav: Path) -> FileCalibration | None:
     """TUM-VI's calibration: a Kalibr chain, and the IMU's noise where there is a file of it."""
     for place in dict.fromkeys((folder, mav, mav.parent, folder / "dso", mav.parent / "dso")):
         chain = sorted(place.glob("camchain*.yaml"))
@@ -92,21 +92,21 @@ def _chain_beside(folder: Path, mav: Path) -> ToldCalibration | None:
     return None
 
 
-def _open_told(folder: Path, mav: Path, told: ToldCalibration, mono: bool, imu: bool) -> Recording:
+def _open_given(folder: Path, mav: Path, given: FileCalibration, mono: bool, imu: bool) -> Recording:
     """A folder by a calibration from elsewhere."""
     images = [_list_stamped(mav / "cam0")]
     if not mono and (mav / "cam1").is_dir():
         images.append(_list_stamped(mav / "cam1"))
-    rig = told.rig_of_images(f"euroc:{folder}", len(images), image_size([path for _, path in images[0]]))
-    has_imu = imu and told.known and (mav / "imu0" / "data.csv").is_file()
+    rig = given.rig_of_images(f"euroc:{folder}", len(images), image_size([path for _, path in images[0]]))
+    has_imu = imu and given.known and (mav / "imu0" / "data.csv").is_file()
     if has_imu and not rig.has_body:
         raise SourceError(
-            f"{told.where}: nothing says where the camera sits against the IMU: expected T_cam_imu (Kalibr), T_BS "
+            f"{given.where}: nothing says where the camera sits against the IMU: expected T_cam_imu (Kalibr), T_BS "
             "(EuRoC) or T_b_c (kiteline); with --no-imu the images alone are used"
         )
     return Recording(
         f"euroc:{folder}", rig, len(images[0]), lambda report: _read_frames(images, report),
-        (told.imu or ImuCalibration()) if has_imu else None, _read_ground_truth(folder, mav, np.eye(4)),
+        (given.imu or ImuCalibration()) if has_imu else None, _read_ground_truth(folder, mav, np.eye(4)),
         lambda report: _read_imu(mav / "imu0" / "data.csv", report),
     )  # fmt: skip
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from kiteline_core.geometry.cameras import CameraRig, Lens
 from kiteline_hw.calibration.checks import checked_baseline
-from kiteline_hw.calibration.told import ToldCalibration
+from kiteline_hw.calibration.file_calibration import FileCalibration
 from kiteline_hw.ports import SourceError
 from kiteline_hw.sensors.frames import EncodedFrame
 from kiteline_hw.sensors.images import ImageFile
@@ -24,8 +24,8 @@ from kiteline_hw.sources.text_files import read_yaml, seconds_to_ns, yaml_number
 _UNSTAMPED_HZ = 10.0  # rate of images whose names are no stamps
 
 
-def open_source(pattern: str, mono: bool, imu: bool, told: ToldCalibration | None = None) -> Recording:
-    """Open images by pattern; they come without an IMU. told: in place of camera.yaml. Raises SourceError."""
+def open_source(pattern: str, mono: bool, imu: bool, given: FileCalibration | None = None) -> Recording:
+    """Open images by pattern; they come without an IMU. given: in place of camera.yaml. Raises SourceError."""
     del imu
     patterns = pattern.split(",")
     if len(patterns) > 2:
@@ -33,8 +33,8 @@ def open_source(pattern: str, mono: bool, imu: bool, told: ToldCalibration | Non
     sides = [_list_files(p) for p in (patterns[:1] if mono else patterns)]
     if len({len(files) for files in sides}) > 1:
         raise SourceError(f"images:{pattern}: {len(sides[0])} left and {len(sides[1])} right images: expected as many")
-    if told is not None:
-        rig = told.rig_of_images(f"images:{pattern}", len(sides), image_size(sides[0]))
+    if given is not None:
+        rig = given.rig_of_images(f"images:{pattern}", len(sides), image_size(sides[0]))
         return _recording(pattern, rig, sides, _parse_times(sides[0], _UNSTAMPED_HZ))
     folder = sides[0][0].parent
     path = next((d / "camera.yaml" for d in (folder, folder.parent) if (d / "camera.yaml").is_file()), None)

@@ -13,7 +13,7 @@ class SourceKind:
 
     argument: what follows the colon, in capitals; DIR and FILE are paths that must exist. layout: glob patterns, one of
     which a folder of this kind matches (with a trailing slash: a sub-folder), and `shown` names them in error messages.
-    told: its open_source takes the calibration that was told as a fourth argument, as there may be no other.
+    given: its open_source has the given calibration as a fourth argument, as there may be no other.
     """
 
     scheme: str
@@ -22,26 +22,26 @@ class SourceKind:
     module: str
     layout: tuple[str, ...] = ()
     shown: str = ""
-    told: bool = False
+    given: bool = False
 
 
 SOURCES: tuple[SourceKind, ...] = (
     SourceKind("euroc", "DIR", "EuRoC or TUM-VI folder (ASL layout), stereo and IMU",
-               "kiteline_hw.sources.euroc", ("mav0/", "cam0/"), "mav0/ (EuRoC)", told=True),
+               "kiteline_hw.sources.euroc", ("mav0/", "cam0/"), "mav0/ (EuRoC)", given=True),
     SourceKind("tum", "DIR", "TUM RGB-D folder",
-               "kiteline_hw.sources.tum", ("rgb.txt", "rgb/"), "rgb.txt (TUM)", told=True),
+               "kiteline_hw.sources.tum", ("rgb.txt", "rgb/"), "rgb.txt (TUM)", given=True),
     SourceKind("kitti", "DIR", "KITTI odometry sequence or raw drive",
                "kiteline_hw.sources.kitti", ("calib.txt", "image_[0123lr]/", "image_0[0123]/"),
                "calib.txt with image_0/ (KITTI)"),
     SourceKind("mcap", "FILE", "ROS 2 bag, Foxglove recording or kiteline log",
-               "kiteline_hw.sources.mcap", ("*.mcap", "*.db3"), "*.mcap or *.db3 (ROS 2)", told=True),
-    SourceKind("images", "GLOB[,GLOB]", "plain images beside a camera.yaml", "kiteline_hw.sources.images", told=True),
+               "kiteline_hw.sources.mcap", ("*.mcap", "*.db3"), "*.mcap or *.db3 (ROS 2)", given=True),
+    SourceKind("images", "GLOB[,GLOB]", "plain images beside a camera.yaml", "kiteline_hw.sources.images", given=True),
     SourceKind("sim", "SCENE", "simulated flight: room, hall, corridor or street", "kiteline_hw.sim.source"),
-    SourceKind("v4l2", "DEV[,DEV]", "live camera, or a pair", "kiteline_hw.cameras.v4l2", told=True),
-    SourceKind("picamera", "N[,N]", "camera of a Raspberry Pi, or a pair", "kiteline_hw.cameras.picamera", told=True),
+    SourceKind("v4l2", "DEV[,DEV]", "live camera, or a pair", "kiteline_hw.cameras.v4l2", given=True),
+    SourceKind("picamera", "N[,N]", "camera of a Raspberry Pi, or a pair", "kiteline_hw.cameras.picamera", given=True),
     SourceKind("stream", "URL[,URL]", "network camera (RTSP, UDP, HTTP) through ffmpeg", "kiteline_hw.cameras.stream",
-               told=True),
-    SourceKind("ros2", "TOPIC[,TOPIC]", "live topics of ROS 2, where rclpy is", "kiteline_hw.cameras.ros2", told=True),
+               given=True),
+    SourceKind("ros2", "TOPIC[,TOPIC]", "live topics of ROS 2, where rclpy is", "kiteline_hw.cameras.ros2", given=True),
 )  # fmt: skip
 
 

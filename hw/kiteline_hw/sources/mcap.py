@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from kiteline_core import odometry
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration, OdometryBatch, Trajectory
 from kiteline_core.geometry.cameras import CameraRig
-from kiteline_hw.calibration.told import ToldCalibration
+from kiteline_hw.calibration.file_calibration import FileCalibration
 from kiteline_hw.logs.mcap_file import RawMessage
 from kiteline_hw.logs.mcap_log import DEPTH, GROUND_TRUTH, IMU, LEFT, ODOMETER, RIG, RIGHT
 from kiteline_hw.logs.rig_json import rig_from_json
@@ -54,7 +54,7 @@ from kiteline_hw.sources.mcap_messages import (
     read_transforms,
     read_velocities,
 )
-from kiteline_hw.sources.mcap_rig import ImageTopic, Selection, TransformTree, select_rig, select_told_rig
+from kiteline_hw.sources.mcap_rig import ImageTopic, Selection, TransformTree, select_given_rig, select_rig
 from kiteline_hw.sources.recording import sorted_trajectory
 
 _REORDER_NS = 200_000_000  # ns that a message is held back for older ones recorded after it
@@ -66,15 +66,15 @@ STANDARD_GRAVITY = 9.80665  # m/s^2
 _MAX_DYNAMIC_TRANSFORMS = 2000  # messages of moving transforms that are read besides the static ones
 
 
-def open_source(path_name: str, mono: bool, imu: bool, told: ToldCalibration | None = None) -> "McapSource":
-    """Open a recording, or the bag in a folder. told: in place of a bag's calibration. Raises SourceError."""
-    return McapSource(open_bag(Path(path_name)), mono, imu, told)
+def open_source(path_name: str, mono: bool, imu: bool, given: FileCalibration | None = None) -> "McapSource":
+    """Open a recording, or the bag in a folder. given: in place of a bag's calibration. Raises SourceError."""
+    return McapSource(open_bag(Path(path_name)), mono, imu, given)
 
 
 class McapSource:
     """A FrameSource over an MCAP file or a ROS 2 bag, whose messages are read while iterating."""
 
-    def __init__(self, file: Bag, mono: bool, imu: bool, told: ToldCalibration | None = None) -> None:
+    def __init__(self, file: Bag, mono: bool, imu: bool, given: FileCalibration | None = None) -> None:
         self.name = f"mcap:{file.path}"
         self.report = SourceReport()
         self._file = file
@@ -89,7 +89,7 @@ class McapSource:
         if rig_channel is not None:
             self._open_log(rig_channel, mono)
         else:
-            self._open_bag(mono, told)
+            self._open_bag(mono, given)
         if not imu:
             self.imu = None
 
@@ -151,15 +151,15 @@ class McapSource:
         self._truth_topic: int | None = topics.get(GROUND_TRUTH)
         self._is_log = True
 
-    def _open_bag(self, mono: bool, told: ToldCalibration | None) -> None:
+    def _open_bag(self, mono: bool, given: FileCalibration | None) -> None:
         images, calibrations, imus = self._discover()
         tree = TransformTree(self._transforms())
         inertial, imu_notes = choose_imu(imus, tree, {i.frame_id for i in images})
         imu_frame = inertial.gyro.frame_id if inertial is not None else None
-        if told is None:
+        if given is None:
             found = select_rig(self.name, images, calibrations, tree, imu_frame, mono=mono)
         else:
-            found = select_told_rig(self.name, images, told, self._image_size, tree, imu_frame, mono=mono)
+            found = select_given_rig(self.name, images, given, self._image_size, tree, imu_frame, mono=mono)
         self._truth_topic = None
         self._is_log = False
         self.rig, self._notes = found.rig, found.notes

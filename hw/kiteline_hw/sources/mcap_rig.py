@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraModel, CameraRig, Lens
 from kiteline_hw.calibration.checks import checked_baseline, checked_camera, parse_lens
-from kiteline_hw.calibration.told import ToldCalibration
+from kiteline_hw.calibration.file_calibration import FileCalibration
 from kiteline_hw.ports import SourceError
 from kiteline_hw.sources.mcap_messages import CameraCalibration, Transform
 
@@ -127,10 +127,10 @@ def select_rig(
     return Selection(rig, left.images, right.images if right else None, depth, imu_usable, t_b_l, tuple(notes))
 
 
-def select_told_rig(
+def select_given_rig(
     name: str,
     images: list[ImageTopic],
-    told: ToldCalibration,
+    given: FileCalibration,
     size_of: Callable[[int], tuple[int, int]],
     tree: TransformTree,
     imu_frame: str | None,
@@ -142,12 +142,12 @@ def select_told_rig(
     size_of: height and width of a channel's images. Raises SourceError.
     """
     topics = {i.topic: i for i in images if i.count and not i.depth}
-    named = [topics[t] for t in told.topics if t in topics]
-    if len(named) < len(told.cameras):
+    named = [topics[t] for t in given.topics if t in topics]
+    if len(named) < len(given.cameras):
         named = sorted(_one_a_camera(name, images, rectified_first=False), key=lambda i: i.topic)
-    chosen = named[: 1 if mono else len(told.cameras)]
+    chosen = named[: 1 if mono else len(given.cameras)]
     left = chosen[0]
-    rig = told.rig_of_images(name, len(chosen), size_of(left.channel))
+    rig = given.rig_of_images(name, len(chosen), size_of(left.channel))
     depth = None if mono or len(chosen) > 1 else next(
         (i for i in images if i.depth and i.count and i.frame_id == left.frame_id), None
     )  # fmt: skip
@@ -158,7 +158,7 @@ def select_told_rig(
     elif T_b_l is not None:
         rig = replace(rig, T_b_c=T_b_l, has_body=True)
     elif imu_frame is not None:
-        notes += (f"imu left out: neither {told.where} nor a static transform says where the camera sits against it",)
+        notes += (f"imu left out: neither {given.where} nor a static transform says where the camera sits against it",)
     rig = replace(rig, has_depth=depth is not None)
     right = chosen[1] if len(chosen) > 1 else None
     imu_usable = imu_frame is not None and T_b_l is not None

@@ -4,8 +4,8 @@ from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 
+from kiteline_hw.calibration.file_calibration import FileCalibration
 from kiteline_hw.calibration.files import read_calibration
-from kiteline_hw.calibration.told import ToldCalibration
 from kiteline_hw.ports import FrameSource, SourceError, is_live
 from kiteline_hw.sources import kinds
 from kiteline_hw.sources.bags.bag_heads import MCAP_MAGIC, SQLITE_MAGIC, refuse_unreadable
@@ -15,7 +15,7 @@ from kiteline_hw.system.process import home_path
 
 
 def open_source(
-    spec: str, mono: bool = False, imu: bool = True, calibration: str | ToldCalibration = ""
+    spec: str, mono: bool = False, imu: bool = True, calibration: str | FileCalibration = ""
 ) -> FrameSource:
     """Open a camera or a recording. Only the calibration is read; images are decoded while iterating.
 
@@ -39,10 +39,10 @@ def open_source(
     opener: Callable[..., FrameSource] = import_module(kind.module).open_source
     if not calibration:
         return opener(argument, mono, imu)
-    told = read_calibration(calibration) if isinstance(calibration, str) else calibration
-    source = opener(argument, mono, imu, told) if kind.told and told.cameras else opener(argument, mono, imu)
-    # a camera has nothing of its own that the told calibration is put over
-    return with_calibration(source, told) if told.known and not is_live(source) else source
+    given = read_calibration(calibration) if isinstance(calibration, str) else calibration
+    source = opener(argument, mono, imu, given) if kind.given and given.cameras else opener(argument, mono, imu)
+    # a camera has nothing of its own that the given calibration is put over
+    return with_calibration(source, given) if given.known and not is_live(source) else source
 
 
 def recognise(spec: str) -> SourceKind:

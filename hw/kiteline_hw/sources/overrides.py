@@ -10,7 +10,7 @@ from kiteline_core.arrays import F64
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration, OdometryBatch, Trajectory
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraModel
-from kiteline_hw.calibration.told import ToldCalibration
+from kiteline_hw.calibration.file_calibration import FileCalibration
 from kiteline_hw.ports import FrameSource, LiveSource, SourceError, is_live
 
 
@@ -100,20 +100,20 @@ def with_other_imu(source: FrameSource, imu: ImuCalibration, T_b_c: F64 | None) 
 
 
 class _CalibratedView(SourceView):
-    def __init__(self, source: FrameSource, told: ToldCalibration) -> None:
+    def __init__(self, source: FrameSource, given: FileCalibration) -> None:
         super().__init__(source, mono=False, imu=True)
         rig = source.rig
         self._T_old_new = np.eye(4)  # the body frame of the new rig in the source's
-        if told.cameras:
-            new = told.rig_of_images(source.name, 1 + (rig.right is not None), (rig.left.height, rig.left.width))
+        if given.cameras:
+            new = given.rig_of_images(source.name, 1 + (rig.right is not None), (rig.left.height, rig.left.width))
             for model, old, side in ((new.left, rig.left, "left"), (new.right, rig.right, "right")):
-                _check_size(model, old, f"{told.where}: {side} camera", source.name)
+                _check_size(model, old, f"{given.where}: {side} camera", source.name)
             T_b_c, has_body = (new.T_b_c, True) if new.has_body else (rig.T_b_c, rig.has_body)
             self.rig = replace(rig, left=new.left, right=new.right, T_c_r=new.T_c_r, T_b_c=T_b_c, has_body=has_body)
             if not rig.has_body:
                 self._T_old_new = rig.T_b_c @ se3.inverse(T_b_c)
-        if told.imu is not None and self.imu is not None:
-            self.imu = told.imu
+        if given.imu is not None and self.imu is not None:
+            self.imu = given.imu
 
     @property
     def ground_truth(self) -> Trajectory | None:
@@ -121,17 +121,17 @@ class _CalibratedView(SourceView):
         return truth if truth is None else Trajectory(truth.t_ns, truth.T_w_b @ self._T_old_new)
 
 
-def _check_size(told: CameraModel | None, found: CameraModel | None, where: str, source: str) -> None:
-    if told is not None and found is not None and (told.width, told.height) != (found.width, found.height):
+def _check_size(given: CameraModel | None, found: CameraModel | None, where: str, source: str) -> None:
+    if given is not None and found is not None and (given.width, given.height) != (found.width, found.height):
         raise SourceError(
-            f"{where} is calibrated at {told.width}x{told.height} px, but {source} has {found.width}x{found.height}: "
+            f"{where} is calibrated at {given.width}x{given.height} px, but {source} has {found.width}x{found.height}: "
             "calibrate at the size of the images"
         )
 
 
-def with_calibration(source: FrameSource, told: ToldCalibration) -> FrameSource:
-    """A view with the cameras, extrinsics and IMU noise that were told. Raises SourceError if they do not fit it.
+def with_calibration(source: FrameSource, given: FileCalibration) -> FrameSource:
+    """A view with the cameras, extrinsics and IMU noise that are given. Raises SourceError if they do not fit it.
 
     Where the file says nothing of the body, the camera's place in it stays that of the source.
     """
-    return _CalibratedView(source, told)
+    return _CalibratedView(source, given)

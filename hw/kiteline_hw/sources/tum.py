@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from kiteline_core.geometry.cameras import CameraModel, CameraRig, Lens
-from kiteline_hw.calibration.told import ToldCalibration
+from kiteline_hw.calibration.file_calibration import FileCalibration
 from kiteline_hw.ports import SourceError, SourceReport
 from kiteline_hw.sensors.frames import DEPTH_TOLERANCE_NS, EncodedFrame, pair_by_time
 from kiteline_hw.sensors.images import ImageFile
@@ -28,15 +28,15 @@ FREIBURG = {
 }
 
 
-def open_source(folder_name: str, mono: bool, imu: bool, told: ToldCalibration | None = None) -> Recording:
-    """Open a TUM RGB-D folder, which has no IMU; mono leaves the depth out. told: its camera. Raises SourceError."""
+def open_source(folder_name: str, mono: bool, imu: bool, given: FileCalibration | None = None) -> Recording:
+    """Open a TUM RGB-D folder, which has no IMU; mono leaves the depth out. given: its camera. Raises SourceError."""
     del imu
     folder = Path(folder_name)
     colour = _list_stamped(folder, "rgb")
     if not colour:
         raise SourceError(f"{folder}: no images: expected TUM's layout, rgb.txt ('t filename' a line) and rgb/*.png")
     depth = [] if mono else _list_stamped(folder, "depth")
-    camera, scale = _read_calibration(folder, colour, told)
+    camera, scale = _read_calibration(folder, colour, given)
     rig = CameraRig(camera, None, np.eye(4), None, has_depth=bool(depth), has_body=False)
     truth = folder / "groundtruth.txt"
     return Recording(
@@ -85,12 +85,12 @@ def _check_order(listed: Stamped, listing: Path) -> None:
         )
 
 
-def _read_calibration(folder: Path, colour: Stamped, told: ToldCalibration | None) -> tuple[CameraModel, float]:
+def _read_calibration(folder: Path, colour: Stamped, given: FileCalibration | None) -> tuple[CameraModel, float]:
     """The camera and the stored depth units a metre."""
     path = folder / "camera.yaml"
-    if told is not None:
+    if given is not None:
         scale = yaml_number(read_yaml(path, ""), "depth_scale", path, DEPTH_SCALE) if path.is_file() else DEPTH_SCALE
-        return told.rig_of_images(str(folder), 1, image_size([image for _, image in colour])).left, _checked(
+        return given.rig_of_images(str(folder), 1, image_size([image for _, image in colour])).left, _checked(
             scale, path
         )
     if path.is_file():

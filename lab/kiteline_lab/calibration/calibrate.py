@@ -13,9 +13,9 @@ import numpy as np
 from kiteline_core.arrays import U8
 from kiteline_core.errors import KitelineError
 from kiteline_core.frame import Frame, ImuBatch, OdometryBatch
+from kiteline_hw.calibration.file_calibration import UNCALIBRATED, FileCalibration
 from kiteline_hw.calibration.files import FORMS, read_calibration
 from kiteline_hw.calibration.own import texts as own_texts
-from kiteline_hw.calibration.told import UNCALIBRATED, ToldCalibration
 from kiteline_hw.sources.kinds import source_forms
 from kiteline_hw.sources.open import open_source
 from kiteline_lab.calibration import boards, imu
@@ -23,7 +23,7 @@ from kiteline_lab.calibration.best_lens import best_lens
 from kiteline_lab.calibration.boards import Board, parse_board
 from kiteline_lab.calibration.picture import residual_picture
 from kiteline_lab.calibration.solve import Calibrated
-from kiteline_lab.calibration.verdict import Finding, judge, overall
+from kiteline_lab.calibration.verdict import CalibrationFinding, judge, overall
 from kiteline_lab.calibration.views import ViewCollector
 from kiteline_lab.flights.out_file import whole_file, write_whole
 from kiteline_lab.flights.progress import Progress
@@ -56,7 +56,7 @@ def collect(
 
 def calibrated(
     collector: ViewCollector, board: Board, lens: str, coefficients: int
-) -> tuple[Calibrated, list[Finding]]:
+) -> tuple[Calibrated, list[CalibrationFinding]]:
     """The cameras of the collected views, and what the result is worth. Raises KitelineError."""
     sizes = [c.size for c in collector.coverage]
     result = best_lens(board.points_m, collector.views, sizes, lens, coefficients)
@@ -108,7 +108,7 @@ def _parser() -> argparse.ArgumentParser:
 
 def _camera(args: argparse.Namespace) -> int:
     board: Board = args.board
-    kept = read_calibration(args.calibration) if args.calibration else ToldCalibration("")
+    kept = read_calibration(args.calibration) if args.calibration else FileCalibration("")
     source = open_source(args.source, mono=args.mono, imu=False, calibration=UNCALIBRATED)
     collector = ViewCollector(board, 1 + (source.rig.right is not None))
     # images without stamps are single pictures: each is looked at
@@ -129,8 +129,8 @@ def _camera(args: argparse.Namespace) -> int:
         rms = ", ".join(f"{r.rms_px:.3f}" for r in result.residuals)
         head = f"kiteline calibrate: {len(result.poses)} views of {_described(board)}, {rms} px rms"
         comments = (f"{head}; {overall(findings)}",)
-        told = ToldCalibration(str(args.out), result.cameras, result.T_c_r, kept.T_b_c, kept.imu, kept.topics)
-        part.write_text(own_texts(told, comments)["calibration.yaml"])
+        given = FileCalibration(str(args.out), result.cameras, result.T_c_r, kept.T_b_c, kept.imu, kept.topics)
+        part.write_text(own_texts(given, comments)["calibration.yaml"])
     if args.picture is not None:
         _write_picture(args.picture, residual_picture(result, collector.coverage))
     if args.json:
@@ -156,7 +156,9 @@ def _described(board: Board) -> str:
     return f"a {kind} of {board.columns}x{board.rows} squares of {1000 * board.square_m:g} mm"
 
 
-def _summary(out: Path, result: Calibrated, findings: list[Finding], collector: ViewCollector) -> dict[str, Any]:
+def _summary(
+    out: Path, result: Calibrated, findings: list[CalibrationFinding], collector: ViewCollector
+) -> dict[str, Any]:
     return {
         "file": str(out),
         "verdict": overall(findings),
@@ -193,10 +195,10 @@ def _write_picture(path: Path, picture: U8) -> None:
 
 
 def _export(args: argparse.Namespace) -> int:
-    told = read_calibration(args.calibration)
-    if not told.cameras and args.format != "kalibr":
-        told.rig()  # says that no camera is there
-    for name, text in FORMS[args.format](told).items():
+    given = read_calibration(args.calibration)
+    if not given.cameras and args.format != "kalibr":
+        given.rig()  # says that no camera is there
+    for name, text in FORMS[args.format](given).items():
         path = args.out / name
         write_whole(path, text.encode())
         sys.stdout.write(f"{path}\n")

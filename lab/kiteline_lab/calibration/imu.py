@@ -37,7 +37,7 @@ _MOUNTED_RAD, _SCALE, _OFFSET_S = 0.03, 0.02, 0.03
 _IMAGES = 2e-3  # of axes; by which images err in one direction all along: focal lengths, depths of a worn pair
 
 
-class NoImu(KitelineError):
+class ImuMissing(KitelineError):
     """A source without inertial samples."""
 
 
@@ -75,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
             if not wanted:
                 break
     if progress is None:
-        raise NoImu(f"{args.source}: no frame came: expected a source with images and an IMU")
+        raise ImuMissing(f"{args.source}: no frame came: expected a source with images and an IMU")
     findings = progress.findings()
     verdict = overall(findings)
     if verdict != "bad" and known is not None:
@@ -119,7 +119,7 @@ def follow(options: AgentOptions, config: AgentConfig) -> Generator[tuple[ImuPro
         stack.callback(source.close)
         source = with_controller_imu(options, source)
         if source.imu is None:
-            raise NoImu(
+            raise ImuMissing(
                 f"{source.name} has no IMU: expected a recording or ros2: topics with one, or --mavlink URL for the "
                 "flight controller's; its noise and place are told by --calibration"
             )

@@ -10,7 +10,7 @@ import numpy as np
 
 from kiteline_agent.inertial.calibration.known_imu import KnownImuConfig
 from kiteline_core.arrays import F64
-from kiteline_lab.calibration.verdict import Finding
+from kiteline_lab.calibration.verdict import CalibrationFinding
 
 _TURNS = ("nod it: turn it up and down", "pan it: turn it left and right", "roll it: tilt it from side to side")
 _RESTS = (
@@ -84,43 +84,51 @@ class ImuProgress:
         text = f"offset to {1e3 * self.offset_sigma_s:.2f} ms, gyro to {100 * gyro:.2f} %, force to {100 * force:.2f} %"
         return f"{text}; {self.wanted() or 'complete'}"
 
-    def findings(self) -> list[Finding]:
+    def findings(self) -> list[CalibrationFinding]:
         """The verdict: what was found, how well it is known, what to do where that is not enough."""
         c, known = self.config, self.known
         if known is None or not known.gyro or not known.offset_s:
             text = "no IMU was found that turns as the images do"
             mend = "check the calibration's T_b_c and axes, that both have one clock, and that the images are tracked"
-            return [Finding("bad", text, mend)]
+            return [CalibrationFinding("bad", text, mend)]
         share = self.tracked / max(1, self.frames)
         tracked = f"{100 * share:.0f} % of {self.frames} frames tracked"
-        out = [Finding("good", tracked) if share >= c.tracked else
-               Finding("poor", tracked, "more texture, more light, slower turns")]  # fmt: skip
+        out = [CalibrationFinding("good", tracked) if share >= c.tracked else
+               CalibrationFinding("poor", tracked, "more texture, more light, slower turns")]  # fmt: skip
         offset_s, sigma_s = known.offset_s
         text = f"camera stamps {1e3 * offset_s:+.2f} ms to the IMU's time, known to {1e3 * sigma_s:.2f} ms"
-        out.append(Finding("good", text) if sigma_s <= c.offset_s else Finding("poor", text, "turn it quickly"))
+        out.append(
+            CalibrationFinding("good", text)
+            if sigma_s <= c.offset_s
+            else CalibrationFinding("poor", text, "turn it quickly")
+        )
         gyro, sigma = np.reshape(known.gyro, (3, 3)), self._columns(known.gyro_sigma)
         turn_deg, scale = rotation_deg(gyro), 100.0 * float(np.abs(np.diag(gyro) - 1.0).max())
         text = (f"camera turned by {turn_deg:.2f} degrees against the gyro, whose scales are up to {scale:.2f} % off, "
                 f"known to {100 * sigma.max():.2f} %")  # fmt: skip
         if turn_deg > c.most_turn_deg:
             mend = "the T_b_c told is another rig's, or an axis is swapped: measure it anew, and begin again"
-            out.append(Finding("bad", text, mend))
+            out.append(CalibrationFinding("bad", text, mend))
         else:
             level = "good" if sigma.max() <= c.turn else "poor"
-            out.append(Finding(level, text, "" if level == "good" else "longer turns about all axes"))
+            out.append(CalibrationFinding(level, text, "" if level == "good" else "longer turns about all axes"))
         if not self.metric:
             out.append(
-                Finding("poor", "accelerometer: not compared", "a single camera does not know lengths by itself")
+                CalibrationFinding(
+                    "poor", "accelerometer: not compared", "a single camera does not know lengths by itself"
+                )
             )
             return out
         sigma = self._columns(known.accel_sigma)
         if not np.isfinite(sigma).all():
-            out.append(Finding("poor", "accelerometer: not compared", "move it to and fro too"))
+            out.append(CalibrationFinding("poor", "accelerometer: not compared", "move it to and fro too"))
             return out
         scale = 100.0 * float(np.abs(np.diag(np.reshape(known.accel, (3, 3))) - 1.0).max())
         text = f"accelerometer's scales up to {scale:.2f} % off, known to {100 * sigma.max():.2f} %"
         mend = "hold it still on each side, looking up, looking down: gravity tells the scale along it"
-        out.append(Finding("good", text) if sigma.max() <= c.force else Finding("poor", text, mend))
+        out.append(
+            CalibrationFinding("good", text) if sigma.max() <= c.force else CalibrationFinding("poor", text, mend)
+        )
         return out
 
 

@@ -17,7 +17,7 @@ _NEEDED_TILTED = 3
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class CalibrationFinding:
     """level: "good", "poor" or "bad". mend: what to do, "" if it is good."""
 
     level: str
@@ -29,7 +29,7 @@ class Finding:
         return f"{self.level:4}  {self.text}" + (f": {self.mend}" if self.mend else "")
 
 
-def judge(result: Calibrated, coverage: Sequence[Coverage], views: int) -> list[Finding]:
+def judge(result: Calibrated, coverage: Sequence[Coverage], views: int) -> list[CalibrationFinding]:
     """All findings, of the whole and of each camera."""
     out = [_of_views(views - result.left_out, result.left_out)]
     names = ("left camera: ", "right camera: ") if len(result.cameras) == 2 else ("",)
@@ -42,53 +42,55 @@ def judge(result: Calibrated, coverage: Sequence[Coverage], views: int) -> list[
     for axis, how in ((0, "turned about its upright axis"), (1, "tipped forward and back")):
         tilted = int((np.abs(normals[:, axis]) > _TILT).sum())
         if tilted < _NEEDED_TILTED:
-            out.append(Finding("poor", f"{tilted} views of the board {how}", "show a few by 20 to 45°"))
+            out.append(CalibrationFinding("poor", f"{tilted} views of the board {how}", "show a few by 20 to 45°"))
     if result.T_c_r is not None:
         baseline_m, sigma = float(np.linalg.norm(result.T_c_r[:3, 3])), result.baseline_sigma()
         turn = np.degrees(np.arccos(np.clip(0.5 * (np.trace(result.T_c_r[:3, :3]) - 1.0), -1.0, 1.0)))
         text = f"baseline {1000 * baseline_m:.2f} mm, known to {100 * sigma:.2f} %; cameras turned by {turn:.2f}°"
         out.append(_of_length(text, sigma, "show the board closer, where both cameras see it"))
         if result.T_c_r[0, 3] <= 0:
-            out.append(Finding("bad", "the right camera lies left of the left one", "swap the two images of SOURCE"))
+            out.append(
+                CalibrationFinding("bad", "the right camera lies left of the left one", "swap the two images of SOURCE")
+            )
     return out
 
 
-def _of_views(used: int, left_out: int) -> Finding:
+def _of_views(used: int, left_out: int) -> CalibrationFinding:
     text = f"{used} views" + (f", {left_out} more did not fit and were left out" if left_out else "")
     if used < ENOUGH_VIEWS:
-        return Finding("poor", text, f"show the board {ENOUGH_VIEWS} times or more, each time elsewhere")
+        return CalibrationFinding("poor", text, f"show the board {ENOUGH_VIEWS} times or more, each time elsewhere")
     if left_out > used // 3:
         mend = "hold the board still and flat; with a pair, check that both images are of one instant"
-        return Finding("poor", text, mend)
-    return Finding("good", text)
+        return CalibrationFinding("poor", text, mend)
+    return CalibrationFinding("good", text)
 
 
-def _of_corners(name: str, rms_px: float) -> Finding:
+def _of_corners(name: str, rms_px: float) -> CalibrationFinding:
     text = f"{name}corners are {rms_px:.2f} px rms from where they should be"
     if rms_px <= GOOD_RMS_PX:
-        return Finding("good", text)
+        return CalibrationFinding("good", text)
     mend = (
         "check that the board is flat, its squares as wide as told, the camera in focus and held still; "
         "try --lens equidistant for a wide lens, or --coefficients 5"
     )
-    return Finding("poor" if rms_px <= USABLE_RMS_PX else "bad", text, mend)
+    return CalibrationFinding("poor" if rms_px <= USABLE_RMS_PX else "bad", text, mend)
 
 
-def _of_coverage(name: str, coverage: Coverage) -> Finding:
+def _of_coverage(name: str, coverage: Coverage) -> CalibrationFinding:
     text, bare = f"{name}{100 * coverage.share:.0f} % of the image covered", coverage.bare_sides()
     if bare:
         mend = "hold the board there, partly outside if it is a ChArUco board"
-        return Finding("poor", f"{name}too few views at the {' and the '.join(bare)}", mend)
+        return CalibrationFinding("poor", f"{name}too few views at the {' and the '.join(bare)}", mend)
     if coverage.share < _COVERED:
-        return Finding("poor", text, "hold the board in its corners")
-    return Finding("good", text)
+        return CalibrationFinding("poor", text, "hold the board in its corners")
+    return CalibrationFinding("good", text)
 
 
-def _of_length(text: str, sigma: float, mend: str) -> Finding:
+def _of_length(text: str, sigma: float, mend: str) -> CalibrationFinding:
     """Of a focal length or a baseline. sigma: relative."""
-    return Finding("good", text) if sigma <= _LENGTH_SIGMA else Finding("poor", text, mend)
+    return CalibrationFinding("good", text) if sigma <= _LENGTH_SIGMA else CalibrationFinding("poor", text, mend)
 
 
-def overall(findings: Sequence[Finding]) -> str:
+def overall(findings: Sequence[CalibrationFinding]) -> str:
     """The worst level."""
     return next((level for level in ("bad", "poor") if any(f.level == level for f in findings)), "good")

@@ -1,1 +1,1 @@
-"""Evaluation: estimates and ground truth go in, errors (ATE, RPE, precision, recall) come out."""
+"""Estimated and true trajectories enter; their errors (ATE, RPE, drift, coverage) leave."""

@@ -1,1 +1,1 @@
-"""Occupancy grids as files of map_server: read, judged against the truth, drawn, and planned on."""
+"""Occupancy grids: files of map_server and true worlds enter; precision, recall, pictures and paths leave."""

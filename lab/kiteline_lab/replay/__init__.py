@@ -1,1 +1,1 @@
-"""Logs of agents and bases enter; the same steps are run again, and the first difference leaves."""
+"""Logs of agents and bases enter; the same steps are run again, and the first output that differs leaves."""

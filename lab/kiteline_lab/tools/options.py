@@ -74,6 +74,7 @@ def _sections(config: Any, path: str) -> Iterator[Section]:
             nested.append((value, f"{path}.{field.name}"))
             continue
         unit, reason = _unit_and_reason(field.name, comments.get(field.name, ""))
+        reason = re.sub(r"\b(True|False)\b", lambda word: word[0].lower(), reason)  # as TOML has them
         options.append(Option(f"{path}.{field.name}", value, type_name(hints[field.name]), unit, reason))
     if options:
         yield Section(path, " ".join((inspect.getdoc(cls) or "").split("\n\n")[0].split()), tuple(options))
@@ -110,7 +111,8 @@ def _unit_and_reason(name: str, comment: str) -> tuple[str, str]:
     by_name = next((unit for suffix, unit in _SUFFIXES if f"_{name}".endswith(suffix)), "")
     if leading and by_name in ("", leading[1]):
         return by_name or leading[1], comment[leading.end() :]
-    return by_name or ("px" if comment.startswith("px ") else ""), comment
+    unit = by_name or ("px" if comment.startswith("px ") else "")
+    return unit, comment.removeprefix(f"{unit} ") if unit else comment
 
 
 def as_toml() -> str:

@@ -10,7 +10,7 @@ import pytest
 
 from kiteline_agent.ekf import landmark_update
 from kiteline_agent.ekf.ekf_slam import EkfSlam
-from kiteline_agent.ekf.filter_state import FilterState, Motion
+from kiteline_agent.ekf.filter_state import FilterState, OdometryMotion
 from kiteline_agent.ekf.odometer_motion import OdometerMotion, camera_motion
 from kiteline_agent.ekf_config import EkfConfig
 from kiteline_bench.papers import ekf
@@ -71,7 +71,7 @@ def test_white_errors_of_a_motion_move_camera_and_map_as_dense_matrices_do() -> 
     a = 0.01 * np.random.default_rng(1).standard_normal((6, 6))
     step = np.array([0.3, -0.1, 0.2])
     R0 = state.T_o_c[:3, :3]
-    state.propagate(Motion(se3.exp(np.append(step, [0.1, -0.2, 0.05])), step, a @ a.T))
+    state.propagate(OdometryMotion(se3.exp(np.append(step, [0.1, -0.2, 0.05])), step, a @ a.T))
     R1, p1 = state.T_o_c[:3, :3], state.T_o_c[:3, 3]
     by_error = np.zeros((state.size, 6))
     by_error[:3, :3], by_error[:3, 3:], by_error[3:6, 3:] = R0, se3.skew(p1) @ R1, R1
@@ -119,7 +119,7 @@ def test_an_odometer_whose_covariance_is_none_does_not_end_the_flight() -> None:
 def test_prediction_moves_the_covariance_as_perturbed_motions_do() -> None:
     """Against draws: pose and landmark relative to it, after white errors and an error of the scale."""
     rng, config = np.random.default_rng(0), EkfConfig(scale_sigma=0.02)
-    motion = Motion(
+    motion = OdometryMotion(
         se3.exp(np.array([0.3, -0.1, 0.2, 0.1, -0.2, 0.05])), np.array([0.3, -0.1, 0.2]),
         np.diag([1e-4, 2e-4, 3e-4, 1e-4, 2e-4, 1e-4]),
     )  # fmt: skip

@@ -7,7 +7,7 @@ import numpy as np
 from kiteline_agent.ekf.filter_state import FilterState
 from kiteline_agent.ekf.ray_initialisation import (
     Rays,
-    Track,
+    RayTrack,
     distance_share,
     linearised,
     new_landmark,
@@ -110,7 +110,7 @@ def test_supporting_views_are_those_of_plain_numpy() -> None:
 
 def _drawn(
     model: vehicle.VehicleModel, rng: np.random.Generator, points: F64 = _POINT[None]
-) -> tuple[FilterState, list[Track]]:
+) -> tuple[FilterState, list[RayTrack]]:
     """A state whose four views and pose drifted by odometry, and the tracks of points (n,3) that all five saw."""
     cam = vehicle.camera()
     poses = _loop(model.planar)
@@ -124,11 +124,11 @@ def _drawn(
             seen.append([_seen(poses[k : k + 1] @ cam.T_b_c, point)[0] for point in points])
             if k < 12:
                 state.add_view(k // 3)
-    sightings = np.array(seen).swapaxes(0, 1) + _SIGMA * rng.standard_normal((len(points), 5, 2))
-    return state, [Track(np.arange(4), xy, _SIGMA) for xy in sightings]
+    observations = np.array(seen).swapaxes(0, 1) + _SIGMA * rng.standard_normal((len(points), 5, 2))
+    return state, [RayTrack(np.arange(4), xy, _SIGMA) for xy in observations]
 
 
-def _rays(state: FilterState, track: Track) -> Rays:
+def _rays(state: FilterState, track: RayTrack) -> Rays:
     rays = linearised(state, track, state.T_o_c, state.view_T_o_c)
     assert rays is not None
     return rays

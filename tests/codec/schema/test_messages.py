@@ -24,6 +24,7 @@ from kiteline_codec.schema import (
     NewLandmarks,
     Observations,
     RemovedObservations,
+    StereoAlignment,
     SubmapPlacement,
     WireError,
     messages,
@@ -138,6 +139,10 @@ def test_errors_say_what_was_expected() -> None:
             messages.encode(wrong)
     with pytest.raises(ValueError, match="storey"):
         messages.key(replace(tile, storey=128))
+    rig = next(r for r in some_records(0, 1) if isinstance(r, StereoAlignment))
+    code = messages.encode(rig)
+    with pytest.raises(WireError, match="two flags are 0 to 3, found 4"):
+        messages.decode(messages.key(rig), b"\4" + code[1:])
 
 
 @given(st.integers(0, 1 << 30), st.integers(1, 64), st.sampled_from([0.0, 0.01, 0.3, 1.0]))

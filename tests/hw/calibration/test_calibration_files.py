@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraModel, Lens
+from kiteline_hw.calibration.file_calibration import FileCalibration
 from kiteline_hw.calibration.files import FORMS, read_calibration
-from kiteline_hw.calibration.told import ToldCalibration
 from kiteline_hw.ports import SourceError
 
 CHAIN = """\
@@ -124,7 +124,7 @@ accelerometer_random_walk: 3.0000e-3
 """
 
 
-def told(folder: Path, **texts: str) -> ToldCalibration:
+def told(folder: Path, **texts: str) -> FileCalibration:
     for name, text in texts.items():
         (folder / f"{name}.yaml").write_text(text)
     return read_calibration(",".join(str(folder / f"{name}.yaml") for name in texts))
@@ -255,7 +255,7 @@ def numbers(low: float, high: float) -> st.SearchStrategy[float]:
 
 
 @st.composite
-def rigs(draw: st.DrawFn) -> ToldCalibration:
+def rigs(draw: st.DrawFn) -> FileCalibration:
     width, height = draw(st.integers(64, 4000)), draw(st.integers(64, 4000))
     lens = draw(st.sampled_from([Lens.NONE, Lens.RADTAN, Lens.EQUIDISTANT]))
 
@@ -269,13 +269,13 @@ def rigs(draw: st.DrawFn) -> ToldCalibration:
     T_b_c = se3.exp(np.array([*draw(turn), *(10.0 * v for v in draw(turn))]))
     imu = ImuCalibration(*(draw(numbers(1e-6, 1.0)) for _ in range(5)))
     if draw(st.booleans()):
-        return ToldCalibration("x", (camera(),), None, T_b_c, imu, ('/a: "b" #c',))
-    return ToldCalibration("x", (camera(), camera()), T_c_r, T_b_c, imu, ("/l", "/r"))
+        return FileCalibration("x", (camera(),), None, T_b_c, imu, ('/a: "b" #c',))
+    return FileCalibration("x", (camera(), camera()), T_c_r, T_b_c, imu, ("/l", "/r"))
 
 
 @settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
 @given(rigs(), st.sampled_from(["kiteline", "kalibr", "euroc", "opencv"]))
-def test_round_trips(tmp_path: Path, rig: ToldCalibration, form: str) -> None:
+def test_round_trips(tmp_path: Path, rig: FileCalibration, form: str) -> None:
     names = []
     for name, text in FORMS[form](rig).items():
         path = tmp_path / form / name
@@ -299,7 +299,7 @@ def test_round_trips(tmp_path: Path, rig: ToldCalibration, form: str) -> None:
 def test_ros_round_trip_of_a_pair(tmp_path: Path) -> None:
     camera = CameraModel(640, 480, 436.2, 437.1, 320.5, 240.25, Lens.RADTAN, (-0.36, 0.15, 0.0003, -0.0008))
     T_c_r = se3.exp(np.array([0.11, 0.001, -0.002, 0.01, -0.02, 0.005]))
-    rig = ToldCalibration("x", (camera, replace(camera, cx=318.0)), T_c_r)
+    rig = FileCalibration("x", (camera, replace(camera, cx=318.0)), T_c_r)
     texts = FORMS["ros"](rig)
     back = told(tmp_path, left=texts["left.yaml"], right=texts["right.yaml"])
     assert back.cameras[1].cx == 318.0 and back.cameras[0].distortion == (*camera.distortion, 0.0)
@@ -310,7 +310,7 @@ def test_ros_round_trip_of_a_pair(tmp_path: Path) -> None:
 def test_five_coefficients_are_not_cut_to_kalibrs_four() -> None:
     camera = CameraModel(640, 480, 436.2, 437.1, 320.5, 240.25, Lens.RADTAN, (-0.36, 0.15, 0.0003, -0.0008, 0.02))
     with pytest.raises(SourceError, match="5 radial-tangential coefficients"):
-        FORMS["kalibr"](ToldCalibration("x", (camera,)))
+        FORMS["kalibr"](FileCalibration("x", (camera,)))
 
 
 @settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)

@@ -6,8 +6,9 @@ from pymavlink.dialects.v20 import common
 
 from kiteline_core.frame import ImuBatch, ImuCalibration, OdometryBatch
 from kiteline_core.geometry.cameras import CameraModel, CameraRig
+from kiteline_hw.mavlink import controller_imu
 from kiteline_hw.mavlink.codec import MavlinkCodec
-from kiteline_hw.mavlink.controller_imu import ControllerImu, ControllerImuConfig
+from kiteline_hw.mavlink.controller_imu import ControllerImu
 from kiteline_hw.mavlink.controller_session import ControllerSession
 from kiteline_hw.mavlink.coordinate_frames import mounting
 from kiteline_hw.mavlink.messages import Heartbeat, VehicleImu
@@ -27,8 +28,8 @@ IN_BODY = {
 }
 
 
-def unit(axes: str = "flu", **config: int) -> ControllerImu:
-    return ControllerImu(mounting(axes)[:3, :3], 200.0, SourceReport(), ControllerImuConfig(**config))
+def unit(axes: str = "flu") -> ControllerImu:
+    return ControllerImu(mounting(axes)[:3, :3], 200.0, SourceReport())
 
 
 def stream_of(imu: ControllerImu, kind: str = "ardupilot") -> tuple[ControllerSession, FlightController]:
@@ -122,8 +123,9 @@ def test_late_samples_come_with_the_next_frame() -> None:
     assert second.t_ns.tolist() == [S + 50 * MS, S + 60 * MS]
 
 
-def test_the_buffer_is_bounded() -> None:
-    imu = unit(max_samples=10)
+def test_the_buffer_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(controller_imu, "_MAX_SAMPLES", 10)
+    imu = unit()
     for k in range(30):
         imu.receive(VehicleImu(k * 5000, *NOSE_UP), None, S + k * 5 * MS)
     batch = imu.take_until(9 * S)

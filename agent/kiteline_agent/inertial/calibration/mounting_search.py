@@ -145,17 +145,17 @@ class _Turns:
 def _found(config: MountingSearchConfig, turns: _Turns, matrix: F64, offset_s: float) -> Mounting | None:
     steps = round(config.most_offset_s / config.step_s)
     offsets = np.asarray(config.step_s * np.arange(-steps, steps + 1), np.float64)
-    felt, weight, cost = turns.by_gyro(offsets), np.ones(len(turns.dt_s)), np.empty(0)
+    by_gyro, weight, cost = turns.by_gyro(offsets), np.ones(len(turns.dt_s)), np.empty(0)
     for _ in range(_FITS):
-        _, cost, left = _fit(config, turns, felt, weight)
+        _, cost, left = _fit(config, turns, by_gyro, weight)
         size = np.maximum(np.linalg.norm(left[np.argmin(cost)], axis=1), config.turn_sigma_rad)
         weight = np.minimum(1.0, _TAIL * np.median(size) / size) ** 2
-    both_s, only_s = _least(offsets, cost), _least(offsets, _cost(turns, felt, matrix, weight))
+    both_s, only_s = _least(offsets, cost), _least(offsets, _cost(turns, by_gyro, matrix, weight))
     if both_s is None or only_s is None:
         return None
-    felt = turns.by_gyro(np.array([both_s[0], only_s[0], offset_s]))
-    fitted, cost, _ = _fit(config, turns, felt, weight)
-    by_offset, given = _cost(turns, felt[1:], matrix, weight)
+    by_gyro = turns.by_gyro(np.array([both_s[0], only_s[0], offset_s]))
+    fitted, cost, _ = _fit(config, turns, by_gyro, weight)
+    by_offset, given = _cost(turns, by_gyro[1:], matrix, weight)
     noise = max(float(cost[0]) / max(3.0 * float(weight.sum()) - _UNKNOWNS, 1.0), config.turn_sigma_rad**2)
     clear = config.significance * noise
     # The fewest changes that explain the turns: where little turned, a rotation could pass for an offset.
@@ -167,7 +167,7 @@ def _found(config: MountingSearchConfig, turns: _Turns, matrix: F64, offset_s: f
     explained = given - (by_offset if k == 1 else float(cost[k]))
     if explained < max(config.explained * given, clear) or not _differs(config, axes, matrix, found_s - offset_s):
         return None
-    rest, share = turns.by_images - felt[k] @ axes.T, weight * turns.dt_s
+    rest, share = turns.by_images - by_gyro[k] @ axes.T, weight * turns.dt_s
     bias = -share @ rest / float(share @ turns.dt_s)
     return Mounting(axes, found_s, sigma * float(np.sqrt(noise)), bias)
 
@@ -204,26 +204,26 @@ def _least(offsets_s: F64, cost: F64) -> tuple[float, float] | None:
     )
 
 
-def _cost(turns: _Turns, felt: F64, axes: F64, weight: F64) -> F64:
-    """Squared errors (k,) of felt (k,n,3) by given axes (3,3), apart from a bias."""
-    left = _without_bias(turns.by_images - felt @ axes.T, turns.dt_s, weight)
+def _cost(turns: _Turns, by_gyro: F64, axes: F64, weight: F64) -> F64:
+    """Squared errors (k,) of by_gyro (k,n,3) by given axes (3,3), apart from a bias."""
+    left = _without_bias(turns.by_images - by_gyro @ axes.T, turns.dt_s, weight)
     return np.asarray(np.sum(left**2, axis=2) @ weight)
 
 
-def _fit(config: MountingSearchConfig, turns: _Turns, felt: F64, weight: F64) -> tuple[F64, F64, F64]:
-    """Scaled rotations (k,3,3) of felt (k,n,3) onto the turns by images, apart from a bias. weight: (n,).
+def _fit(config: MountingSearchConfig, turns: _Turns, by_gyro: F64, weight: F64) -> tuple[F64, F64, F64]:
+    """Scaled rotations (k,3,3) of by_gyro (k,n,3) onto the turns by images, apart from a bias. weight: (n,).
 
     Also their squared errors (k,), with those of the prior, which is no scale and no rotation; and the errors (k,n,3).
     """
     pull = 0.5 * (config.turn_sigma_rad / config.rotation_sigma_rad) ** 2
     stiff = (config.turn_sigma_rad / config.scale_sigma) ** 2
-    seen, felt = (_without_bias(vectors, turns.dt_s, weight) for vectors in (turns.by_images, felt))
-    moment = (weight * seen.T) @ felt + pull * np.eye(3)
+    seen, by_gyro = (_without_bias(vectors, turns.dt_s, weight) for vectors in (turns.by_images, by_gyro))
+    moment = (weight * seen.T) @ by_gyro + pull * np.eye(3)
     rotation = _rotation(moment)
-    matched, square = np.sum(rotation * moment, axis=(1, 2)), np.sum(felt**2, axis=2) @ weight + 3.0 * pull
+    matched, square = np.sum(rotation * moment, axis=(1, 2)), np.sum(by_gyro**2, axis=2) @ weight + 3.0 * pull
     scale = (matched + stiff) / (square + stiff)
     axes = scale[:, None, None] * rotation
-    left = seen - felt @ axes.transpose(0, 2, 1)
+    left = seen - by_gyro @ axes.transpose(0, 2, 1)
     prior = pull * np.sum((axes - np.eye(3)) ** 2, axis=(1, 2)) + stiff * (scale - 1.0) ** 2
     return axes, np.asarray(np.sum(left**2, axis=2) @ weight + prior), left
 

@@ -19,7 +19,7 @@ _FRAMES = 64  # most frames that are kept
 
 
 @dataclass(frozen=True, slots=True)
-class Link:
+class SampledMotion:
     """Raw samples between two frames, and the poses (4,4) by images at both. rates: (2,3) rad/s, raw, at both.
 
     frames: all of the window, with these two: IMU time and pose (4,4).
@@ -51,7 +51,7 @@ class PoseChain:
         """Move the poses with the map: p_new = T_new_old p_old."""
         self._poses = [(t, T_new_old @ T) for t, T in self._poses]
 
-    def take(self, buffer: SampleBuffer, offset_s: float) -> Link | bool:
+    def take(self, buffer: SampleBuffer, offset_s: float) -> SampledMotion | bool:
         """The next window, once its samples have arrived; True: it has a gap, False: not yet. offset_s: camera stamp
         to IMU time.
         """
@@ -72,7 +72,7 @@ class PoseChain:
         rates = [rate_at(buffer, t + shift) for t in (begin_ns, end_ns)]
         if samples is None or samples.duration_s > _LONGEST * self._window_s or rates[0] is None or rates[1] is None:
             return True
-        return Link(samples, begin, end, np.array(rates), frames)
+        return SampledMotion(samples, begin, end, np.array(rates), frames)
 
 
 def rate_at(buffer: SampleBuffer, t_ns: int) -> F64 | None:

@@ -16,7 +16,7 @@ from kiteline_agent.inertial.calibration.gyro_calibration import GyroCalibration
 from kiteline_agent.inertial.calibration.known_imu import KnownImuConfig, is_plausible, known_axes
 from kiteline_agent.inertial.calibration.lever_search import LeverSearch, LeverSearchConfig
 from kiteline_agent.inertial.calibration.mounting_search import Mounting, MountingSearch, MountingSearchConfig
-from kiteline_agent.inertial.calibration.pose_chain import Link, PoseChain
+from kiteline_agent.inertial.calibration.pose_chain import PoseChain, SampledMotion
 from kiteline_agent.inertial.calibration.turn_scatter import added_variance
 from kiteline_agent.inertial.calibration.window import Window
 from kiteline_agent.inertial.preintegration import Samples
@@ -76,7 +76,7 @@ class _Move:
     """
 
     window: Window
-    link: Link
+    link: SampledMotion
     density: float
     position_m: float
     unsteady: float
@@ -236,7 +236,7 @@ class SelfCalibration:
         """
         self.restarted = self.turned = False
         turn = self._turns.take(buffer, self.gyro.offset_s)
-        if isinstance(turn, Link):
+        if isinstance(turn, SampledMotion):
             offset_s, density = self.gyro.offset_s, float(self._density(turn)[0])
             added = added_variance(
                 turn, buffer, self.gyro.matrix, self.gyro.bias, self._config.turn_sigma_rad, density
@@ -257,7 +257,7 @@ class SelfCalibration:
             if not self.accel.has_vertical:
                 self.accel.set_vertical(gravity)
             move = self._moves.take(buffer, self.gyro.offset_s)
-            if isinstance(move, Link):
+            if isinstance(move, SampledMotion):
                 self._add_move(move)
                 self._test_accel()
                 self._search_lever()
@@ -370,7 +370,7 @@ class SelfCalibration:
             change = step @ buffer.last_accel
         return change
 
-    def _add_move(self, link: Link) -> None:
+    def _add_move(self, link: SampledMotion) -> None:
         config = self._config
         position_m = max(config.position_sigma_m, config.position_rad * self._depth_m)
         now = _Move(self._integrate(link, self.gyro), link, float(self._density(link)[1]), position_m, self._unsteady)
@@ -386,12 +386,12 @@ class SelfCalibration:
         poses = before.link.T_m_b0, link.T_m_b0, link.T_m_b1
         self.accel.add((before.window, now.window), poses, self._p_b_c, variance, self._lever)
 
-    def _integrate(self, link: Link, gyro: GyroCalibration) -> Window:
+    def _integrate(self, link: SampledMotion, gyro: GyroCalibration) -> Window:
         matrix, bias = gyro.matrix, gyro.bias
         rates = link.rates @ matrix.T - bias
         return Window.of(link.samples, matrix, bias, rates[0], rates[1])
 
-    def _density(self, link: Link) -> F64:
+    def _density(self, link: SampledMotion) -> F64:
         """(2,) noise density of gyro and accelerometer in a window."""
         calibrated = np.array([self._calibration.gyro_noise, self._calibration.accel_noise])
         measured = link.samples.density

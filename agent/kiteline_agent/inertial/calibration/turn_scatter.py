@@ -5,7 +5,7 @@ Within a window the gyro's bias and the time offset are fitted to the rotations 
 
 import numpy as np
 
-from kiteline_agent.inertial.calibration.pose_chain import Link, rate_at
+from kiteline_agent.inertial.calibration.pose_chain import SampledMotion, rate_at
 from kiteline_agent.inertial.calibration.window import Window
 from kiteline_agent.inertial.sample_buffer import SampleBuffer
 from kiteline_core.arrays import F64
@@ -15,7 +15,9 @@ _FITTED = 4  # bias and time offset
 _CHANCE = 4.0  # times the expected mean square: chance makes up to 3 of it, and worn lenses seldom more
 
 
-def added_variance(link: Link, buffer: SampleBuffer, matrix: F64, bias: F64, image_rad: float, density: float) -> float:
+def added_variance(
+    link: SampledMotion, buffer: SampleBuffer, matrix: F64, bias: F64, image_rad: float, density: float
+) -> float:
     """Variance, rad^2 about an axis, that a window's rotation by images has beyond the expected one.
 
     matrix (3,3), bias (3,): of the gyro. image_rad: expected error of a rotation by images. density: of the gyro's

@@ -1,1 +1,1 @@
-"""Logs: flown for hours, cut anywhere, replayed; bars leave."""
+"""Logs of hours of flight enter, are cut anywhere and replayed; bars leave."""

@@ -197,7 +197,7 @@ def real(bench: Bench) -> list[Experiment]:
     street, flight = bench.source("kitti_straight"), bench.source("euroc_mh01_air")
     return [
         Experiment("kitti_straight, two robots", SEQUENCE_03, robots(f"kitti:{street}", 10.0, overlapping(51, 2)), 1),
-        *(Experiment(f"euroc_mh01_air, two robots, one eye and IMU{more}", None,
+        *(Experiment(f"euroc_mh01_air, two robots, one camera and IMU{more}", None,
                      robots(f"euroc:{flight}", 20.0, overlapping(700, 2, frames), imu=True, first_s=_AIR_S), 1)
           for more, frames in (("", _OVERLAP), (", 5 s in common", _AIR_OVERLAP))),
     ]  # fmt: skip

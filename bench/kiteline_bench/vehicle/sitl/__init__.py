@@ -1,1 +1,1 @@
-"""ArduCopter in software in the loop, with kiteline's agent and rendered cameras, in simulated time."""
+"""ArduCopter in software in the loop: a built binary and a scene enter; flights and bars leave."""

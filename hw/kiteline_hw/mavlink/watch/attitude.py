@@ -17,7 +17,7 @@ from kiteline_core.geometry import se3
 from kiteline_hw.mavlink.controller_odometry import StampClock
 from kiteline_hw.mavlink.coordinate_frames import R_L_O, mounting
 from kiteline_hw.mavlink.messages import Attitude
-from kiteline_hw.mavlink.watch.findings import FindingLog, Level
+from kiteline_hw.mavlink.watch.findings import FindingLevel, FindingLog
 from kiteline_hw.ports import PoseSample
 
 TOPIC = "axes"
@@ -164,7 +164,7 @@ class AttitudeWatch:
             return
         if len(self._turns) >= c.misfit_turns and float(turns[self._in_use]) > c.misfit_chi2:
             self._log.say(
-                TOPIC, "none", Level.WARNING,
+                TOPIC, "none", FindingLevel.WARNING,
                 f"attitude: the vehicle turns otherwise than the flight controller says, by any axes (now {used})",
                 "kiteline: mounting fits no axes",
                 "The camera is mounted at an angle that its calibration does not say, or its stamps are late",
@@ -175,7 +175,7 @@ class AttitudeWatch:
         if tilt_rad > c.tilt_rad and len(self._downs) >= c.downs // 2:
             if self._log.state(TOPIC) != "tilt":
                 self._log.say(
-                    TOPIC, "tilt", Level.WARNING,
+                    TOPIC, "tilt", FindingLevel.WARNING,
                     f"attitude: own roll and pitch are {np.degrees(tilt_rad):.0f} degrees off the flight controller's, "
                     f"with axes {used}",
                     f"kiteline: tilt is off by {np.degrees(tilt_rad):.0f} deg",
@@ -186,7 +186,8 @@ class AttitudeWatch:
         fits = bool(self._turns) and float(turns[self._in_use]) < c.fit_chi2
         if fits and level and float(others.min()) - float(chi2[self._in_use]) > c.sure_chi2:
             self._log.say(
-                TOPIC, "good", Level.INFO, f"attitude: agrees with the flight controller's, axes {used} are right",
+                TOPIC, "good", FindingLevel.INFO,
+                f"attitude: agrees with the flight controller's, axes {used} are right",
                 f"kiteline: axes {used} are right",
             )  # fmt: skip
 
@@ -197,7 +198,7 @@ class AttitudeWatch:
             right = " or ".join([", ".join(fitting[:-1]), fitting[-1]])
             remedy = f"Do not fly. Tilt and turn the vehicle by hand to learn which of {right} is right"
         self._log.say(
-            TOPIC, tuple(fitting), Level.ERROR,
+            TOPIC, tuple(fitting), FindingLevel.ERROR,
             f"attitude: --axes {used} are wrong: by the flight controller's attitude they are {right}",
             f"kiteline: axes {used} wrong, fit: {'/'.join(fitting)}", remedy,
         )  # fmt: skip

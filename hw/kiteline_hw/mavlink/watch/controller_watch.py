@@ -12,7 +12,7 @@ from kiteline_hw.mavlink.watch import messages as wire
 from kiteline_hw.mavlink.watch.attitude import TOPIC as AXES
 from kiteline_hw.mavlink.watch.attitude import AttitudeWatch
 from kiteline_hw.mavlink.watch.estimator import EstimatorWatch
-from kiteline_hw.mavlink.watch.findings import Finding, FindingLog, Level
+from kiteline_hw.mavlink.watch.findings import Finding, FindingLevel, FindingLog
 from kiteline_hw.mavlink.watch.latency import LatencyWatch
 from kiteline_hw.mavlink.watch.messages import (
     AutopilotVersion,
@@ -98,23 +98,23 @@ class ControllerWatch:
         """Report that poses are held back because the axes are wrong, or that they are sent again."""
         if held:
             self._log.say(
-                "held", True, Level.ERROR, "poses: held back, because --axes are wrong",
+                "held", True, FindingLevel.ERROR, "poses: held back, because --axes are wrong",
                 "kiteline: poses held, axes wrong",
                 "A vehicle that is in the air already goes on getting them",
             )  # fmt: skip
         elif self._log.state("held"):
-            self._log.say("held", False, Level.INFO, "poses: the axes fit, they are sent", "kiteline: axes fit")
+            self._log.say("held", False, FindingLevel.INFO, "poses: the axes fit, they are sent", "kiteline: axes fit")
 
     def report_heading(self, *, held: bool) -> None:
         """Report that poses are held back until the heading is known, or that it is known now."""
         if held:
             self._log.say(
-                "heading", True, Level.WARNING,
+                "heading", True, FindingLevel.WARNING,
                 "poses: held back, because the flight controller's heading is not known", "kiteline: waits for heading",
                 "It must send ATTITUDE: check that the wire to it carries our requests",
             )  # fmt: skip
         elif self._log.state("heading"):
-            self._log.say("heading", False, Level.INFO, "poses: the heading is known", "kiteline: heading known")
+            self._log.say("heading", False, FindingLevel.INFO, "poses: the heading is known", "kiteline: heading known")
 
     def tick(self, now_ns: int, link: LinkState) -> list[MavlinkMessage]:
         """Say what has changed; the messages to send: requests, and findings as STATUSTEXT."""
@@ -152,7 +152,11 @@ class ControllerWatch:
         if before is not None and before - m.t_ms > self.config.restart_ms:
             self._log.forget("restart")
             self._log.say(
-                "restart", m.t_ms, Level.WARNING, "flight controller: restarted", "kiteline: controller restarted"
+                "restart",
+                m.t_ms,
+                FindingLevel.WARNING,
+                "flight controller: restarted",
+                "kiteline: controller restarted",
             )
             self.attitude.restart()
             self.estimator.restart()

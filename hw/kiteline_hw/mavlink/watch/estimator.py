@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from kiteline_hw.mavlink.watch.findings import FindingLog, Level
+from kiteline_hw.mavlink.watch.findings import FindingLevel, FindingLog
 from kiteline_hw.mavlink.watch.messages import (
     ARDUPILOT,
     NO_AIDING_FLAG,
@@ -65,7 +65,7 @@ class EstimatorWatch:
             self._say_used("and says so")
         elif _STOPPED_TEXT in m.text:
             self._log.say(
-                TOPIC, "stopped", Level.ERROR, "poses: the flight controller's estimator stopped using them",
+                TOPIC, "stopped", FindingLevel.ERROR, "poses: the flight controller's estimator stopped using them",
                 "kiteline: EKF stopped using poses",
             )  # fmt: skip
 
@@ -99,7 +99,7 @@ class EstimatorWatch:
 
         if lasts("rejected", c.rejected_ns):
             self._log.say(
-                TOPIC, "rejected", Level.ERROR,
+                TOPIC, "rejected", FindingLevel.ERROR,
                 f"poses: the estimator rejects them: innovations {max(m.velocity_ratio, m.position_ratio):.1f} times "
                 "its limit",
                 "kiteline: EKF rejects poses",
@@ -107,14 +107,14 @@ class EstimatorWatch:
             )  # fmt: skip
         elif lasts("ignored", c.ignored_ns):
             self._log.say(
-                TOPIC, "ignored", Level.ERROR,
+                TOPIC, "ignored", FindingLevel.ERROR,
                 "poses: sent, but the flight controller ignores them: its estimator has no position",
                 "kiteline: EKF ignores the poses", _IGNORED[ardupilot],
             )  # fmt: skip
         elif lasts("used", c.used_ns) and self._log.state(TOPIC) != "used":
             if self._position_before and self._log.state(TOPIC) is None:
                 self._log.say(
-                    TOPIC, "unknown", Level.INFO,
+                    TOPIC, "unknown", FindingLevel.INFO,
                     "poses: sent; the estimator had a position before them, so whether it uses them is not told",
                     "kiteline: EKF has position without poses",
                     "With GPS or optical flow as well, look at the innovations in the ground station",
@@ -124,7 +124,7 @@ class EstimatorWatch:
 
     def _say_used(self, why: str) -> None:
         self._log.say(
-            TOPIC, "used", Level.INFO, f"poses: the flight controller's estimator uses them ({why})",
+            TOPIC, "used", FindingLevel.INFO, f"poses: the flight controller's estimator uses them ({why})",
             "kiteline: EKF uses the poses",
         )  # fmt: skip
 
@@ -135,6 +135,7 @@ class EstimatorWatch:
             return
         name = "EKF_STATUS_REPORT" if autopilot == ARDUPILOT else "ESTIMATOR_STATUS"
         self._log.say(
-            TOPIC, "silent", Level.WARNING, f"poses: sent; whether they are used is not told, as no {name} comes",
+            TOPIC, "silent", FindingLevel.WARNING,
+            f"poses: sent; whether they are used is not told, as no {name} comes",
             f"kiteline: no {name}", "The port may be too slow, or its stream rates fixed",
         )  # fmt: skip

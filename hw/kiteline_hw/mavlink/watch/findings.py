@@ -6,7 +6,7 @@ from enum import IntEnum
 SHORT_CHARACTERS = 50  # of a STATUSTEXT's text field
 
 
-class Level(IntEnum):
+class FindingLevel(IntEnum):
     """How bad a finding is; the values of MAV_SEVERITY."""
 
     ERROR = 3
@@ -19,7 +19,7 @@ class Finding:
     """One finding. short: for STATUSTEXT, at most 50 characters. remedy: what to do about it, "" if nothing."""
 
     topic: str
-    level: Level
+    level: FindingLevel
     text: str
     short: str
     remedy: str = ""
@@ -37,7 +37,7 @@ class FindingLog:
         self._states: dict[str, object] = {}
         self._new: list[Finding] = []
 
-    def say(self, topic: str, state: object, level: Level, text: str, short: str, remedy: str = "") -> None:
+    def say(self, topic: str, state: object, level: FindingLevel, text: str, short: str, remedy: str = "") -> None:
         """Add a finding unless its topic was last said in the same state."""
         if self.state(topic) == state:
             return

@@ -3,7 +3,7 @@
 from collections import deque
 from dataclasses import dataclass
 
-from kiteline_hw.mavlink.watch.findings import FindingLog, Level
+from kiteline_hw.mavlink.watch.findings import FindingLevel, FindingLog
 from kiteline_hw.mavlink.watch.messages import PX4
 
 _FRAME_BYTES = 245  # of ODOMETRY on the wire
@@ -45,7 +45,7 @@ class LatencyWatch:
         setting = "EKF2_EV_DELAY 0, as stamps are of the capture" if autopilot == PX4 else f"VISO_DELAY_MS {delay_ms}"
         jittery = high - low > self.config.jitter_ms
         self._log.say(
-            "latency", delay_ms, Level.WARNING if jittery else Level.INFO,
+            "latency", delay_ms, FindingLevel.WARNING if jittery else FindingLevel.INFO,
             f"latency of poses: {low:.0f} ms, 95 % within {high:.0f} ms; to set: {setting}",
             f"kiteline: set {setting.split(',')[0]}",
             "It varies too much for one value: raise --cpu, or lower the frame rate" if jittery else "",

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from kiteline_hw.mavlink.watch.findings import Finding, Level
+from kiteline_hw.mavlink.watch.findings import Finding, FindingLevel
 from kiteline_hw.mavlink.watch.messages import ARDUPILOT, PX4
 
 TOPIC, FORWARD_TOPIC = "parameters", "forwarding"
@@ -86,7 +86,7 @@ def compare(autopilot: int, values: Mapping[str, float]) -> list[Finding]:
     rules = [rule for rule in RULES.get(autopilot, ()) if rule.name in values]
     wrong = [
         Finding(
-            rule.name, Level.ERROR if rule.needed else Level.WARNING,
+            rule.name, FindingLevel.ERROR if rule.needed else FindingLevel.WARNING,
             f"{rule.name} is {values[rule.name]:g}, expected {rule.want}: {rule.why}", "",
             f"set {rule.name} to {rule.want}",
         )
@@ -99,14 +99,16 @@ def compare(autopilot: int, values: Mapping[str, float]) -> list[Finding]:
     wanted = {rule.name for rule in RULES.get(autopilot, ())}
     if not rules:
         text = "no parameter was told" if wanted else "this firmware has no table here"
-        return [Finding(TOPIC, Level.WARNING, text, "", "is the link good in both directions?" if wanted else "")]
+        return [
+            Finding(TOPIC, FindingLevel.WARNING, text, "", "is the link good in both directions?" if wanted else "")
+        ]
     out = list(said.values())
-    if not any(f.level is Level.ERROR for f in out):
+    if not any(f.level is FindingLevel.ERROR for f in out):
         fine = len({rule.name for rule in rules} - set(said))
-        out.append(Finding(TOPIC, Level.INFO, f"{fine} are as kiteline needs them", ""))
+        out.append(Finding(TOPIC, FindingLevel.INFO, f"{fine} are as kiteline needs them", ""))
     if missing := sorted(wanted - set(values)):
         text = f"not told: {', '.join(missing)}"
-        out.append(Finding(TOPIC, Level.WARNING, text, "", "this firmware may lack them: update it"))
+        out.append(Finding(TOPIC, FindingLevel.WARNING, text, "", "this firmware may lack them: update it"))
     return out
 
 
@@ -121,7 +123,7 @@ def _ardupilot_ports(values: Mapping[str, float]) -> list[Finding]:
     ports = {n: values.get(f"SERIAL{n}_PROTOCOL") for n in _SERIAL_PORTS}
     out = [
         Finding(
-            FORWARD_TOPIC, Level.WARNING, f"SERIAL{n} speaks MAVLink 1, which has no ODOMETRY", "",
+            FORWARD_TOPIC, FindingLevel.WARNING, f"SERIAL{n} speaks MAVLink 1, which has no ODOMETRY", "",
             f"if it leads here: set SERIAL{n}_PROTOCOL to 2",
         )
         for n, protocol in ports.items() if protocol == _MAVLINK_1
@@ -134,17 +136,23 @@ def _ardupilot_ports(values: Mapping[str, float]) -> list[Finding]:
     if quiet:
         text = f"MAVLink on {listed}; {', '.join(quiet)} does not forward"
         out.append(
-            Finding(FORWARD_TOPIC, Level.INFO, text, "", "that must be the port here; a mavlink: link needs forwarding")
+            Finding(
+                FORWARD_TOPIC,
+                FindingLevel.INFO,
+                text,
+                "",
+                "that must be the port here; a mavlink: link needs forwarding",
+            )
         )
     else:
         new = any(f"MAV{n}_OPTIONS" in values for n in _CHANNELS)
         bit = f"bit {_NO_FORWARD_4_7} of MAVn_OPTIONS" if new else f"bit {_NO_FORWARD} of SERIALx_OPTIONS"
         text = f"MAVLink on {listed}; each forwards, so ODOMETRY also goes out on the telemetry radio"
         remedy = f"set {bit} of the port here (unless a mavlink: link goes through it: the bit ends that)"
-        out.append(Finding(FORWARD_TOPIC, Level.WARNING, text, "", remedy))
+        out.append(Finding(FORWARD_TOPIC, FindingLevel.WARNING, text, "", remedy))
     if slow and len(slow) == len(carrying):
         text = f"each MAVLink port is slower than {_LEAST_BAUD}200 baud: 30 poses a second take 7.5 kB/s"
-        out.append(Finding(FORWARD_TOPIC, Level.WARNING, text, "", "set SERIALx_BAUD of the port here to 921"))
+        out.append(Finding(FORWARD_TOPIC, FindingLevel.WARNING, text, "", "set SERIALx_BAUD of the port here to 921"))
     return out
 
 
@@ -154,8 +162,8 @@ def _px4_ports(values: Mapping[str, float]) -> list[Finding]:
     if forwarding:
         text = f"{', '.join(forwarding)} is 1: ODOMETRY also goes out on the telemetry radio"
         remedy = "set it to 0 for the port here (unless a mavlink: link goes through it: that needs forwarding)"
-        return [Finding(FORWARD_TOPIC, Level.WARNING, text, "", remedy)]
+        return [Finding(FORWARD_TOPIC, FindingLevel.WARNING, text, "", remedy)]
     if not used:
-        return [Finding(FORWARD_TOPIC, Level.INFO, "no serial MAVLink instance, so none forwards", "")]
+        return [Finding(FORWARD_TOPIC, FindingLevel.INFO, "no serial MAVLink instance, so none forwards", "")]
     listed = ", ".join(f"MAV_{n}" for n in used)
-    return [Finding(FORWARD_TOPIC, Level.INFO, f"MAVLink on {listed}; none forwards", "")]
+    return [Finding(FORWARD_TOPIC, FindingLevel.INFO, f"MAVLink on {listed}; none forwards", "")]

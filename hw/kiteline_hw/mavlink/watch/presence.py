@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pymavlink.dialects.v20 import common
 
 from kiteline_hw.mavlink.messages import Heartbeat
-from kiteline_hw.mavlink.watch.findings import FindingLog, Level
+from kiteline_hw.mavlink.watch.findings import FindingLevel, FindingLog
 from kiteline_hw.mavlink.watch.messages import AUTOPILOT_VERSION, REQUEST_MESSAGE, AutopilotVersion, Command
 
 TOPIC, DEVICE_TOPIC, SIGNING_TOPIC, ANSWER_TOPIC = "controller", "device", "signing", "answers"
@@ -104,7 +104,7 @@ class PresenceWatch:
             return []
         if now_ns - max(heard_ns, self._fault_ns) >= self.config.absent_ns:
             self._log.say(
-                TOPIC, "silent", Level.ERROR,
+                TOPIC, "silent", FindingLevel.ERROR,
                 f"flight controller: silent for {(now_ns - heard_ns) / 1e9:.0f} s", "kiteline: controller is silent",
                 "Is it powered, and the cable plugged in? Poses are still sent",
             )  # fmt: skip
@@ -132,7 +132,7 @@ class PresenceWatch:
         firmware = f" {self._version}" if self._version else ""
         name = f"{autopilot_name(m.autopilot)}{firmware}"
         self._log.say(
-            TOPIC, ("found", m.system, m.autopilot, self._version), Level.INFO,
+            TOPIC, ("found", m.system, m.autopilot, self._version), FindingLevel.INFO,
             f"flight controller: {how}: {name}, {vehicle_name(m.type)}, system {m.system}"
             + ("" if firmware else "; its firmware does not tell its version"),
             f"kiteline: sees {name}, system {m.system}",
@@ -162,32 +162,36 @@ class PresenceWatch:
             )
         seconds = self.config.absent_ns / 1e9
         self._log.say(
-            TOPIC, state, Level.ERROR, f"flight controller: not found in {seconds:.0f} s at {self._url}: {why}",
+            TOPIC, state, FindingLevel.ERROR, f"flight controller: not found in {seconds:.0f} s at {self._url}: {why}",
             "kiteline: flight controller not found", remedy,
         )  # fmt: skip
 
     def _say_device(self, link: LinkState) -> None:
         if link.device_fault:
             self._log.say(
-                DEVICE_TOPIC, link.device_fault, Level.ERROR, f"flight controller: {self._url}: {link.device_fault}",
-                "kiteline: serial port is missing",
+                DEVICE_TOPIC, link.device_fault, FindingLevel.ERROR,
+                f"flight controller: {self._url}: {link.device_fault}", "kiteline: serial port is missing",
                 "Plug it in, or end the program that uses it; this user must be in group dialout. It is tried again",
             )  # fmt: skip
         elif self._log.state(DEVICE_TOPIC) not in (None, ""):
             self._log.say(
-                DEVICE_TOPIC, "", Level.INFO, f"flight controller: {self._url} is open", "kiteline: serial port is open"
+                DEVICE_TOPIC,
+                "",
+                FindingLevel.INFO,
+                f"flight controller: {self._url} is open",
+                "kiteline: serial port is open",
             )
 
     def _say_signing(self, link: LinkState) -> None:
         if link.refused and link.has_key:
             self._log.say(
-                SIGNING_TOPIC, "refused", Level.ERROR,
+                SIGNING_TOPIC, "refused", FindingLevel.ERROR,
                 "signing: messages came without our key's signature, and were refused", "kiteline: signature refused",
                 "Set the same passphrase in the controller and for the agent",
             )  # fmt: skip
         elif link.signed and not link.has_key:
             self._log.say(
-                SIGNING_TOPIC, "no key", Level.WARNING,
+                SIGNING_TOPIC, "no key", FindingLevel.WARNING,
                 "signing: the flight controller signs its messages, and will refuse ours, which are not signed",
                 "kiteline: no key for signing", "Give the agent the key, or switch signing off in the ground station",
             )  # fmt: skip
@@ -199,6 +203,7 @@ class PresenceWatch:
             else "Check the wire from our TX to its RX, the URL's direction, and whether it wants signed messages"
         )
         self._log.say(
-            ANSWER_TOPIC, "none", Level.ERROR, "flight controller: heard, but it answers nothing that it is asked",
+            ANSWER_TOPIC, "none", FindingLevel.ERROR,
+            "flight controller: heard, but it answers nothing that it is asked",
             "kiteline: controller does not answer", remedy,
         )  # fmt: skip

@@ -20,7 +20,7 @@ from kiteline_hw.mavlink.messages import (
 )
 from kiteline_hw.mavlink.watch import messages as wire
 from kiteline_hw.mavlink.watch import parameters
-from kiteline_hw.mavlink.watch.findings import Finding, FindingLog, Level
+from kiteline_hw.mavlink.watch.findings import Finding, FindingLevel, FindingLog
 from kiteline_hw.mavlink.watch.messages import (
     AutopilotVersion,
     CommandAck,
@@ -228,7 +228,7 @@ class ControllerSurvey:
         out = [Finding("heartbeat", f.level, f.text, "", f.remedy) for f in self._presence_findings]
         controller = self.presence.heartbeat
         if controller is None:
-            return out or [Finding("heartbeat", Level.ERROR, "flight controller: not found", "")]
+            return out or [Finding("heartbeat", FindingLevel.ERROR, "flight controller: not found", "")]
         out += parameters.compare(controller.autopilot, self._values)
         out += parameters.compare_forwarding(controller.autopilot, self._values)
         return [*out, *self._streams(controller), self._sync(controller), self._radio_finding(), *self._said()]
@@ -237,53 +237,55 @@ class ControllerSurvey:
         c = self.config
         if controller.armed:
             text = "the vehicle is armed: no streams were asked for"
-            return [Finding("streams", Level.WARNING, text, "", "disarm it, and check again")]
+            return [Finding("streams", FindingLevel.WARNING, text, "", "disarm it, and check again")]
         slow = "use a faster baud rate, or look for fixed stream rates (SRx_, MAV_x_RATE)"
         out = []
         for name, _, wanted_hz in self._wanted(controller):
             stream = self._rates.get(name)
             if stream is None or stream.rate_hz is None:
                 text = f"{name}: none came" + (", the request was refused" if self._refused else "")
-                out.append(Finding("streams", Level.WARNING, text, "", slow))
+                out.append(Finding("streams", FindingLevel.WARNING, text, "", slow))
                 continue
             text = f"{name}: {stream.rate_hz:.0f} Hz of {wanted_hz:.0f}, jitter {stream.jitter_ms:.1f} ms (95 %)"
             if name == "HIGHRES_IMU" and stream.rate_hz < c.least_imu_hz:
-                out.append(Finding("streams", Level.WARNING, text, "", f"too slow for --imu controller: {slow}"))
+                out.append(Finding("streams", FindingLevel.WARNING, text, "", f"too slow for --imu controller: {slow}"))
             elif stream.rate_hz < c.rate_share * wanted_hz or stream.jitter_ms > c.jitter_ms:
-                out.append(Finding("streams", Level.WARNING, text, "", slow))
+                out.append(Finding("streams", FindingLevel.WARNING, text, "", slow))
             else:
-                out.append(Finding("streams", Level.INFO, text, ""))
+                out.append(Finding("streams", FindingLevel.INFO, text, ""))
         return out
 
     def _sync(self, controller: Heartbeat) -> Finding:
         asked = f"it asked {self._sync_requests} times itself"
         if not self._round_trips_ms:
-            level = Level.ERROR if controller.autopilot == wire.PX4 else Level.WARNING
-            remedy = "PX4 needs it to convert stamps: is the wire to it good?" if level is Level.ERROR else ""
+            level = FindingLevel.ERROR if controller.autopilot == wire.PX4 else FindingLevel.WARNING
+            remedy = "PX4 needs it to convert stamps: is the wire to it good?" if level is FindingLevel.ERROR else ""
             return Finding("timesync", level, f"no answer; {asked}", "", remedy)
         trips = sorted(self._round_trips_ms)
         middle, high = trips[len(trips) // 2], trips[round(0.95 * (len(trips) - 1))]
         text = f"{len(trips)} answers, round trip {middle:.1f} ms, 95 % within {high:.1f} ms; {asked}"
         if controller.autopilot == wire.PX4 and self._sync_requests == 0:
             return Finding(
-                "timesync", Level.ERROR, text, "", "PX4 must ask, to convert stamps: set MAV_x_MODE to onboard"
+                "timesync", FindingLevel.ERROR, text, "", "PX4 must ask, to convert stamps: set MAV_x_MODE to onboard"
             )
         if high > self.config.round_trip_ms:
-            return Finding("timesync", Level.WARNING, text, "", "a slow or busy port: raise its baud rate")
-        return Finding("timesync", Level.INFO, text, "")
+            return Finding("timesync", FindingLevel.WARNING, text, "", "a slow or busy port: raise its baud rate")
+        return Finding("timesync", FindingLevel.INFO, text, "")
 
     def _radio_finding(self) -> Finding:
         c, m = self.config, self._radio
         if m is None:
             text = "no RADIO_STATUS heard: none on this port, and ArduPilot never forwards it"
-            return Finding("radio", Level.INFO, text, "")
+            return Finding("radio", FindingLevel.INFO, text, "")
         text = f"signal {m.rssi}, remote {m.remote_rssi}, noise {m.noise}; buffer {m.txbuf} % free"
         if m.txbuf < c.least_txbuf:
-            return Finding("radio", Level.WARNING, text, "", "it is overloaded: keep ODOMETRY off it (forwarding)")
+            return Finding(
+                "radio", FindingLevel.WARNING, text, "", "it is overloaded: keep ODOMETRY off it (forwarding)"
+            )
         if min(m.rssi, m.remote_rssi) - m.noise < c.least_margin:
-            return Finding("radio", Level.WARNING, text, "", "weak: mend antennas, or come nearer")
-        return Finding("radio", Level.INFO, text, "")
+            return Finding("radio", FindingLevel.WARNING, text, "", "weak: mend antennas, or come nearer")
+        return Finding("radio", FindingLevel.INFO, text, "")
 
     def _said(self) -> list[Finding]:
-        bad = [text for text, severity in self._texts.items() if severity <= int(Level.WARNING)]
-        return [Finding("it says", Level.WARNING, text, "") for text in bad[:8]]
+        bad = [text for text, severity in self._texts.items() if severity <= int(FindingLevel.WARNING)]
+        return [Finding("it says", FindingLevel.WARNING, text, "") for text in bad[:8]]

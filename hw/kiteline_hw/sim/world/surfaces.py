@@ -11,8 +11,6 @@ from kiteline_hw.sim.world.world import World
 
 def with_difficult_surfaces(world: World, seed: int, bits: int, repeated: float, glossy: float) -> World:
     """The world with shares of its faces repeating or glossy; which ones is drawn from the seed."""
-    if repeated <= 0.0 and glossy <= 0.0:
-        return world
     rng = np.random.default_rng([seed, 89])
     draws = rng.random((len(world.faces), 2))
     faces, pool = world.faces.copy(), world.pool

@@ -9,9 +9,13 @@ def check_controller(url: str, key: str = "") -> list[DoctorCheck]:
     key: a file with the key of MAVLink's signatures; "": none.
     """
     from kiteline_hw.mavlink.surveyor import survey_controller
-    from kiteline_hw.mavlink.watch.findings import Level
+    from kiteline_hw.mavlink.watch.findings import FindingLevel
     from kiteline_hw.system.clock import MonotonicClock
 
-    severities = {Level.ERROR: Severity.FAIL, Level.WARNING: Severity.NOTE, Level.INFO: Severity.OK}
+    severities = {
+        FindingLevel.ERROR: Severity.FAIL,
+        FindingLevel.WARNING: Severity.NOTE,
+        FindingLevel.INFO: Severity.OK,
+    }
     found = survey_controller(url, MonotonicClock(), key)
     return [DoctorCheck(severities[f.level], f.topic, f.text, f.remedy) for f in found]

@@ -1,0 +1,151 @@
+"""Images and IMU that contradict each other: no map in metres begins, the user is told what to check, images go on."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from kiteline_agent.config import AgentConfig
+from kiteline_agent.governor.cost_model import Work
+from kiteline_agent.inertial.preintegration import Samples
+from kiteline_agent.inertial_start_config import ContradictionConfig
+from kiteline_agent.initialisation import inertial_start
+from kiteline_agent.initialisation.contradiction import ContradictionWatch, contradicts, exceeds_lens_errors
+from kiteline_agent.initialisation.corner_tracks import CornerObservations
+from kiteline_agent.initialisation.inertial_start import InertialStart
+from kiteline_agent.initialisation.window_noise import WindowNoise
+from kiteline_core.arrays import F64
+from tests.agent.initialisation.test_inertial_bundle import CALIBRATION, PRIOR, window
+from tests.agent.initialisation.test_inertial_start import CAMERA, Tracks
+
+Change = Callable[[CornerObservations, list[Samples]], tuple[CornerObservations, list[Samples]]]
+
+
+def start_with(monkeypatch: pytest.MonkeyPatch, change: Change, keyframes: int = 36) -> tuple[float, list[str]]:
+    """Seconds until a map begins (infinite if none does) on a changed window, and the warnings until then."""
+    corners, samples, _ = window(1, keyframes=keyframes, noise_px=0.2)
+    corners, samples = change(corners, samples)
+    monkeypatch.setattr(InertialStart, "_points", lambda *_: SimpleNamespace(sigma_rho=np.ones(100)))
+    monkeypatch.setattr(inertial_start, "realigned", lambda _keyframes, observations, *_: observations)
+    start = InertialStart(CAMERA, CALIBRATION, AgentConfig(), Work())
+    start._tracks = Tracks(corners)  # type: ignore[assignment]
+    monkeypatch.setattr(start, "_intervals", lambda keyframes, _offset: samples[: len(keyframes) - 1])
+    monkeypatch.setattr(start, "_measured_noise", WindowNoise)
+    warnings: list[str] = []
+    for k in range(keyframes):
+        ctx: Any = SimpleNamespace(t_ns=250_000_000 * k, images=SimpleNamespace(left=None))
+        found = start.add(ctx, None, 0.0)
+        warnings += start.take_warnings()
+        if found is not None:
+            return ctx.t_ns * 1e-9, warnings
+    return float("inf"), warnings
+
+
+def unchanged(corners: CornerObservations, samples: list[Samples]) -> tuple[CornerObservations, list[Samples]]:
+    return corners, samples
+
+
+def longer_focal_length(corners: CornerObservations, samples: list[Samples]) -> Any:
+    """Corners as a camera shows them whose focal length is a tenth longer than told."""
+    return replace(corners, xy=1.1 * corners.xy), samples
+
+
+def turned(R: F64) -> Change:
+    def change(corners: CornerObservations, samples: list[Samples]) -> Any:
+        return corners, [replace(s, gyro=s.gyro @ R.T, accel=s.accel @ R.T) for s in samples]
+
+    return change
+
+
+def in_g(corners: CornerObservations, samples: list[Samples]) -> Any:
+    return corners, [replace(s, accel=s.accel / 9.81) for s in samples]
+
+
+def in_degrees(corners: CornerObservations, samples: list[Samples]) -> Any:
+    return corners, [replace(s, gyro=np.degrees(s.gyro)) for s in samples]
+
+
+def test_a_rig_as_calibrated_begins_a_map_and_warns_of_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    begun_s, warnings = start_with(monkeypatch, unchanged)
+    assert begun_s < 9.0
+    assert warnings == []
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        longer_focal_length,
+        turned(np.diag([1.0, -1.0, -1.0])),
+        turned(np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])),
+        in_g,
+        in_degrees,
+    ],
+    ids=["focal length", "two axes negated", "a quarter turn", "accelerations in g", "rates in degrees"],
+)
+def test_a_rig_that_is_not_as_calibrated_begins_none_and_says_so_once(
+    monkeypatch: pytest.MonkeyPatch, change: Change
+) -> None:
+    begun_s, warnings = start_with(monkeypatch, change)
+    assert begun_s == float("inf")
+    assert len(warnings) == 1
+    assert "T_BS" in warnings[0]
+
+
+@pytest.mark.parametrize(
+    ("lens_chi2", "gyro_noise", "accel_bias_m_s2", "wrong"),
+    [
+        (2.0, 2.8, 0.1, False),  # images that are 20 ms late, which tracking finds
+        (17.0, 1.2, 0.3, False),  # worn rigs
+        (14.0, 1.9, 0.1, True),  # a focal length that is off by a tenth
+        (32.0, 1.2, 0.1, True),
+        (2.0, 7.0, 0.1, True),  # images that are 50 ms late
+        (2.0, 0.8, 8.0, True),  # accelerations in g
+    ],
+)
+def test_what_calibrated_and_worn_rigs_show_is_no_contradiction(
+    lens_chi2: float, gyro_noise: float, accel_bias_m_s2: float, wrong: bool
+) -> None:
+    info = np.diag(np.full(8, 1e4))
+    lens = np.array([1.0, 0, 0, 0, 0, 0, 0, 0]) * np.sqrt(lens_chi2 / 1e4)
+    solution: Any = SimpleNamespace(
+        state=SimpleNamespace(lens=lens), bias=np.array([0.0, 0.0, 0.0, 0.0, accel_bias_m_s2, 0.0])
+    )
+    assert contradicts(solution, gyro_noise, PRIOR, info, ContradictionConfig()) is wrong
+
+
+def test_the_imu_is_given_up_for_what_it_shows_and_for_a_lens_alone_much_later() -> None:
+    config = ContradictionConfig(lasts_s=5.0, unsure_s=24.0)
+    watch = ContradictionWatch(config)
+    assert not any(watch.note(k * 10**9, contradicts=True, by_imu=k == 3) and watch.certain for k in range(9))
+    assert not watch.certain  # a lens may be off beside a true IMU
+    for k in range(9, 24):
+        watch.note(k * 10**9, contradicts=True, by_imu=False)
+    assert not watch.certain
+    watch.note(24 * 10**9, contradicts=True, by_imu=False)
+    assert watch.certain
+    watch.note(25 * 10**9, contradicts=False)
+    assert not watch.certain
+    for k in range(26, 32):
+        watch.note(k * 10**9, contradicts=True, by_imu=True)
+    assert watch.certain
+    assert not watch.note(32 * 10**9, contradicts=False) and not watch.certain
+    for k in range(33, 50):  # people in view: windows that fit nothing in between
+        watch.note(k * 10**9, contradicts=True if k % 3 else None, by_imu=True)
+        assert not watch.certain
+    # windows as starts show them: the real flight backward, whose lens is off; two axes negated; accelerations in g
+    for gyro_noise, bias_m_s2, imu in ((0.2, 0.16, False), (7.4, 0.1, True), (0.2, 8.3, True)):
+        solution: Any = SimpleNamespace(bias=np.array([0.0, 0.0, 0.0, 0.0, bias_m_s2, 0.0]))
+        assert exceeds_lens_errors(solution, gyro_noise, PRIOR, config) is imu
+
+
+def test_a_contradiction_is_told_once_it_lasts_and_again_after_an_end() -> None:
+    watch = ContradictionWatch(ContradictionConfig(lasts_s=5.0))
+    said: list[int] = []
+    for k in range(60):
+        tells = k % 3 != 1  # every third window tells neither
+        events = watch.note(500_000_000 * k, contradicts=k not in (3, 30) if tells else None)
+        said += [k] * len(events)
+    assert said == [15, 42]

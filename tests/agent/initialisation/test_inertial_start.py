@@ -1,0 +1,294 @@
+"""When a monocular map in metres begins: the window is solved again until the newest keyframe sees enough landmarks."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from kiteline_agent.config import AgentConfig
+from kiteline_agent.governor.cost_model import Work
+from kiteline_agent.imaging.features import DetectorConfig, build_pyramid
+from kiteline_agent.inertial_start_config import CornerTracksConfig
+from kiteline_agent.initialisation import inertial_start
+from kiteline_agent.initialisation.corner_tracks import CornerObservations, CornerTracks, TrackedKeyframe, with_found
+from kiteline_agent.initialisation.inertial_start import InertialStart
+from kiteline_agent.initialisation.inertial_window import SolvedWindow, WindowSolution, finished
+from kiteline_agent.initialisation.metric_restart import MetricPoints
+from kiteline_agent.initialisation.window_noise import WindowNoise
+from kiteline_agent.tracking.frame_context import FrameContext
+from kiteline_agent.tracking.waiting_frames import WaitingFrames
+from kiteline_core.arrays import F64
+from kiteline_core.frame import Frame, ImuBatch
+from kiteline_core.geometry import se3
+from tests.agent.initialisation.test_inertial_bundle import CALIBRATION, FOCAL, T_B_C, window
+
+CAMERA: Any = SimpleNamespace(fx=FOCAL, fy=FOCAL, cx=376.0, cy=240.0, width=752, height=480, T_b_c=T_B_C)
+
+
+class Tracks:
+    """Recorded corners, one keyframe more at each call of `add`."""
+
+    def __init__(self, corners: CornerObservations) -> None:
+        self._corners, self.keyframes = corners, list[Any]()
+
+    def is_due(self, _t_ns: int) -> bool:
+        return True
+
+    def follow(self, _left: object) -> None:
+        pass
+
+    def add(self, t_ns: int, _left: object, _turn: object) -> None:
+        self.keyframes.append(SimpleNamespace(t_ns=t_ns))
+
+    def drop_before(self, t_ns: int) -> None:
+        pass
+
+    def clear(self) -> None:
+        raise AssertionError("samples are missing")
+
+    def flow_px(self) -> float:
+        return 100.0
+
+    def observations(self) -> CornerObservations:
+        n = len(self.keyframes)
+        corners = CornerObservations(self._corners.xy[:n], self._corners.seen[:n], self._corners.ids)
+        return corners.part(np.flatnonzero(corners.seen.sum(axis=0) >= 3))
+
+
+def begins_after(monkeypatch: pytest.MonkeyPatch, poor: int) -> tuple[float, float]:
+    """Seconds until the scale is known, and until the map begins, if after that `poor` keyframes see few landmarks."""
+    corners, samples, _ = window(1, keyframes=24, noise_px=0.2)
+    asked: list[float] = []
+
+    def points(
+        self: InertialStart, ctx: FrameContext, corners: CornerObservations, solution: WindowSolution
+    ) -> MetricPoints:
+        asked.append(ctx.t_ns * 1e-9)
+        few: Any = SimpleNamespace(sigma_rho=np.ones(5 if len(asked) <= poor else 100))
+        return few  # type: ignore[no-any-return]
+
+    monkeypatch.setattr(InertialStart, "_points", points)
+    monkeypatch.setattr(inertial_start, "realigned", lambda _keyframes, observations, *_: observations)
+    config = AgentConfig()
+    known = replace(
+        config.inertial_start.bundle, lens_focal=1e-5, lens_centre_px=1e-2, lens_radial=1e-5, camera_turn_rad=1e-5
+    )
+    config = replace(config, inertial_start=replace(config.inertial_start, bundle=known))  # the scale is known sooner
+    start = InertialStart(CAMERA, CALIBRATION, config, Work())
+    start._tracks = Tracks(corners)  # type: ignore[assignment]
+    monkeypatch.setattr(start, "_intervals", lambda keyframes, _offset: samples[: len(keyframes) - 1])
+    monkeypatch.setattr(start, "_measured_noise", WindowNoise)
+    for k in range(24):
+        ctx: Any = SimpleNamespace(t_ns=250_000_000 * k, images=SimpleNamespace(left=None))
+        if start.add(ctx, None, 0.0) is not None:
+            return asked[0], asked[-1]
+    raise AssertionError("the map never begins")
+
+
+def test_a_map_that_lacks_landmarks_begins_at_one_of_the_next_keyframes(monkeypatch: pytest.MonkeyPatch) -> None:
+    known, begun = begins_after(monkeypatch, 0)
+    assert known == begun
+    assert begins_after(monkeypatch, 3) == (known, pytest.approx(known + 3 * 0.25))
+
+
+def test_corners_that_alignment_finds_again_count_where_flow_lost_them() -> None:
+    rng = np.random.default_rng(0)
+    corners = CornerObservations(rng.normal(size=(4, 6, 2)), rng.random((4, 6)) < 0.5, np.arange(6))
+    columns = np.array([0, 2, 5])
+    aligned = replace(corners.part(columns), xy=rng.normal(size=(4, 3, 2)), seen=rng.random((4, 3)) < 0.7)
+    both = with_found(corners, columns, aligned)
+    for k in range(4):
+        for i in range(6):
+            at = np.flatnonzero(columns == i)
+            again = len(at) == 1 and bool(aligned.seen[k, at[0]])
+            assert both.seen[k, i] == (corners.seen[k, i] or again)
+            if corners.seen[k, i]:
+                np.testing.assert_array_equal(both.xy[k, i], corners.xy[k, i])
+            elif again:
+                np.testing.assert_array_equal(both.xy[k, i], aligned.xy[k, at[0]])
+
+
+def test_windows_whose_keyframes_coincide_confirm_no_scale() -> None:
+    def at(places: np.ndarray[Any, Any]) -> Any:
+        solution: Any = SimpleNamespace(state=SimpleNamespace(p=places))
+        return SolvedWindow((0, 1, 2, 3), np.zeros(0, np.int64), np.zeros((0, 3)), solution)
+
+    start = InertialStart(CAMERA, CALIBRATION, AgentConfig(), Work())
+    apart, together = np.arange(12.0).reshape(4, 3), np.ones((4, 3))
+    assert start._agrees(at(apart), at(1.01 * apart))
+    assert not start._agrees(at(apart), at(1.1 * apart))
+    with np.errstate(all="raise"):
+        assert not start._agrees(at(together), at(together))
+        assert not start._agrees(at(together), at(apart))
+        assert not start._agrees(at(apart), at(together))
+
+
+def at_once(result: Any) -> Any:
+    """A computation of one part."""
+    return result
+    yield
+
+
+def test_a_lower_cost_at_the_same_scale_confirms_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    def solved(scale: float, cost: float) -> inertial_start._Solved:
+        state = SimpleNamespace(p=scale * np.arange(12.0).reshape(4, 3))
+        solution: Any = SimpleNamespace(state=state, cost=cost, scale_sigma=0.02)
+        return inertial_start._Solved(solution, np.full((5, 3), scale), np.zeros(5, np.int64))
+
+    def is_lowest(scale: float, cost: float) -> tuple[bool, float]:
+        """Whether a solution with cost 1000 stands beside this one from nothing; scale of the next start."""
+        found, start = solved(1.0, 1000.0), InertialStart(CAMERA, CALIBRATION, AgentConfig(), Work())
+        start._before = SolvedWindow((0, 1, 2, 3), np.zeros(0, np.int64), found.xyz, found.solution)
+        monkeypatch.setattr(start, "_solve", lambda *_: at_once(solved(scale, cost)))
+        stands = finished(start._is_lowest(found, None, [], None))  # type: ignore[arg-type]
+        return stands, float(start._before.xyz[0, 0])
+
+    assert is_lowest(1.2, 1000.0) == (True, 1.0)
+    assert is_lowest(1.2, 990.0) == (False, 1.2)
+    assert is_lowest(1.005, 990.0) == (True, 1.0)  # it left out other corners
+
+
+def test_a_window_begins_after_the_samples_that_are_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An IMU that starts after the camera: keyframes from its first sample on count, not only those of later frames."""
+    start = InertialStart(CAMERA, CALIBRATION, AgentConfig(), Work())
+    monkeypatch.setattr(start._tracks, "flow_px", lambda: 100.0)
+    monkeypatch.setattr(start._tracks, "is_due", lambda _t_ns: True)
+    monkeypatch.setattr(start._tracks, "add", lambda *_: None)
+    monkeypatch.setattr(start._tracks, "follow", lambda _left: None)
+    start._tracks.keyframes = [SimpleNamespace(t_ns=250_000_000 * k) for k in range(20)]  # type: ignore[misc]
+    t_ns = np.arange(1_100_000_000, 4_800_000_000, 5_000_000)
+    ctx: Any = SimpleNamespace(
+        t_ns=4_750_000_000, images=SimpleNamespace(left=None),
+        imu=ImuBatch(t_ns, np.zeros((len(t_ns), 3)), np.tile([0.0, 0.0, 9.8], (len(t_ns), 1))),
+    )  # fmt: skip
+    start.add_samples(ctx)
+    solved: list[int] = []
+    monkeypatch.setattr(start, "_attempting", lambda _ctx, keyframes, *_: iter([solved.append(len(keyframes))]))
+    start.add(ctx, None, 0.0)
+    assert [k.t_ns for k in start._tracks.keyframes] == [250_000_000 * k for k in range(4, 20)]  # 0.2 s are bridged
+    start.add(ctx, None, 0.0)
+    assert solved == [16]
+
+
+@pytest.mark.parametrize(("flow_px", "kept"), [(0.2, 17), (8.0, 77)])
+def test_of_a_long_rest_a_window_holds_the_end(monkeypatch: pytest.MonkeyPatch, flow_px: float, kept: int) -> None:
+    """A window of 20 s is solved every 2 s at most: the scale would be known seconds later than after a short rest."""
+    config = AgentConfig()
+    tracks = replace(config.inertial_start.corner_tracks, keyframes=100)
+    start = InertialStart(
+        CAMERA,
+        CALIBRATION,
+        replace(config, inertial_start=replace(config.inertial_start, corner_tracks=tracks)),
+        Work(),
+    )
+    monkeypatch.setattr(start._tracks, "flow_px", lambda: flow_px)
+    monkeypatch.setattr(start._tracks, "is_due", lambda _t_ns: True)
+    monkeypatch.setattr(start._tracks, "add", lambda *_: None)
+    monkeypatch.setattr(start._tracks, "follow", lambda _left: None)
+    monkeypatch.setattr(start, "_attempting", lambda *_: None)
+    monkeypatch.setattr(start, "_intervals", lambda *_: None)
+    start._tracks.keyframes = [SimpleNamespace(t_ns=250_000_000 * k) for k in range(77)]  # type: ignore[misc]
+    ctx: Any = SimpleNamespace(t_ns=19_000_000_000, images=SimpleNamespace(left=None))
+    start.add(ctx, None, 0.0)
+    assert len(start._tracks.keyframes) == kept
+
+
+SECOND = 1_000_000_000
+
+
+def kept_s(seconds: float, config: CornerTracksConfig, oldest_s: float = 0.0) -> np.ndarray[Any, Any]:
+    """Stamps of the keyframes that are left of one every 0.25 s."""
+    camera: Any = None
+    tracks = CornerTracks(camera, DetectorConfig(), config)
+    for k in range(round(4 * seconds) + 1):
+        tracks.keyframes.append(TrackedKeyframe(k * SECOND // 4, (), np.zeros(0, np.int64), np.zeros((0, 2))))
+        tracks.drop_before(round(oldest_s * SECOND))
+    return np.array([k.t_ns for k in tracks.keyframes]) / SECOND
+
+
+def test_a_long_window_keeps_every_second_of_its_old_keyframes() -> None:
+    config = CornerTracksConfig(keyframes=20)
+    np.testing.assert_array_equal(kept_s(4.0, config), np.arange(0.0, 4.01, 0.25))
+    long = kept_s(7.0, config)
+    assert len(long) == 20 and long[0] == 0.0 and long[-1] == 7.0
+    assert np.diff(long).max() == 0.5 and (np.diff(long)[-8:] == 0.25).all()
+
+
+def test_a_window_that_is_thinned_out_ends_before_its_oldest_keyframes() -> None:
+    config = CornerTracksConfig(keyframes=20)
+    longest = kept_s(30.0, config)
+    assert len(longest) == 20 and longest[-1] == 30.0 and 8.5 < np.ptp(longest) <= 9.5
+    assert np.diff(longest).max() == 0.5
+    assert kept_s(7.0, config, oldest_s=3.0)[0] == 3.0
+
+
+def test_corners_are_followed_over_a_turn_that_the_gyro_tells() -> None:
+    rng = np.random.default_rng(3)
+    image = cv2.GaussianBlur(rng.integers(0, 256, (480, 752)).astype(np.uint8), (0, 0), 2.0)
+    image = cv2.normalize(image, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)  # type: ignore[call-overload]
+    turn = se3.so3_exp(np.array([0.0, 0.2, 0.0]))  # of the camera, in a quarter of a second
+    matrix = np.array([[FOCAL, 0.0, CAMERA.cx], [0.0, FOCAL, CAMERA.cy], [0.0, 0.0, 1.0]])
+    turned = cv2.warpPerspective(image, matrix @ turn.T @ np.linalg.inv(matrix), (752, 480))
+    config = AgentConfig()
+
+    def followed(told: F64 | None) -> int:
+        tracks = CornerTracks(CAMERA, config.detector, config.inertial_start.corner_tracks)
+        tracks.add(0, build_pyramid(image, 4))
+        tracks.add(SECOND // 4, build_pyramid(np.asarray(turned, np.uint8), 4), told)
+        return len(np.intersect1d(tracks.keyframes[0].ids, tracks.keyframes[1].ids))
+
+    assert followed(turn) > 80 and followed(None) < 40
+
+
+def test_frames_between_keyframes_tell_where_corners_went() -> None:
+    config, rng = AgentConfig(), np.random.default_rng(4)
+    scene = cv2.GaussianBlur(rng.normal(128.0, 80.0, (480, 1152)), (0, 0), 2.0).clip(0.0, 255.0).astype(np.uint8)
+    frames = [build_pyramid(np.ascontiguousarray(scene[:, 20 * k : 752 + 20 * k]), 4) for k in range(13)]
+
+    def followed(frame_by_frame: bool) -> int:
+        tracks = CornerTracks(CAMERA, config.detector, config.inertial_start.corner_tracks)
+        for k, frame in enumerate(frames):
+            if frame_by_frame:
+                tracks.follow(frame)
+            if k in (0, len(frames) - 1):
+                tracks.add(k * SECOND // 20, frame)
+        return len(np.intersect1d(tracks.keyframes[0].ids, tracks.keyframes[1].ids))
+
+    assert followed(frame_by_frame=True) > 80 and followed(frame_by_frame=False) < 40
+
+
+def test_frames_that_wait_are_some_time_apart_and_lose_no_samples() -> None:
+    waiting, taken, samples = WaitingFrames(0.24), list[float](), 0
+
+    def take(found: tuple[Frame, ImuBatch | None]) -> None:
+        nonlocal samples
+        taken.append(found[0].t_ns / SECOND)
+        assert found[1] is not None
+        samples += len(found[1].t_ns)
+
+    for k in range(41):
+        t_ns = k * SECOND // 20
+        imu = ImuBatch(np.array([t_ns - 5_000_000, t_ns]), np.zeros((2, 3)), np.zeros((2, 3)))
+        waiting.add(Frame(t_ns, np.zeros((4, 4), np.uint8)), imu)
+        if k in (20, 22):
+            take(waiting.next())
+    assert taken == [0.0, 0.25] and waiting.span_s == pytest.approx(1.5)
+    while len(waiting):
+        take(waiting.next_to_track())
+    assert samples == 2 * 41 and taken[-1] == 2.0  # the newest frame is among them
+    assert min(np.diff(taken)) > 0.24 and max(np.diff(taken)) <= 0.5
+
+
+def test_frames_do_not_wait_for_ever() -> None:
+    waiting = WaitingFrames(0.24)
+    for k in range(2000):
+        t_ns = k * SECOND // 20
+        waiting.add(
+            Frame(t_ns, np.zeros((4, 4), np.uint8)), ImuBatch(np.array([t_ns]), np.zeros((1, 3)), np.zeros((1, 3)))
+        )
+        assert len(waiting) <= 64
+    frame, imu = waiting.next()
+    assert imu is not None and imu.t_ns[0] == 0 and imu.t_ns[-1] == frame.t_ns  # samples of all frames before

@@ -1,0 +1,94 @@
+"""Ground and labels of landmarks where there are no scans."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from kiteline_basestation.config import GridConfig, GroundHeightConfig
+from kiteline_basestation.grid import ground_kernels as kernels
+from kiteline_basestation.grid.ground_height import ground_heights
+from kiteline_basestation.grid.sparse_scan import GROUND, OBSTACLE, UNLABELLED, label, sparse_scan
+from kiteline_core.arrays import F64, I64
+from kiteline_core.geometry.cameras import RectifiedCamera
+from tests.basestation.flat_rooms import camera
+
+CAMERA = RectifiedCamera(640, 480, 320.0, 320.0, 319.5, 239.5, 0.1, True, np.eye(4))
+
+
+def test_ground_is_the_floor_and_neither_a_table_nor_noise_below() -> None:
+    rng = np.random.default_rng(1)
+    floor = np.column_stack([rng.uniform(0, 4, (200, 2)), rng.normal(0.0, 0.01, 200)])
+    table = np.column_stack([rng.uniform(1, 3, (500, 2)), rng.normal(0.7, 0.01, 500)])
+    noise = np.column_stack([rng.uniform(0, 4, (30, 2)), rng.uniform(-2.0, -0.2, 30)])
+    points = np.concatenate([floor, table, noise])
+    ground = ground_heights(GroundHeightConfig(), points, np.full(len(points), 1.2))
+    np.testing.assert_allclose(ground, 0.0, atol=0.06)
+
+
+def test_labels_follow_height_and_distance() -> None:
+    height = np.array([-0.5, -0.05, 0.05, 0.12, 0.12, 1.9, 2.1, np.nan])
+    distance = np.array([1.0, 1.0, 1.0, 0.0, 10.0, 1.0, 1.0, 1.0])
+    expected = [UNLABELLED, GROUND, GROUND, OBSTACLE, GROUND, OBSTACLE, UNLABELLED, UNLABELLED]
+    assert label(GridConfig(), height, distance).tolist() == expected
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.1])
+def test_landmarks_of_a_hall_make_a_scan(slope: float) -> None:
+    """A floor 1 m below the camera, a wall 5 m ahead, and before it to the left a box that is lower than the camera."""
+    rng = np.random.default_rng(0)
+    floor = np.column_stack([rng.uniform([0.5, -4], [5, 4], (500, 2)), np.full(500, -1.0)])
+    wall = np.column_stack([np.full(300, 5.0), rng.uniform(-4, 4, 300), rng.uniform(-0.8, 0.9, 300)])
+    box = np.column_stack([np.full(60, 3.0), rng.uniform(0.5, 1.5, 60), rng.uniform(-0.8, -0.6, 60)])
+    floor = floor[~((floor[:, 0] > 3.0) & (np.abs(floor[:, 1] / floor[:, 0] - 1 / 3) < 0.2))]  # hidden by the box
+    points = np.concatenate([floor, wall, box])
+    points[:, 2] += slope * points[:, 0]
+    points_k = np.column_stack([-points[:, 1], -points[:, 2], points[:, 0]])
+    made = sparse_scan(GridConfig(), CAMERA, camera(0.0, 0.0, 0.0), points_k, np.ones(len(points), bool))
+    assert made is not None
+    scan, labels = made
+    assert np.mean(labels[: len(floor)] == GROUND) > 0.97 and np.mean(labels[len(floor) :] == OBSTACLE) > 0.97
+    assert scan.camera_height_m == pytest.approx(1.0 - 0.8 * slope, abs=0.1)
+    ahead = scan.azimuths_rad
+    at_box, at_wall = np.abs(ahead - 0.32) < 0.1, np.abs(ahead + 0.4) < 0.2
+    assert scan.obstacle_m[at_wall] * np.cos(ahead[at_wall]) == pytest.approx(5.0, abs=0.2)
+    assert (scan.bands[at_wall] & 4).any()
+    assert scan.obstacle_m[at_box] * np.cos(ahead[at_box]) == pytest.approx(3.0, abs=0.2)
+    assert (scan.bands[at_box] == 1).all(), "only low"
+    assert (scan.free_m[at_wall] > 3.5).mean() > 0.8 and (scan.free_from_m[at_wall] < 2.5).mean() > 0.8
+
+
+def test_without_a_floor_there_is_no_scan() -> None:
+    rng = np.random.default_rng(0)
+    ceiling = np.column_stack([rng.uniform(-3, 3, 200), np.full(200, -1.5), rng.uniform(1, 6, 200)])
+    assert sparse_scan(GridConfig(), CAMERA, camera(0.0, 0.0, 0.0), ceiling, np.ones(200, bool)) is None
+    assert sparse_scan(GridConfig(), CAMERA, camera(0.0, 0.0, 0.0), np.full((3, 3), np.nan), np.ones(3, bool)) is None
+
+
+def ground_reference(count: F64, seed: int, seed_bin: int, reach: int, share: float, least: float) -> I64:
+    rows, columns, bins = count.shape
+    ground = {(seed // columns, seed % columns): seed_bin}
+    queue = list(ground)
+    while queue:
+        r, c = queue.pop(0)
+        for place in ((r + 1, c), (r - 1, c), (r, c + 1), (r, c - 1)):
+            if place in ground or not (0 <= place[0] < rows and 0 <= place[1] < columns):
+                continue
+            window = range(max(0, ground[r, c] - reach), min(bins - 1, ground[r, c] + reach) + 1)
+            h = count[place]
+            need = max(share * max(h[b] for b in window), least)
+            peaks = [b for b in window if h[b] >= need and (b == window[-1] or h[b] >= h[b + 1])]
+            ground[place] = peaks[0] if peaks else ground[r, c]
+            queue.append(place)
+    return np.array([[ground[r, c] for c in range(columns)] for r in range(rows)])
+
+
+@settings(max_examples=40)
+@given(st.integers(0, 2**32 - 1))
+def test_ground_spreads_as_in_the_reference(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    count = rng.integers(0, 9, (rng.integers(1, 5), rng.integers(1, 5), 20)).astype(np.float32)
+    start, start_bin, reach = int(rng.integers(count.shape[0] * count.shape[1])), int(rng.integers(20)), 3
+    ground = np.zeros(count.shape[:2], np.int32)
+    kernels.spread_ground(count, start, start_bin, reach, 0.25, 4.0, ground, np.zeros(ground.size, np.int32))
+    assert np.array_equal(ground, ground_reference(count.astype(float), start, start_bin, reach, 0.25, 4.0))

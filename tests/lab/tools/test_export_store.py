@@ -1,0 +1,150 @@
+"""Exports of a map that was made by the real mapper."""
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+
+from kiteline_basestation.intake.placements import PlacementState
+from kiteline_basestation.mapper import Mapper, MapperInput
+from kiteline_basestation.mapper_state import MapperState
+from kiteline_basestation.store.checksums import StoreError
+from kiteline_basestation.store.saved_map import SavedMap, SavedValues
+from kiteline_basestation.store.state_texts import texts_of
+from kiteline_basestation.store.store import FILE, Store, batch_of
+from kiteline_codec.schema import CameraIntrinsics, KeyframeHeader, NewLandmarks, Record, SubmapPlacement, messages
+from kiteline_core.geometry import se3
+from kiteline_core.geometry.cameras import RectifiedCamera
+from kiteline_core.ids import NO_KEYFRAME, AgentId, keyframe_id, submap_id
+from kiteline_lab.evaluation import trajectories
+from kiteline_lab.grids.files import read_grid
+from kiteline_lab.tools.export import ExportError, files, main
+
+LEVEL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # a camera that looks along x
+
+
+def records(agent: int) -> tuple[Record, ...]:
+    """Three keyframes, half a metre apart, each with its own forty points."""
+    rng = np.random.default_rng(agent)
+    camera = RectifiedCamera(640, 480, 400.0, 400.0, 320.0, 240.0, 0.1, True, np.eye(4))
+    out: list[Record] = [CameraIntrinsics(AgentId(agent), camera)]
+    submap = submap_id(agent, 1, 0)
+    parent = NO_KEYFRAME
+    for i in range(3):
+        keyframe = keyframe_id(submap, i)
+        step = se3.from_rt(LEVEL, np.zeros(3)) if i == 0 else se3.from_rt(np.eye(3), np.array([0.0, 0.0, 0.5]))
+        out.append(KeyframeHeader(keyframe, 1_700_000_000_123_456_789 + i * 10**9, parent, step, 40))
+        index = np.arange(40, dtype=np.uint16)
+        uv = rng.uniform([10, 10], [630, 470], (40, 2)).astype(np.float32)
+        depth = rng.uniform(2, 6, 40).astype(np.float32)
+        zeros = np.zeros(40, np.uint8)
+        descriptor = rng.integers(0, 256, (40, 32), dtype=np.uint8)
+        out.append(NewLandmarks(keyframe, 0, index, uv, 1 / depth, zeros, zeros, descriptor))
+        parent = keyframe
+    return tuple(out)
+
+
+@pytest.fixture
+def mapper() -> Mapper:
+    made = Mapper()
+    made.step(MapperInput(((AgentId(0), records(0)),)), 0)
+    return made
+
+
+def test_tum_is_the_trajectory_of_keyframes(mapper: Mapper, tmp_path: Path) -> None:
+    ((name, content),) = files(mapper, "tum", "a.tum").items()
+    (tmp_path / name).write_bytes(content)
+    found = trajectories.read(str(tmp_path / name)).trajectory
+    assert found.t_ns.tolist() == [1_700_000_000_123_456_789 + i * 10**9 for i in range(3)]
+    np.testing.assert_allclose(found.T_w_b[:, :3, 3], [[0, 0, 0], [0.5, 0, 0], [1.0, 0, 0]], atol=1e-8)
+
+
+def test_one_trajectory_is_of_one_agent(mapper: Mapper) -> None:
+    with pytest.raises(ExportError, match=r"agents \[0\], none with number 4"):
+        files(mapper, "tum", "a.tum", agent=4)
+    mapper.step(MapperInput(((AgentId(2), records(2)),)), 10**9)
+    mapper.placements[submap_id(2, 1, 0)] = np.eye(4)
+    with pytest.raises(ExportError, match=r"agents \[0, 2\].*--agent"):
+        files(mapper, "tum", "a.tum")
+    assert files(mapper, "tum", "a.tum", agent=2)["a.tum"].count(b"\n") == 3
+
+
+def test_graph_holds_every_keyframe_and_parent(mapper: Mapper, tmp_path: Path) -> None:
+    (tmp_path / "a.g2o").write_bytes(files(mapper, "g2o", "a.g2o")["a.g2o"])
+    graph, values = gtsam.readG2o(str(tmp_path / "a.g2o"), True)
+    assert (graph.size(), values.size()) == (2, 3)
+    assert graph.error(values) < 1e-12
+
+
+def test_ply_and_grid_are_readable(mapper: Mapper, tmp_path: Path) -> None:
+    made = files(mapper, "pgm", "plan.pgm") | files(mapper, "ply", "a.ply")
+    assert sorted(made) == ["a.ply", "plan.pgm", "plan.yaml"]
+    assert b"image: plan.pgm\n" in made["plan.yaml"]  # no quotes, which simple readers keep
+    for name, content in made.items():
+        (tmp_path / name).write_bytes(content)
+    assert read_grid(tmp_path / "plan.yaml").cell_m == mapper.config.grid.cell_m
+    assert b"element vertex 0\n" in made["a.ply"]  # each landmark has one observation
+
+
+def test_command_reads_a_store(mapper: Mapper, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    codes = {messages.key(r): messages.encode(r) for r in records(0)}
+    placed = SubmapPlacement(submap_id(0, 1, 0), np.eye(4))
+    own = {messages.key(placed): messages.encode(placed)}
+    state = MapperState(placements=PlacementState({submap_id(0, 1, 0): np.eye(4)}))
+    store = Store(tmp_path)
+    store.write(batch_of(SavedMap({AgentId(0): SavedValues(codes, own)}, texts_of(state)), SavedMap()))
+    store.close()
+    assert main([str(tmp_path), "--format", "tum", "--out", str(tmp_path / "new" / "a.tum")]) == 0
+    assert capsys.readouterr().out.strip() == str(tmp_path / "new" / "a.tum")
+    found = trajectories.read(str(tmp_path / "new" / "a.tum")).trajectory.T_w_b[:, :3, 3]
+    np.testing.assert_allclose(found, [[0, 0, 0], [0.5, 0, 0], [1.0, 0, 0]], atol=2e-3)  # as coarse as codes are
+    assert main([str(tmp_path / FILE), "--format", "pgm", "--out", str(tmp_path / "plan.pgm")]) == 0
+    assert read_grid(tmp_path / "plan.yaml").cell_m > 0
+
+
+@pytest.mark.parametrize(
+    "name", ["my plan.pgm", "a: b #c.pgm", "two\nlines.pgm", "-.pgm", "Höhe.pgm", "\udcff.pgm", "no suffix"]
+)
+def test_a_picture_of_any_name_is_found_again(name: str, mapper: Mapper, tmp_path: Path) -> None:
+    for file, content in files(mapper, "pgm", name).items():
+        (tmp_path / file).write_bytes(content)
+    assert read_grid((tmp_path / name).with_suffix(".yaml")).cell_m > 0
+    with pytest.raises(ExportError, match=r"ends in \.pgm"):
+        files(mapper, "pgm", "plan.yaml")
+
+
+def test_what_no_disk_takes_leaves_the_file_as_it_was(
+    mapper: Mapper, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = Store(tmp_path)
+    store.write(batch_of(SavedMap({AgentId(0): SavedValues({}, {})}, texts_of(MapperState())), SavedMap()))
+    store.close()
+    out = tmp_path / "out" / "map.ply"
+    assert main([str(tmp_path), "--format", "ply", "--out", str(out)]) == 0
+    before = out.read_bytes()
+    out.write_bytes(b"older")
+
+    def full(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "fsync", full)
+        with pytest.raises(OSError, match="No space"):
+            main([str(tmp_path), "--format", "ply", "--out", str(out)])
+    assert [(path.name, path.read_bytes()) for path in out.parent.iterdir()] == [("map.ply", b"older")]
+    os.mkfifo(pipe := tmp_path / "pipe")
+    with ThreadPoolExecutor(1) as pool:
+        read = pool.submit(pipe.read_bytes)
+        assert main([str(tmp_path), "--format", "ply", "--out", str(pipe)]) == 0
+        assert read.result(10) == before
+
+
+def test_files_that_are_no_store_are_named(tmp_path: Path) -> None:
+    (tmp_path / "wrong").write_bytes(b"hello")
+    for store in ("wrong", "missing"):
+        with pytest.raises(StoreError, match=store):
+            main([str(tmp_path / store), "--format", "ply", "--out", str(tmp_path / "a.ply")])
+    assert not (tmp_path / "a.ply").exists()
