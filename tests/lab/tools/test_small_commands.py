@@ -8,7 +8,7 @@ import pytest
 from kiteline_codec.transport.seal import fingerprint
 from kiteline_core.ids import MAX_AGENTS
 from kiteline_hw.ports import LinkError
-from kiteline_hw.system.key_store import new_key, read_file
+from kiteline_hw.system.key_store import MAPS, new_key, read_file
 from kiteline_lab.tools import keys, maps
 
 
@@ -31,7 +31,7 @@ def test_keys_are_shown_as_fingerprints_and_on_demand_as_lines_of_the_file(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = tmp_path / "keys"
-    for agent in ("7", keys.MAPS):
+    for agent in ("7", MAPS):
         assert keys.main(["--file", str(file), "new", agent]) == 0
         capsys.readouterr()
         held = read_file(file)
@@ -41,8 +41,8 @@ def test_keys_are_shown_as_fingerprints_and_on_demand_as_lines_of_the_file(
         assert [line.split("  ")[1] for line in shown] == [fingerprint(key) for key in named.values()]
         assert not any(key.hex() in "".join(shown) for key in named.values())
     assert held.maps is not None
-    assert keys.main(["--file", str(file), "show", "--secret", keys.MAPS]) == 0
-    assert capsys.readouterr().out == f"{keys.MAPS} {held.maps.hex()}\n"
+    assert keys.main(["--file", str(file), "show", "--secret", MAPS]) == 0
+    assert capsys.readouterr().out == f"{MAPS} {held.maps.hex()}\n"
     with pytest.raises(SystemExit):
         keys.main(["--file", str(file), "show", "--secret", "8"])
     assert "agent 8 has no key" in capsys.readouterr().err
