@@ -180,12 +180,14 @@ def indoors(bench: Bench) -> list[Experiment]:
     """Somebody else's room along a real trajectory, 440 stereo pairs.
 
     Its path comes back once: from 13.5 to 15 s it sees what it saw from 10.3 to 12 s, from within 0.6 m and 20 degrees.
+    A robot that is carried to where it sees what it knows goes on in its map. So that a loss breaks a flight, it wakes
+    where it has never looked, and comes to 20 frames of the map before.
     """
     room = f"mcap:{bench.source('room_flight.mcap')}"
     return [
-        Experiment("room, one robot, a loss", PIONEER, broken(room, [(0.0, 12.0), (13.5, 22.1)]), maps=2),
-        Experiment("room, one robot, carried back twice unseeing", PIONEER,
-                   broken(room, [(0.0, 8.0), (6.0, 15.0), (13.0, 22.1)]), maps=2),
+        Experiment("room, one robot, a loss", PIONEER, broken(room, [(9.0, 17.0), (3.5, 10.0)]), maps=2),
+        Experiment("room, one robot, two losses", PIONEER,
+                   broken(room, [(9.0, 16.0), (4.0, 10.0), (0.0, 5.0)]), maps=3),
         Experiment("room, two robots", SEQUENCE_03, robots(room, 20.0, overlapping(440, 2)), 1),
         Experiment("room, three robots", SEQUENCE_07, robots(room, 20.0, overlapping(440, 3)), 2),
         Experiment("room, two robots, no shared frame", SEQUENCE_05, robots(room, 20.0, [(0, 240), (270, 440)]), 1),
