@@ -27,6 +27,7 @@ from kiteline_bench.papers.several_maps.several_maps import (
     overlapping,
     own,
     robots,
+    run,
 )
 from kiteline_bench.papers.throttled import MODES, NO_ERRORS, Errors, Throttled, paper_errors
 from kiteline_core.arrays import F64
@@ -195,6 +196,18 @@ def test_the_thesis_cuts_its_own_sequences(tmp_path: Path) -> None:
 def test_other_sequences_are_not_the_thesis_s(data_dir: Path) -> None:
     with pytest.raises(SourceError, match="none of the thesis's sequences"):
         own(data_dir)
+
+
+def test_sequences_that_are_cut_short_or_broken_are_bars_that_are_not_met(
+    tmp_path: Path, data_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """51 of KITTI 03's 801 frames leave the second robot without any; of 05 there is nothing but a folder."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "sequences" / "05" / "image_0").mkdir(parents=True)
+    (tmp_path / "sequences" / "05" / "calib.txt").write_text("")
+    (tmp_path / "sequences" / "03").symlink_to(data_dir / "kitti_straight")
+    met = {bar.name: bar.met for bar in run(Bench(tmp_path, tmp_path, lambda _: None, sequences=tmp_path))}
+    assert met["KITTI 05: flown"] is False and met["KITTI 03: merges"] is False
 
 
 def test_a_short_name_is_no_other_sequence() -> None:
