@@ -214,7 +214,7 @@ class Agent:
             # By images: what a fused pose differs by is in all pixels alike, and would move all depths together.
             self._depth.update_landmarks(ctx, by_images)
             self._depth.search_seeds(ctx, track)
-            if self.right_camera is not None:
+            if self.right_camera is not None and self._effort.first == 0:  # half an image hardly tells the offset
                 T_o_m = camera.pose.T_o_m
                 moved, said = self.right_camera.add(ctx.t_ns, track)
                 events += said

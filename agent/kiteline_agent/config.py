@@ -261,7 +261,7 @@ class GovernorConfig:
     down_s: float = 0.25  # s between two falls: the expected costs need time to follow the first one
     up_s: float = 1.5  # s of low load before a rise
     max_gap_s: float = 0.35  # s between tracked frames; after more, tracking often fails
-    carried_gap_s: float = 0.8  # s: the same with an IMU, whose prediction counts as tracking for 1 s
+    carried_gap_s: float = 1.0  # s: the same with an IMU, whose prediction counts as tracking for as long
     blind_s: float = 1.0  # s without a tracked frame, after which one is tracked whatever it costs
     doubt: float = 0.15  # relative error of the expected cost of a frame, at least: a pair for the disparity offset
     first_frame_ms: float = 3.5  # ms: expected cost of a tracked frame at full effort at the start: 752x480 on a laptop

@@ -11,7 +11,9 @@ import pytest
 
 from kiteline_bench.harness.bars import Bar, Bench, FlightFailed
 from kiteline_bench.harness.result import FlownProcesses
+from kiteline_bench.papers import simulated_vehicle as vehicle
 from kiteline_bench.papers.ds_ptam import PERCENTS, _unless_failed, table, throttled_bars
+from kiteline_bench.papers.initialisation import bound
 from kiteline_bench.papers.segfloor.scenes import Scene, corridor_1, corridor_2, synthetic, trajectory
 from kiteline_bench.papers.sequences import _ORB_SLAM2, DataSequence, SequenceResult, find_sequences, sequence_bars
 from kiteline_bench.papers.several_maps.several_maps import (
@@ -25,8 +27,10 @@ from kiteline_bench.papers.several_maps.several_maps import (
     overlapping,
     own,
     robots,
+    run,
 )
 from kiteline_bench.papers.throttled import MODES, NO_ERRORS, Errors, Throttled, paper_errors
+from kiteline_core.arrays import F64
 from kiteline_core.frame import Trajectory
 from kiteline_core.geometry import se3
 from kiteline_hw.ports import SourceError
@@ -194,6 +198,18 @@ def test_other_sequences_are_not_the_thesis_s(data_dir: Path) -> None:
         own(data_dir)
 
 
+def test_sequences_that_are_cut_short_or_broken_are_bars_that_are_not_met(
+    tmp_path: Path, data_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """51 of KITTI 03's 801 frames leave the second robot without any; of 05 there is nothing but a folder."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "sequences" / "05" / "image_0").mkdir(parents=True)
+    (tmp_path / "sequences" / "05" / "calib.txt").write_text("")
+    (tmp_path / "sequences" / "03").symlink_to(data_dir / "kitti_straight")
+    met = {bar.name: bar.met for bar in run(Bench(tmp_path, tmp_path, lambda _: None, sequences=tmp_path))}
+    assert met["KITTI 05: flown"] is False and met["KITTI 03: merges"] is False
+
+
 def test_a_short_name_is_no_other_sequence() -> None:
     assert DataSequence("KITTI", "straight", "").printed_m(_ORB_SLAM2) is None
 
@@ -227,3 +243,27 @@ def test_areas_and_ways_are_those_of_the_thesis(
     assert np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum() == pytest.approx(way_m, rel=0.03)
     assert np.allclose(poses[:, 2, 3], scene.camera_m)
     assert np.allclose(-poses[:, 2, 2], np.sin(scene.tilt_rad))  # it looks down by the tilt
+
+
+@pytest.mark.parametrize("planar", [True, False])
+def test_the_bound_of_known_poses_is_reached_by_least_squares_and_odometry_makes_it_larger(planar: bool) -> None:
+    model, rng = vehicle.VehicleModel(planar), np.random.default_rng(3)
+    T_o_c = vehicle.loop(planar)[:26] @ vehicle.camera().T_b_c
+    point, sigma = T_o_c[0, :3, :3] @ np.array([1.0, -0.5, 7.0]) + T_o_c[0, :3, 3], 0.002
+    known = bound(model, T_o_c, point, sigma, odometry=False)
+
+    def residual(at: F64, xy: F64) -> F64:
+        local = np.einsum("kji,kj->ki", T_o_c[:, :3, :3], at - T_o_c[:, :3, 3])
+        return np.asarray((local[:, :2] / local[:, 2:] - xy).ravel())
+
+    exact = residual(point, np.zeros((len(T_o_c), 2))).reshape(-1, 2)
+    errors = []
+    for _ in range(400):
+        xy, at = exact + sigma * rng.standard_normal(exact.shape), point.copy()
+        for _ in range(4):
+            J = np.stack([residual(at + 1e-6 * axis, xy) - residual(at, xy) for axis in np.eye(3)], axis=1) / 1e-6
+            at -= np.linalg.lstsq(J, residual(at, xy), rcond=None)[0]
+        errors.append(at - point)
+    assert np.trace(np.cov(np.array(errors).T)) == pytest.approx(np.trace(known), rel=0.25)
+    told = bound(model, T_o_c, point, sigma, odometry=True)
+    assert (np.linalg.eigvalsh(told - known) > -1e-12).all() and np.trace(told) > 2.0 * np.trace(known)

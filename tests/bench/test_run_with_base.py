@@ -53,3 +53,16 @@ def test_parts_follow_one_another_and_dark_ones_show_nothing(data_dir: Path) -> 
     assert np.allclose(first, again), "the same place again"
     assert [k for k, e in enumerate(out.found) if not e.inliers][1:] == [10, 11, 12, 13]
     assert not out.bytes_up and not out.bytes_down
+
+
+def test_a_base_goes_on_after_the_last_frame_until_it_has_nothing_left_to_do(data_dir: Path) -> None:
+    steps, at_last_frame = [], []
+    scenarios = [Scenario(str(data_dir / "room_flight.mcap"), parts=(Part(0.0, 2.0),))]
+
+    def note(run: JointRun) -> None:
+        at_last_frame.append(len(run.agents[0].found))
+        real = run.station.step
+        run.station.step = lambda *given: steps.append(given[2]) or real(*given)  # type: ignore[method-assign,func-returns-value]
+
+    fly_with_base(scenarios, at_end=note)
+    assert at_last_frame == [40] and len(steps) * TICK_NS >= 5_000_000_000

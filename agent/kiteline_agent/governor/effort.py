@@ -24,8 +24,8 @@ class Effort:
 FULL = Effort(1.00, 1.00, 1.0, 1, 0, 1.0, 1.0, 1, 1.00, 1.00)
 CARRIED = (
     FULL,
-    Effort(1.00, 1.00, 1.0, 1, 0, 1.0, 1.0, 8, 1.00, 1.00),
-    Effort(0.65, 0.65, 0.5, 0, 1, 1.4, 0.5, 8, 0.81, 0.60),
+    Effort(1.00, 1.00, 1.0, 1, 0, 1.0, 1.0, 16, 1.00, 1.00),
+    Effort(0.65, 0.65, 0.5, 0, 1, 1.0, 0.5, 8, 0.81, 0.60),
 )  # with an IMU, which bridges skipped frames: skipping costs little accuracy
 ALONE = (
     FULL,

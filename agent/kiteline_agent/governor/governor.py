@@ -30,6 +30,7 @@ _FIRST_LONGER = 2.5  # the same between the first two frames; a longer gap is du
 _GUESS = {Extra.KEYFRAME: 1.7, Extra.SEARCH: 3.5, Extra.SUBMAP: 3.0, Extra.SCAN: 0.5}  # at first, in full frames
 _OUTLIER = 1.5  # cost of a frame, in usual frames, above which it is clipped
 _SPREAD = 2.0  # mean deviations that cover nine of ten frames
+_ALONE = 1.1  # times the expected cost of a keyframe and its frame, which a window must have room for
 _LEAST = 0.1  # least share of the budget for frames
 _LEARNING, _KEYFRAME_LEARNING = 0.15, 0.4  # gains of the expected cost of frames and rate of keyframes
 _FIRST_KEYFRAMES_S, _FIRST_PERIOD_S = 2.0, 0.05  # expected at the start: keyframes a second, s between frames
@@ -254,8 +255,8 @@ class Governor:
         return self._window_ns + cost_ns <= self._config.margin * self._budget_ns
 
     def _gap_exceeds(self, t_ns: int, gap_s: float) -> bool:
-        """True if skipping this frame makes the time since the last tracked one exceed gap_s."""
-        return t_ns + self._period_ns - self._tracked_t_ns > gap_s * 1e9
+        """True at the frame that is next to gap_s after the last tracked one, and at all later ones."""
+        return t_ns + 0.5 * self._period_ns - self._tracked_t_ns > gap_s * 1e9
 
     def _room_for(self, extra: Extra, factor: float) -> bool:
         """True if a frame with an extra fits, at `factor` times the expected cost.
@@ -288,8 +289,8 @@ class Governor:
         return lost or self._due >= 1.0 - 1e-6
 
     def _share(self) -> float:
-        """Share of frames to track: as the budget allows, but no more than on the next better row."""
-        most = 1.0 / self._every(max(self.level - 1, 0))
+        """Share of frames to track: as the budget allows, but no more than on the next better row, or its own."""
+        most = 1.0 / min(self._every(max(self.level - 1, 0)), self._every(self.level))
         all_frames = self._frames(self.level) * self._every(self.level)
         if all_frames <= 0.0:
             return most
@@ -304,19 +305,35 @@ class Governor:
 
     def _frames(self, level: int) -> float:
         """Share of the budget for the tracked frames of a row, without keyframes."""
-        row, now = self._ladder[level], self._row
-        frame_ns = self._frame_ns * row.frame_cost / now.frame_cost
-        return frame_ns / self._every(level) * self._config.window_s * 1e9 / self._period_ns / self._budget_ns
+        frames = self._config.window_s * 1e9 / self._period_ns / self._every(level)
+        return frames * self._row_frame_ns(level) / self._budget_ns
+
+    def _row_frame_ns(self, level: int) -> float:
+        """Expected cost of a tracked frame of a row."""
+        return self._frame_ns * self._ladder[level].frame_cost / self._row.frame_cost
 
     def _load(self, level: int) -> float:
-        """Expected load of a row, as a share of the budget: frames, keyframes (at least one), skipped frames."""
+        """Expected load of a row, as a share of the budget: frames, keyframes, skipped frames.
+
+        Where frames may be as far apart as a window, a keyframe waits for one that has room. A row whose keyframes
+        have none is overloaded, and so is one with more keyframes than every second window, if no other frame has room
+        beside a keyframe. Otherwise any window has to hold a keyframe.
+        """
         if not self._frame_ns:
             return 0.0
-        row, now = self._ladder[level], self._row
-        keyframes = max(self._keyframes_s * self._config.window_s * now.keyframes / row.keyframes, 1.0)
+        config, row, now = self._config, self._ladder[level], self._row
+        waits = self._gap_s >= config.window_s
+        keyframes = self._keyframes_s * config.window_s * now.keyframes / row.keyframes
         keyframe_ns = self._extra_ns[Extra.KEYFRAME] * row.keyframe_cost / now.keyframe_cost
-        idle_ns = self._idle_ns * (1.0 - 1.0 / self._every(level)) * self._config.window_s * 1e9 / self._period_ns
-        return self._frames(level) + (keyframes * keyframe_ns + idle_ns) / self._budget_ns
+        idle_ns = self._idle_ns * (1.0 - 1.0 / self._every(level)) * config.window_s * 1e9 / self._period_ns
+        load = self._frames(level) + (max(keyframes, 0.0 if waits else 1.0) * keyframe_ns + idle_ns) / self._budget_ns
+        frame_ns = self._row_frame_ns(level)
+        alone = (idle_ns + _ALONE * (frame_ns + keyframe_ns)) / self._budget_ns
+        if waits and alone > 1.0:
+            return max(load, alone)
+        if waits and alone + frame_ns / self._budget_ns > 1.0:
+            return max(load, 2.0 * keyframes)
+        return load
 
     def _choose_row(self, t_ns: int, ladder: tuple[Effort, ...]) -> None:
         """Choose the row with hysteresis: lower effort at once, higher after a calm period and one row at a time."""
@@ -335,7 +352,7 @@ class Governor:
                 return
         if self.level == 0 or self._load(self.level - 1) > config.comfort:
             self._calm_since_ns = t_ns
-        elif t_ns - self._calm_since_ns >= config.up_s * 1e9:
+        elif self._waiting is None and t_ns - self._calm_since_ns >= config.up_s * 1e9:
             self._set_level(t_ns, self.level - 1)
 
     def _best_affordable(self, best: int) -> int:

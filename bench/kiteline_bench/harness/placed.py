@@ -46,6 +46,8 @@ class KeyframesInWorld:
         T_b_c = Rectifier(source.rig).camera.T_b_c
         source.close()
         run, mapper = self.agent(agent), self.flight.station.mapper
+        if not run.found:
+            return {}
         truth = {t: T for t, T in zip(run.t_ns, run.truth, strict=True) if T is not None}
         boot = run.found[0].submap >> SUBMAP_BITS
         pairs: dict[int, list[tuple[F64, F64]]] = {}

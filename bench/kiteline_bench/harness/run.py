@@ -24,6 +24,7 @@ from kiteline_hw.sources.open import open_source
 from kiteline_hw.system.vocabulary import shipped_vocabulary
 
 TICK_NS = 50_000_000  # of flights with a base
+_QUIET_S = 5.0  # without a job, after which a base is done: it adjusts a merged map after seconds
 
 
 class FlyingAgent:
@@ -202,8 +203,12 @@ def fly_with_base(
     base: BaseConfig | None = None,
     bytes_s: tuple[int, int] = (0, 0),
     profile: str = "wifi",
+    at_end: Callable[[JointRun], None] | None = None,
 ) -> JointRun:
-    """Fly in lock-step until the last scenario is over; packets arrive one tick later. bytes_s: budget up and down."""
+    """Fly in lock-step until the last scenario is over; packets arrive one tick later. bytes_s: budget up and down.
+
+    at_end: called when the last frame came. With it the base then goes on until it has begun no job for _QUIET_S.
+    """
     station = Station(base or BaseConfig(), lambda _: coded_channel(1, bytes_s[1], profile), shipped_vocabulary())
     jobs = LockstepJobs()
     starts = [_Start(scenario, agent, bytes_s[0], profile) for scenario in scenarios]
@@ -221,7 +226,16 @@ def fly_with_base(
         up, down = {}, dict(output.packets)
         now_ns += TICK_NS
     station.step({}, jobs.done(now_ns), now_ns)
-    return JointRun(scenarios, [start.flying.run for start in starts], station)
+    flown = JointRun(scenarios, [start.flying.run for start in starts], station)
+    if at_end is not None:
+        at_end(flown)
+        busy_ns = now_ns
+        while now_ns - busy_ns < _QUIET_S * 1e9:
+            now_ns += TICK_NS
+            output = station.step({}, jobs.done(now_ns), now_ns)
+            jobs.add(output.jobs, now_ns)
+            busy_ns = busy_ns if jobs.idle else now_ns
+    return flown
 
 
 class _Start:

@@ -1,6 +1,7 @@
 """A landmark's position by its rays against 100 particles along the first one, at the same instant.
 
-Where odometry tells the poses, rays and poses correct each other, as in the filter when it lets a landmark in.
+Where odometry tells the poses, rays and poses correct each other, as in the filter when it lets a landmark in. Beside
+both stands the Cramer-Rao bound of these observations, which no unbiased estimator of the landmark is below.
 """
 
 import time
@@ -21,6 +22,7 @@ from kiteline_core.geometry import se3
 PARTICLES = 100
 _DRAWS = 300
 _REPEATS = 20  # of each position while CPU time is taken: one call is shorter than the clock is fine
+_NORMALS = 500  # draws of an error with a given covariance
 _STEP_M = 0.1
 _LEAST_PARALLAX = 0.05  # rad, as the filter wants it
 
@@ -40,11 +42,15 @@ class Setting:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """Mean errors in m, and CPU in us of one position with poses that are taken as known."""
+    """Mean errors in m, and CPU in us of one position with poses that are taken as known.
+
+    bound_m: mean error of an estimator that reaches the Cramer-Rao bound.
+    """
 
     setting: Setting
     rays_m: float
     particles_m: float
+    bound_m: float
     rays_us: float
     particles_us: float
 
@@ -54,7 +60,8 @@ def compare(setting: Setting) -> Outcome:
     rng, cam = np.random.default_rng(0), vehicle.camera()
     model = vehicle.VehicleModel(setting.planar)
     poses, sigma = vehicle.loop(setting.planar), model.sigma_px / cam.fx
-    errors, cpu = np.zeros((_DRAWS, 2)), np.zeros(2)
+    errors, cpu = np.zeros((_DRAWS, 3)), np.zeros(2)
+    unit = np.random.default_rng(1).standard_normal((_NORMALS, 3))
     rays, particles = np.empty(3), np.empty(3)
     for n in range(_DRAWS):
         true, told, motions = _way(setting, model, poses, rng)
@@ -72,10 +79,38 @@ def compare(setting: Setting) -> Outcome:
         if found and setting.odometry:
             found = _enters(motions, xy, sigma, rays)
         # A position that the rays refuse is no landmark; the particles are spared there, too.
-        errors[n] = [np.linalg.norm(at - point) for at in (rays, particles)] if found else np.nan
+        errors[n] = np.nan
+        if found:
+            least = unit @ np.linalg.cholesky(bound(model, true, point, sigma, odometry=setting.odometry)).T
+            errors[n] = [np.linalg.norm(at, axis=-1).mean() for at in (rays - point, particles - point, least)]
     mean = np.nanmean(errors, axis=0)
     us = cpu * 1e-3 / (_DRAWS * _REPEATS)
-    return Outcome(setting, float(mean[0]), float(mean[1]), float(us[0]), float(us[1]))
+    return Outcome(setting, float(mean[0]), float(mean[1]), float(mean[2]), float(us[0]), float(us[1]))
+
+
+def bound(model: vehicle.VehicleModel, T_o_c: F64, point: F64, sigma: float, *, odometry: bool) -> F64:
+    """Cramer-Rao bound (3,3) in m^2 of a point (3,) seen from cameras T_o_c (n,4,4) with a deviation sigma.
+
+    odometry: the poses after the first one are known by the odometry of the model, else exactly.
+    """
+    n = len(T_o_c)
+    local = np.einsum("kji,kj->ki", T_o_c[:, :3, :3], point - T_o_c[:, :3, 3])
+    of_local = np.zeros((n, 2, 3))  # derivatives of x/z, y/z
+    of_local[:, 0, 0] = of_local[:, 1, 1] = 1.0 / local[:, 2]
+    of_local[:, :, 2] = -local[:, :2] / local[:, 2:] ** 2
+    of_point = of_local @ T_o_c[:, :3, :3].transpose(0, 2, 1)
+    noise = sigma**2 * np.eye(2 * n)
+    if odometry:
+        T_o_b = T_o_c @ se3.inverse(vehicle.camera().T_b_c)
+        for k in range(1, n):  # the error of a motion moves all later cameras beside the point
+            way = float(np.linalg.norm(T_o_b[k, :3, 3] - T_o_b[k - 1, :3, 3]))
+            moved = np.concatenate([T_o_b[k - 1, :3, :3], se3.skew(point - T_o_b[k, :3, 3]) @ T_o_b[k, :3, :3]], axis=1)
+            of_motion = np.zeros((n, 2, 6))
+            of_motion[k:] = of_point[k:] @ moved
+            flat = of_motion.reshape(2 * n, 6)
+            noise += flat @ vehicle.odometry_covariance(model, way) @ flat.T
+    A = of_point.reshape(2 * n, 3)
+    return np.asarray(np.linalg.inv(A.T @ np.linalg.solve(noise, A)))
 
 
 def _way(

@@ -108,15 +108,20 @@ def odometry(
     """Body motion (4,4) that the odometry tells, and the camera's with its covariance. scale: true over told."""
     true = se3.inverse(before) @ after
     way = float(np.linalg.norm(true[:3, 3]))
-    axes = np.array([1.0, 1.0, 0.0] if model.planar else [1.0, 1.0, 1.0])
-    turn_axes = np.array([0.0, 0.0, 1.0] if model.planar else [1.0, 1.0, 1.0])
-    cov = np.diag(np.concatenate([model.path_noise**2 * way * axes, model.turn_noise**2 * way * turn_axes]))
+    cov = odometry_covariance(model, way)
     error = np.sqrt(np.diagonal(cov)) * rng.standard_normal(6)
     told = np.eye(4)
     told[:3, :3] = true[:3, :3] @ se3.so3_exp(error[3:] + model.turn_bias * way * np.array([0.0, 0.0, 1.0]))
     slips = model.slip > 0.0 and (k * _STEP_M) % 6.0 < 1.0
     told[:3, 3] = (true[:3, 3] / scale + error[:3]) * (1.0 + model.slip if slips else 1.0)
     return told, camera_motion(told, cov, T_b_c)
+
+
+def odometry_covariance(model: VehicleModel, way_m: float) -> F64:
+    """Covariance (6,6) of what odometry tells of a motion: translation in m and rotation in rad, in the body."""
+    axes = np.array([1.0, 1.0, 0.0] if model.planar else [1.0, 1.0, 1.0])
+    turn_axes = np.array([0.0, 0.0, 1.0] if model.planar else [1.0, 1.0, 1.0])
+    return np.diag(np.concatenate([model.path_noise**2 * way_m * axes, model.turn_noise**2 * way_m * turn_axes]))
 
 
 def _observations(

@@ -7,6 +7,7 @@ from pathlib import Path
 from kiteline_hw.calibration.file_calibration import FileCalibration
 from kiteline_hw.calibration.files import read_calibration
 from kiteline_hw.ports import FrameSource, SourceError, is_live
+from kiteline_hw.sensors.odometry_file import with_odometry_file
 from kiteline_hw.sources import kinds
 from kiteline_hw.sources.bags.bag_heads import MCAP_MAGIC, SQLITE_MAGIC, refuse_unreadable
 from kiteline_hw.sources.kinds import SourceKind
@@ -37,12 +38,18 @@ def open_source(
             raise SourceError(f"{path}: expected a folder with the layout of {kind.scheme}")
         argument = str(path)
     opener: Callable[..., FrameSource] = import_module(kind.module).open_source
-    if not calibration:
-        return opener(argument, mono, imu)
-    given = read_calibration(calibration) if isinstance(calibration, str) else calibration
-    source = opener(argument, mono, imu, given) if kind.given and given.cameras else opener(argument, mono, imu)
-    # a camera has nothing of its own that the given calibration is put over
-    return with_calibration(source, given) if given.known and not is_live(source) else source
+    given = read_calibration(calibration) if isinstance(calibration, str) and calibration else calibration
+    if isinstance(given, str):
+        source = opener(argument, mono, imu)
+    else:
+        source = opener(argument, mono, imu, given) if kind.given and given.cameras else opener(argument, mono, imu)
+        # a camera has nothing of its own that the given calibration is put over
+        source = with_calibration(source, given) if given.known and not is_live(source) else source
+    if kind.argument == "DIR":
+        return with_odometry_file(source, Path(argument))
+    if kind.scheme == "images":
+        return with_odometry_file(source, *home_path(argument.split(",")[0]).parents[:2])
+    return source
 
 
 def recognise(spec: str) -> SourceKind:

@@ -13,6 +13,7 @@ from pathlib import Path
 from mcap.writer import CompressionType, Writer
 
 from kiteline_hw.logs.mcap_file import McapFile, RawMessage
+from kiteline_hw.logs.mcap_repair import REPAIRED
 from kiteline_hw.ports import SourceError
 from kiteline_lab.flights.out_file import whole_file
 
@@ -182,7 +183,10 @@ def _prefixes(files: list[McapFile]) -> list[str]:
 
 
 def _write(path: Path, files: list[McapFile], messages: Iterable[tuple[int, RawMessage]], prefixes: list[str]) -> int:
-    """Write messages (number of file, message); returns the count. Equal channels of several files become one."""
+    """Write messages (number of file, message); returns the count. Equal channels of several files become one.
+
+    What is taken from a cut file says so in its metadata, as a repaired log does: its last step may be incomplete.
+    """
     written = 0
     schemas: dict[tuple[str, str, bytes], int] = {}
     channels: dict[tuple[str, str, int, str], int] = {}
@@ -192,8 +196,9 @@ def _write(path: Path, files: list[McapFile], messages: Iterable[tuple[int, RawM
             writer = Writer(stream, compression=CompressionType.ZSTD)
             writer.start("", "kiteline")
             for file in files:
+                damage = {} if file.cut is None else {REPAIRED: file.cut}
                 for record in file.metadata:
-                    writer.add_metadata(record.name, record.metadata)
+                    writer.add_metadata(record.name, {**record.metadata, **damage})
             for number, m in messages:
                 target = known.get((number, m.channel))
                 if target is None:

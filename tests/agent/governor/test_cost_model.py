@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from kiteline_agent.agent import Agent
-from kiteline_agent.config import AgentConfig
+from kiteline_agent.config import AgentConfig, GovernorConfig
 from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_agent.governor.cost_model import PRICES_NS, Work, cost_ns
 from kiteline_agent.governor.effort import CARRIED, FULL, governed
@@ -16,6 +16,7 @@ from kiteline_core.frame import Frame
 from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId
 from kiteline_hw.sources.open import open_source
 from kiteline_hw.system.vocabulary import shipped_vocabulary
+from tests.agent.room_flight import RoomFlight
 
 
 def costs_of(path: Path, config: AgentConfig, frames: int = 12) -> tuple[list[int], list[Work], list[bool]]:
@@ -110,3 +111,20 @@ def test_newest_frame_wins_on_a_busy_core() -> None:
     assert core.free_ns == 80_000_000
     assert core.newest_wins(10_000_000, 50_000_000) and not core.newest_wins(50_000_000, 50_000_000)
     assert not VirtualCpu(0.0).newest_wins(0, 50_000_000)
+
+
+def test_halved_images_are_not_compared_for_the_disparity_offset(room_flight: RoomFlight) -> None:
+    """They hardly tell it, and a comparison costs a sixth of such a frame."""
+    pairs = {}
+    for percent in (0.0, 1.0):
+        config = AgentConfig(governor=GovernorConfig(cpu_percent=percent))
+        agent = Agent(room_flight.rig, None, config, Identity(AgentId(0), 0), NoBaseChannel())
+        cost, found, halved = 0, 0, 0
+        for frame in room_flight.first(4.0).frames:
+            agent.step(StepInput(frame, cpu_ns=cost), frame.t_ns)
+            cost = cost_ns(agent.work)
+            found += agent.work.pairs
+            halved += agent.work.frames if agent._effort.first else 0
+        pairs[percent] = found
+        assert percent == 0.0 or halved > 5
+    assert pairs[0.0] > 5 and pairs[1.0] == 0

@@ -101,7 +101,7 @@ def test_images_alone_keep_room_for_keyframes_that_come_early() -> None:
 
 @pytest.mark.parametrize("carried", [True, False])
 def test_frames_are_let_through_evenly(carried: bool) -> None:
-    flight = Flight(0.25 * LOAD, carried=carried).fly(600)
+    flight = Flight(0.25 * LOAD, every_s=1.0, carried=carried).fly(600)
     skips = [len(run) for run in "".join("x" if t else "." for t in flight.tracked[60:]).split("x")][1:-1]
     assert max(skips) <= 8 and max(skips) - min(skips) <= 6
 
@@ -191,7 +191,7 @@ def test_a_new_map_does_not_wait_for_ever_behind_the_search_for_the_old_one(perc
 @pytest.mark.parametrize("ladder", [CARRIED, ALONE])
 def test_ladder_leads_down(ladder: tuple[Effort, ...]) -> None:
     config = AgentConfig()
-    costs = [row.frame_cost / row.every for row in ladder]
+    costs = [(row.frame_cost + row.keyframe_cost, row.frame_cost / row.every) for row in ladder]
     assert costs == sorted(costs, reverse=True) and len(set(costs)) == len(costs)
     assert ladder[0] == FULL and governed(config, FULL) == config
     for row in ladder:
@@ -206,6 +206,21 @@ def test_effort_scales_what_the_user_has_chosen() -> None:
     assert governed(chosen, FULL).align.points == 120
     assert governed(chosen, CARRIED[-1]).align.points == round(120 * CARRIED[-1].points)
     assert governed(chosen, FULL).align.fine_from == 0
+
+
+@pytest.mark.parametrize(("every_s", "first"), [(3.0, 0), (1.0, 1)])
+def test_at_an_eighth_images_are_halved_only_where_keyframes_are_frequent(every_s: float, first: int) -> None:
+    """A whole keyframe takes most of a second's budget, so that only every second one has room for one."""
+    flight = Flight(0.12 * LOAD, every_s).fly(1200)
+    assert np.mean([effort.first == first for effort in flight.efforts[400:]]) > 0.8
+    assert len(flight.waits) > 10
+    assert max(flight.windows()) <= 0.12 * LOAD * 1.001
+
+
+def test_at_an_eighth_a_keyframe_waits_for_a_second_of_its_own() -> None:
+    """Frames that are tracked while it waits would keep it waiting: no two frames and a keyframe fit in a second."""
+    flight = Flight(0.12 * LOAD, every_s=1.0).fly(1200)
+    assert max(flight.waits[5:]) <= 1.05e9
 
 
 @pytest.mark.parametrize("carried", [True, False])

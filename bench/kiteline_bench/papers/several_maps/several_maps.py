@@ -6,7 +6,7 @@ proportion to the path: the thesis calls its own results similar to that (03, 09
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -84,7 +84,7 @@ class Outcome:
     """What came of an experiment. found, true: keyframe positions (n,3) of each robot in the truth's world, in m.
 
     placed: how many of the maps lie in one world. ate_m: of these. apart_m: how far the worst of them lies from where
-    it should.
+    it should. last_frame_m: the joint error when the last frame came, before the base had done what that began.
     """
 
     experiment: Experiment
@@ -96,6 +96,7 @@ class Outcome:
     apart_m: float
     found: list[F64] = field(default_factory=list)
     true: list[F64] = field(default_factory=list)
+    last_frame_m: float = float("inf")
 
     @property
     def limit_m(self) -> float:
@@ -115,8 +116,16 @@ class Outcome:
 
 
 def fly(experiment: Experiment) -> Outcome:
-    """Fly an experiment with a base, in lock-step in this process."""
-    return judge(experiment, KeyframesInWorld(fly_with_base(experiment.scenarios, _AGENT)))
+    """Fly an experiment with a base, in lock-step in this process, until the base has nothing left to do.
+
+    So are the thesis's: its maps are merged and adjusted after the robots have finished.
+    """
+    at_end = list[Outcome]()
+    flown = fly_with_base(
+        experiment.scenarios, _AGENT,
+        at_end=lambda run: at_end.append(judge(experiment, KeyframesInWorld(run))),
+    )  # fmt: skip
+    return replace(judge(experiment, KeyframesInWorld(flown)), last_frame_m=at_end[0].joint_m)
 
 
 def judge(experiment: Experiment, flown: KeyframesInWorld) -> Outcome:
@@ -144,7 +153,7 @@ def _path_m(run: AgentRun) -> float:
         T[:3, 3] if T is not None and e is not None and e.tracked else np.full(3, np.nan)
         for T, e in zip(run.truth, run.estimates, strict=True)
     ]
-    return float(np.nansum(np.linalg.norm(np.diff(np.array(seen), axis=0), axis=1)))
+    return float(np.nansum(np.linalg.norm(np.diff(np.reshape(seen, (-1, 3)), axis=0), axis=1)))
 
 
 def robots(
@@ -180,12 +189,14 @@ def indoors(bench: Bench) -> list[Experiment]:
     """Somebody else's room along a real trajectory, 440 stereo pairs.
 
     Its path comes back once: from 13.5 to 15 s it sees what it saw from 10.3 to 12 s, from within 0.6 m and 20 degrees.
+    A robot that is carried to where it sees what it knows goes on in its map. So that a loss breaks a flight, it wakes
+    where it has never looked, and comes to 20 frames of the map before.
     """
     room = f"mcap:{bench.source('room_flight.mcap')}"
     return [
-        Experiment("room, one robot, a loss", PIONEER, broken(room, [(0.0, 12.0), (13.5, 22.1)]), maps=2),
-        Experiment("room, one robot, carried back twice unseeing", PIONEER,
-                   broken(room, [(0.0, 8.0), (6.0, 15.0), (13.0, 22.1)]), maps=2),
+        Experiment("room, one robot, a loss", PIONEER, broken(room, [(9.0, 17.0), (3.5, 10.0)]), maps=2),
+        Experiment("room, one robot, two losses", PIONEER,
+                   broken(room, [(9.0, 16.0), (4.0, 10.0), (0.0, 5.0)]), maps=3),
         Experiment("room, two robots", SEQUENCE_03, robots(room, 20.0, overlapping(440, 2)), 1),
         Experiment("room, three robots", SEQUENCE_07, robots(room, 20.0, overlapping(440, 3)), 2),
         Experiment("room, two robots, no shared frame", SEQUENCE_05, robots(room, 20.0, [(0, 240), (270, 440)]), 1),
@@ -246,12 +257,16 @@ def _drawn(o: Outcome) -> Drawn:
 
 def run(bench: Bench) -> list[Bar]:
     """All experiments, their bars, table and plot."""
-    outcomes = []
+    outcomes, unflown = list[Outcome](), list[Bar]()
     wanted = own(bench.sequences) if bench.sequences else [*indoors(bench), *real(bench), *outdoors(bench)]
     chosen = bench.chosen(wanted)
     for k, experiment in enumerate(chosen):
         bench.say(f"flying {experiment.name} ({k + 1} of {len(chosen)})")
-        outcomes.append(fly(experiment))
+        try:
+            outcomes.append(fly(experiment))
+        except SourceError as error:
+            unflown.append(is_true(f"{experiment.name}: flown", "yes", False, str(error)))
+            continue
         o = outcomes[-1]
         bench.say(
             f"  {o.placed} of {o.maps} maps placed, {o.merges} merges, {o.path_m:.0f} m, joint ATE {_metres(o.joint_m)}"
@@ -262,7 +277,7 @@ def run(bench: Bench) -> list[Bar]:
     plot_experiments(folder / name, [_drawn(o) for o in outcomes])
     _tell(bench, outcomes)
     bench.more.append(f"![Keyframes of all robots in the base's world, and the true paths]({name})")
-    return [bar for o in outcomes for bar in bars(o)]
+    return [*unflown, *(bar for o in outcomes for bar in bars(o))]
 
 
 def bars(o: Outcome) -> list[Bar]:
@@ -291,12 +306,13 @@ def _tell(bench: Bench, outcomes: Sequence[Outcome]) -> None:
         error = "-" if theirs is None or theirs.ate_m is None else f"{theirs.ate_m:g} m of {theirs.path_m:g} m"
         rows.append((
             o.experiment.name, "-" if theirs is None else f"{theirs.name}, {theirs.robots}", error,
-            o.maps, o.merges, f"{o.path_m:.1f} m", _metres(o.joint_m),
+            o.maps, o.merges, f"{o.path_m:.1f} m", _metres(o.joint_m), _metres(o.last_frame_m),
             f"{100 * o.joint_m / o.path_m:.4f} %" if np.isfinite(o.joint_m) else "-",
             "-" if theirs is None else f"{100 * theirs.share:.4f} %",
         ))  # fmt: skip
     columns = (
-        "ours", "the thesis", "ORB-SLAM2 there", "maps", "merges", "paths of all robots", "joint ATE", "of the paths",
+        "ours", "the thesis", "ORB-SLAM2 there", "maps", "merges", "paths of all robots", "joint ATE",
+        "when the last frame came", "of the paths",
         "the thesis's",
     )  # fmt: skip
     table(bench, "Beside the thesis", columns, rows)
