@@ -237,7 +237,7 @@ class GridConfig:
     side_columns: int = (
         2  # of a scan at either side of its view that count as far ones: what stands there is not seen whole
     )
-    occupied_from: int = 10  # 1/32; log-odds from which a band is occupied: one near view, two far ones
+    occupied_from: int = 9  # 1/32; log-odds from which a band is occupied: one near view, two far ones
     free_from: int = 4  # 1/32; a cell is free if all bands lie at or below minus this: one sure view, two far ones
     free_clear: int = 3  # 1/32; the same with no sign of an obstacle within two cells: one fair view
     free_beside: int = (
