@@ -215,7 +215,7 @@ class GroundHeightConfig:
 
 @dataclass(frozen=True, slots=True)
 class GridConfig:
-    """The occupancy grid. Heights are relative to the local ground; log-odds are in 1/16."""
+    """The occupancy grid. Heights are relative to the local ground; log-odds are in 1/32."""
 
     cell_m: float = 0.05  # m; a quarter of the gap that a small vehicle passes; 0.01 possible, 0.2 suits wide streets
     max_range_m: float = 20.0  # m; beyond, the columns of a scan are wider than half a metre
@@ -229,21 +229,24 @@ class GridConfig:
     bands_m: tuple[float, ...] = (0.1, 0.5, 1.2, 2.0)  # m; limits of the height bands, as the agents' scans have them
     accurate_sigma_m: float = 0.05  # m; up to this deviation of a range a view counts in full: a cell by default
     gap_sigmas: float = 3.0  # standard deviations before an obstacle within which ground is not freed
-    log_hit: int = 6  # 1/16; log-odds of one near view of an obstacle (p = 0.59); in inverse proportion to the range
-    log_free: int = 3  # 1/16; of one near view of free space (p = 0.45): half, as an edge is seen beside itself
-    log_free_sure: int = 2  # 1/16; the same of a far view well before what it sees
-    log_free_far: int = 1  # 1/16; of a far view elsewhere (box and wall may be one surface), and before seen ground
+    log_hit: int = 12  # 1/32; log-odds of one near view of an obstacle (p = 0.59); in inverse proportion to the range
+    log_free: int = 6  # 1/32; of one near view of free space (p = 0.45): half, as an edge is seen beside itself
+    log_free_sure: int = 4  # 1/32; the same of a far view well before what it sees
+    log_free_fair: int = 3  # 1/32; of a far view less far before it
+    log_free_far: int = 2  # 1/32; of a far view elsewhere (box and wall may be one surface), and before seen ground
     sure_sigmas: float = (
         2.0  # standard deviations beyond gap_sigmas from which on a far view is well before what it sees
     )
     open_sigmas: float = 1.0  # the same before a scan's end without an obstacle, which lies two before the last ground
+    fair_sigmas: float = 1.0  # fewer of them from which on it is less far before: 0.3 % are wrong with no sign near
     side_columns: int = (
         2  # of a scan at either side of its view that count as far ones: what stands there is not seen whole
     )
-    occupied_from: int = 5  # 1/16; log-odds from which a band is occupied: one near view, two far ones
-    free_from: int = 2  # 1/16; a cell is free if all bands lie at or below minus this: one near view, two far ones
+    occupied_from: int = 9  # 1/32; log-odds from which a band is occupied: one near view, two far ones
+    free_from: int = 4  # 1/32; a cell is free if all bands lie at or below minus this: one sure view, two far ones
+    free_clear: int = 3  # 1/32; the same with no sign of an obstacle within two cells: one fair view
     free_beside: int = (
-        5  # 1/16; the same beside an occupied cell: a near view and a sure one, as one may lie a cell off
+        10  # 1/32; the same beside an occupied cell: a near view and a sure one, as one may lie a cell off
     )
     hole_neighbours: int = (
         5  # of 8 that are free, none occupied: a cell that no view spoke against is free too (a gap between two rays)

@@ -3,14 +3,14 @@
 from kiteline_codec.channel import RecordChannel
 from kiteline_codec.schema import Key, KeyframeScan, Record, messages
 
-_UNDER_WAY = 4  # scans that are sent before the first of them is known to have arrived
+_UNDER_WAY = 4  # later scans that are sent before the first of them is known to have arrived
 _WAITING = 1024  # scans kept while the link has no room, as codes: 0.3 MB
 
 
 class ScanQueue:
-    """Shares scans, newest first, while those before arrive: they never fill a link that is short of bytes.
+    """Shares the first scans of a keyframe at once, later ones newest first, while those before arrive.
 
-    When too many wait, the oldest between keyframes go first, then the oldest of keyframes.
+    So these never fill a link that is short of bytes. When too many wait, the oldest are dropped.
     """
 
     def __init__(self, channel: RecordChannel) -> None:
@@ -24,6 +24,9 @@ class ScanQueue:
 
     def put(self, record: KeyframeScan) -> None:
         """Share a scan, in place of one that waits under the same key."""
+        if record.part < KeyframeScan.FIRST_PARTS:
+            self._channel.put(record)
+            return
         key = record.key()
         self._waiting.pop(key, None)
         self._note_arrived()
@@ -32,8 +35,7 @@ class ScanQueue:
             return
         self._waiting[key] = messages.encode(record)
         if len(self._waiting) > _WAITING:
-            oldest = next((k for k in self._waiting if k.part), next(iter(self._waiting)))
-            del self._waiting[oldest]
+            del self._waiting[next(iter(self._waiting))]
 
     def share(self) -> None:
         """Share what waits, as far as there is room."""

@@ -174,6 +174,7 @@ class ScanGrid:
             bands,
             config.occupied_from,
             config.free_from,
+            config.free_clear,
             config.free_beside,
             config.hole_neighbours,
             int(config.opening),
@@ -218,7 +219,8 @@ class ScanGrid:
             kernels.draw_free(
                 sectors.x, sectors.y, sectors.first_rad, sectors.step_rad, sectors.begin, sectors.start, sectors.end,
                 sectors.low, sectors.under, sectors.clear, sectors.camera_band, sectors.accurate, sectors.sure,
-                (config.log_free, config.log_free_sure, config.log_free_far), hits, sign, slots, spare, used,
+                sectors.fair, (config.log_free, config.log_free_sure, config.log_free_fair, config.log_free_far), hits,
+                sign, slots, spare, used,
                 self._store.pool, touched,
             )  # fmt: skip
             for r, c in np.argwhere(touched).tolist():

@@ -7,7 +7,7 @@ them, old sections of low priority are dropped instead.
 from collections.abc import Callable
 
 from kiteline_codec.coding.packing import Writer
-from kiteline_codec.schema import KEYFRAME_KINDS, PREDICTOR_KINDS, Key
+from kiteline_codec.schema import KEYFRAME_KINDS, PREDICTOR_KINDS, Key, KeyframeScan, Priority
 from kiteline_codec.sync import ranges
 from kiteline_codec.sync.archive import Archive, Row, Spill
 from kiteline_codec.sync.digest import MODULUS, Digest, hash_value
@@ -269,9 +269,11 @@ class Outbox:
         return (least if here is None else min(here, least)) - 1
 
     def urgency(self) -> int | None:
-        """The priority of what is sent next, least first; None if nothing waits."""
+        """The priority of what is sent next, least first; None if nothing waits. Scans may wait as tiles do."""
         key = self._top()
-        return None if key is None else self._entries[key].order[0]
+        if key is None:
+            return None
+        return int(Priority.GRID) if key.kind == KeyframeScan.KIND else self._entries[key].order[0]
 
     def _top(self) -> Key | None:
         key = self._queue.top()

@@ -48,7 +48,8 @@ def test_each_cell_of_a_scan_is_freed_once() -> None:
         counted = 0
         for place in grid.places:
             odds = grid.log_odds(place)
-            assert set(np.unique(odds)) <= {0, -config.log_free, -config.log_free_sure, -config.log_free_far}
+            views = config.log_free, config.log_free_sure, config.log_free_fair, config.log_free_far
+            assert set(np.unique(odds)) <= {0, *(-view for view in views)}
             column, row = np.arange(64) + 64 * place.column, np.arange(64) + 64 * place.row
             dx, dy = (column[None, :] + 0.5) * 0.05 - x, (row[:, None] + 0.5) * 0.05 - y
             r, a = np.hypot(dx, dy), np.arctan2(dy, dx) - heading
@@ -107,15 +108,34 @@ def test_a_far_view_frees_alone_what_lies_well_before_its_obstacle_and_two_what_
     columns = (np.arange(128) + 0.5) * CONFIG.cell_m
     sigma_m = CONFIG.sigma_px / bf * 5.53**2
     end = 5.53 - CONFIG.gap_sigmas * sigma_m
-    sure = end - CONFIG.sure_sigmas * sigma_m
+    sure, fair = (end - n * sigma_m for n in (CONFIG.sure_sigmas, CONFIG.sure_sigmas - CONFIG.fair_sigmas))
     near = found.accurate_m(CONFIG)
     assert near + 0.2 < sure < end - 0.2
     assert (row[(columns > near + 0.1) & (columns < sure - 0.1)] == -CONFIG.log_free_sure).all()
-    assert (row[(columns > sure + 0.1) & (columns < end - 0.1)] == -CONFIG.log_free_far).all()
+    assert (row[(columns > sure + 0.06) & (columns < fair - 0.06)] == -CONFIG.log_free_fair).all()
+    assert (row[(columns > fair + 0.06) & (columns < end - 0.06)] == -CONFIG.log_free_far).all()
     assert not (row[columns > end + 0.1] < 0).any()
     assert at(grid, 0.5 * (near + sure), 0.0) == 0 and at(grid, end - 0.15, 0.0) == -1
     grid.put(1, found, camera(0.02, 0.0, 0.0))
     assert at(grid, end - 0.15, 0.0) == 0
+
+
+def test_a_fair_view_frees_alone_where_no_sign_of_an_obstacle_is_near() -> None:
+    """What one view frees wrongly lies beside something that another one saw, nearly always."""
+    bf, end = 48.0, 5.0
+    ground = keep(CONFIG, bare(1.0, end), bf)
+    place = end - 0.5 * CONFIG.open_sigmas * CONFIG.sigma_px / bf * end**2
+    grid = ScanGrid(CONFIG)
+    grid.put(0, ground, camera(0.0, 0.0, 0.0))
+    assert at(grid, place, 0.0) == 0
+    nothing, one = np.zeros(70), np.arange(70) == 35
+    thing = replace(
+        bare(1.0, end), free_from_m=nothing, free_m=nothing, obstacle_m=np.where(one, place + 0.08, np.inf),
+        bands=one.astype(np.uint8),
+    )  # fmt: skip
+    grid.put(1, keep(CONFIG, thing, bf), camera(0.0, 0.0, 0.0))
+    assert at(grid, place + 0.08, 0.02) == -1, "one far view of an obstacle is a sign, no obstacle"
+    assert at(grid, place, 0.0) == -1 and at(grid, place, 0.6) == 0
 
 
 def test_a_far_view_of_ground_that_ends_before_no_obstacle_frees_alone_nearly_up_to_its_end() -> None:
@@ -127,7 +147,7 @@ def test_a_far_view_of_ground_that_ends_before_no_obstacle_frees_alone_nearly_up
     columns = (np.arange(128) + 0.5) * CONFIG.cell_m
     sure = end - CONFIG.open_sigmas * CONFIG.sigma_px / bf * end**2
     assert (row[(columns > found.accurate_m(CONFIG) + 0.1) & (columns < sure - 0.06)] == -CONFIG.log_free_sure).all()
-    assert (row[(columns > sure + 0.06) & (columns < end - 0.06)] == -CONFIG.log_free_far).all()
+    assert (row[(columns > sure + 0.06) & (columns < end - 0.06)] == -CONFIG.log_free_fair).all()
     assert sure > end - CONFIG.sure_sigmas * CONFIG.sigma_px / bf * end**2 + 0.1
 
 
@@ -165,7 +185,7 @@ def test_ground_that_was_seen_over_a_low_obstacle_is_free_and_what_it_hides_is_u
 
 def test_a_view_counts_by_how_accurate_it_is_not_by_how_far() -> None:
     wall = scan_of(np.array(box(-12.03, -12.03, 12.03, 12.03)), 0.0, 0.0, 0.0)
-    for bf, expected in ((30.0, 0), (400.0, round(6 * np.sqrt(0.05 * 400.0 / 0.3) / 12.03)), (2000.0, 6)):
+    for bf, expected in ((30.0, 0), (400.0, round(12 * np.sqrt(0.05 * 400.0 / 0.3) / 12.03)), (2000.0, 12)):
         found = keep(CONFIG, wall, bf)
         assert found is not None
         grid = ScanGrid(CONFIG)

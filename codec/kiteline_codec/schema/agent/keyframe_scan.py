@@ -39,9 +39,9 @@ class KeyframeScan(Record):
 
     KIND = 11
     ID = IdOf.KEYFRAME
-    PRIORITY = Priority.GRID
+    PRIORITY = Priority.LANDMARKS
     PARTS = 16
-    FIRST_PARTS = PARTS
+    FIRST_PARTS = 2  # a hundred bytes each: later, a link that is full for a whole flight would not carry one
 
     keyframe: KeyframeId
     scan: ColumnScan
