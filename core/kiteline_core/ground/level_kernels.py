@@ -11,7 +11,8 @@ _HALF_PX = 4  # px to each side of a pixel in its row that are compared
 _NEARER_PX = 1.5  # px by which another disparity is larger, at least: less is the error of a slanted surface
 _LEAST_ERROR = 4.0  # grey levels: mean difference from which a disparity is in doubt
 _BETTER = 0.5  # of that difference that another disparity leaves, at most
-_SUPPORT = 5  # other pixels within one row and _HALF_PX columns that have the new disparity to a pixel
+_FITS = 3.0  # grey levels that another disparity leaves, at most: noise leaves two. Poor fits are found by chance
+_SUPPORT = 15  # of 26 pixels within one row and _HALF_PX columns, that have the new disparity to a pixel: of three rows
 
 
 @njit
@@ -31,8 +32,8 @@ def correct_thin_surfaces(left, right, most_px, disparity, errors, best, least, 
     """Replace disparities (h,w) in px of surfaces that are thinner than a matched block by those that the rows show.
 
     Semi-global matching gives such a surface the disparity of what lies behind. A disparity is in doubt where a row of
-    2 _HALF_PX + 1 pixels does not fit, and a larger one, up to most_px, fits far better: it takes that one, or becomes
-    unknown (0) if too few pixels around have it.
+    2 _HALF_PX + 1 pixels does not fit, and a larger one, up to most_px, fits well: it takes that one, or becomes unknown
+    (0) if too few pixels around have it.
     left, right: (h,w) uint8. errors: (w,) float32, best, least, lowest, difference: (w,) int32, doubted: (k,) int32,
     better: (k,) float32, for the kernel's own use. At most k pixels are changed. Returns how many.
     """
@@ -91,7 +92,7 @@ def _search_row(left, right, most_px, disparity, errors, best, least, lowest, di
             error += errors[k]
         best[u], least[u], lowest[u] = -1, 0, most_px
         if disparity[u] > 0.0 and error > _LEAST_ERROR * (2 * _HALF_PX + 1):
-            least[u] = int(np.ceil(_BETTER * error))
+            least[u] = int(np.ceil(min(_BETTER * error, np.float32(_FITS * (2 * _HALF_PX + 1)))))
             lowest[u] = int(disparity[u] + _NEARER_PX) + 1
             first, last, begin_q = min(first, u), u, min(begin_q, lowest[u])
     for q in range(begin_q, most_px):

@@ -56,7 +56,7 @@ def corrected(left: U8, right: U8, disparity: F32) -> F32:
         error = np.cumsum(errors[v, seen])[-1]
         if error <= 4.0 * (2 * half + 1):
             continue
-        least = 0.5 * error
+        least = np.ceil(min(0.5 * error, 3.0 * (2 * half + 1)))
         for q in range(int(disparity[v, u] + 1.5) + 1, min(MOST_PX, u - half + 1)):
             moved = right[v, u - half - q : u + half + 1 - q]
             other = np.abs(left[v, seen].astype(int) - moved.astype(int)).sum()
@@ -67,7 +67,7 @@ def corrected(left: U8, right: U8, disparity: F32) -> F32:
     lonely = [
         (v, u)
         for (v, u), q in found.items()
-        if (np.abs(out[max(v - 1, 0) : v + 2, max(u - half, 0) : u + half + 1] - q) <= 1.0).sum() - 1 < 5
+        if (np.abs(out[max(v - 1, 0) : v + 2, max(u - half, 0) : u + half + 1] - q) <= 1.0).sum() - 1 < 15
     ]
     for at_px in lonely:
         out[at_px] = 0.0
