@@ -32,8 +32,8 @@ def correct_thin_surfaces(left, right, most_px, disparity, errors, best, least, 
     """Replace disparities (h,w) in px of surfaces that are thinner than a matched block by those that the rows show.
 
     Semi-global matching gives such a surface the disparity of what lies behind. A disparity is in doubt where a row of
-    2 _HALF_PX + 1 pixels does not fit, and a larger one, up to most_px, fits well: it takes that one, or becomes unknown
-    (0) if too few pixels around have it.
+    2 _HALF_PX + 1 pixels does not fit, and a larger one, up to most_px, fits well: it takes that one, or becomes
+    unknown (0) if too few pixels around have it.
     left, right: (h,w) uint8. errors: (w,) float32, best, least, lowest, difference: (w,) int32, doubted: (k,) int32,
     better: (k,) float32, for the kernel's own use. At most k pixels are changed. Returns how many.
     """
