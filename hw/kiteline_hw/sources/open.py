@@ -7,9 +7,9 @@ from pathlib import Path
 from kiteline_hw.calibration.file_calibration import FileCalibration
 from kiteline_hw.calibration.files import read_calibration
 from kiteline_hw.ports import FrameSource, SourceError, is_live
-from kiteline_hw.sensors.odometry_file import with_odometry_file
 from kiteline_hw.sources import kinds
 from kiteline_hw.sources.bags.bag_heads import MCAP_MAGIC, SQLITE_MAGIC, refuse_unreadable
+from kiteline_hw.sources.beside.odometry_file import with_odometry_file
 from kiteline_hw.sources.kinds import SourceKind
 from kiteline_hw.sources.overrides import with_calibration
 from kiteline_hw.system.process import home_path

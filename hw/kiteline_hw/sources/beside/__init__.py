@@ -1,0 +1,1 @@
+"""Files beside a recording: a source and its folder enter, the source with what they hold leaves."""
