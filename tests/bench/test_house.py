@@ -44,6 +44,12 @@ def test_sub_packages_can_form_a_circle_where_modules_do_not(tmp_path: Path) -> 
     assert circles(by_sub_package(sources.imports())) == [["kiteline_core.x", "kiteline_core.y"]]
 
 
+def test_the_sources_have_no_circles() -> None:
+    graph = Sources.of(ROOT).imports()
+    assert circles(graph) == []
+    assert circles(by_sub_package(graph)) == []
+
+
 def test_circles_are_whole_and_apart() -> None:
     graph = {"a": {"b"}, "b": {"c"}, "c": {"a", "d"}, "d": {"e"}, "e": {"d"}, "f": {"a"}}
     assert circles(graph) == [["a", "b", "c"], ["d", "e"]]
