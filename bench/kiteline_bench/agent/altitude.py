@@ -13,7 +13,9 @@ from kiteline_bench.harness.bars import Bar, Bench, at_most, table
 from kiteline_bench.harness.recording import Recording, items_of
 from kiteline_bench.harness.run import fly_alone
 from kiteline_bench.harness.starts import median_ratio
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
+from kiteline_hw.sim.sensors.rig import make_rig
 from kiteline_hw.sim.source import open_sim
 from kiteline_hw.sources.text_files import read_tum_poses
 from kiteline_lab.evaluation.metrics import TrajectoryAlignment
@@ -63,7 +65,7 @@ def _write_lifted(source: Path, out: Path, start_s: float, height_m: float, down
     """Write a recorded motion, lifted smoothly after a while, with the camera turned down meanwhile, as a TUM file."""
     poses = read_tum_poses(source)
     begin_ns = poses[0][0] + round(1e9 * start_s)
-    T_b_c, lifted = open_sim("street", 1, seconds=1.0).rig.T_b_c, list[tuple[int, np.ndarray]]()
+    T_b_c, lifted = make_rig().T_b_c, list[tuple[int, F64]]()
     kept = [(t_ns, T) for t_ns, T in poses if 0 <= t_ns - begin_ns < 1e9 * (_SECONDS + 2.0)]
     origin = kept[0][1][:3, 3]
     for t_ns, T_w_b in kept:

@@ -105,7 +105,8 @@ def _mounting(table: Yaml, path: Path, rig: CameraRig) -> F64:
     told = table.get("T_b_d")
     if told is None:
         return rig.T_b_c @ se3.from_rt(_FORWARD_LEFT_UP, np.zeros(3))
-    T = np.array(told if isinstance(told, list) and len(told) == 16 else np.zeros(16)).reshape(4, 4)
+    is_pose = isinstance(told, list) and len(told) == 16 and all(isinstance(value, int | float) for value in told)
+    T = np.array(told if is_pose else np.zeros(16), np.float64).reshape(4, 4)
     if not np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-3) or np.linalg.det(T[:3, :3]) < 0.0:
         raise SourceError(f"{path}: expected T_b_d: [16 numbers], a pose by rows")
     return T

@@ -89,6 +89,7 @@ def test_gaps_and_stamps_that_go_back_are_left_out(folder: Path) -> None:
         ("t_ns,vx\n-5,0.1\n", "", "does not fit t_ns,vx"),
         ("t_s,ticks_left,ticks_right\n1.0,2,3\n", "", "metres_per_tick"),
         ("t_s,vx\n1.0,0.5\n", "T_b_d: [1, 2]\n", "T_b_d"),
+        ("t_s,vx\n1.0,0.5\n", "T_b_d: [a, b, c, d, e, f, g, h, i, j, k, l, m, n, o, p]\n", "T_b_d"),
     ],
 )
 def test_a_file_that_is_none_is_an_error_with_its_name(folder: Path, text: str, yaml: str, says: str) -> None:
