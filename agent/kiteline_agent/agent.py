@@ -26,9 +26,10 @@ from kiteline_agent.mapping.loss_stage import FrameOutcome, LossStage
 from kiteline_agent.mapping.pose_report import PoseReport
 from kiteline_agent.mapping.right_camera import RightCamera
 from kiteline_agent.mapping.submap_stage import SubmapStage
+from kiteline_agent.motion.extrapolation import MAX_PREDICTION_S
 from kiteline_agent.relocalisation.map_cache import MapCache
 from kiteline_agent.relocalisation.relocaliser import Relocaliser
-from kiteline_agent.scans.local_grid import LocalGrid, Surroundings
+from kiteline_agent.scans.local_grid import LOST_S, LocalGrid, Surroundings
 from kiteline_agent.scans.scan_stage import ScanStage
 from kiteline_agent.step import Estimate, Identity, PredictedPose, StepInput, StepOutput
 from kiteline_agent.tracking.frame_context import FrameContext
@@ -73,7 +74,7 @@ class Agent:
         self._has_depth = rig.right is not None or rig.has_depth
         self.work = Work()  # operations of the last step
         self.map = LocalMap(camera, config.local_map)
-        self.map_cache = MapCache(camera, config.map_cache, config.matching, config.ransac, vocabulary)
+        self.map_cache = MapCache(camera, config.map_cache, config.matching, vocabulary)
         self._governor = Governor(config.governor)
         self._effort = FULL
         self._camera = CameraState(rig, imu, config, identity, self.map)
@@ -153,9 +154,7 @@ class Agent:
     def predict(self, t_ns: int) -> PredictedPose | None:
         """The pose at a time after the last processed frame; None before there is a map, and too long after it."""
         waits = self._inertial_start is not None and len(self._inertial_start.waiting) > 0
-        return (
-            None if waits else self._report.predict(t_ns, joined(self._skipped_imu), self._full_config.prediction.max_s)
-        )
+        return None if waits else self._report.predict(t_ns, joined(self._skipped_imu), MAX_PREDICTION_S)
 
     def _process_next(self, newest: Frame) -> tuple[Estimate | None, list[str]]:
         """Process the newest frame, or what waits before it. Returns the newest frame's estimate, and events."""
@@ -320,7 +319,7 @@ class Agent:
     def _forget_scans(self, ctx: FrameContext, outcome: FrameOutcome) -> None:
         """Forget the obstacles of scans once the motion of the vehicle has been unknown for too long."""
         lost_ns = 0 if outcome.bridged or self._placed_ns is None else ctx.t_ns - self._placed_ns
-        if lost_ns > self._full_config.local_grid.lost_s * 1e9:
+        if lost_ns > LOST_S * 1e9:
             self._local_grid.forget()
             if self._scans is not None:
                 self._scans.forget()

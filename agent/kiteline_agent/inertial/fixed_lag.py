@@ -21,6 +21,9 @@ from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.order_statistics import median
 
 _BY_DEFINITION = 1e-4  # m and rad: deviation of a pose that defines its map
+_VELOCITY_CHI2 = 7.81  # 95 % with 3 degrees of freedom: an odometer's velocity beyond it is down-weighted
+_RELINEARISE_GYRO_RAD_S = 0.01  # rad/s; change of bias above which an interval is integrated again
+_RELINEARISE_ACCEL_M_S2 = 0.2  # m/s^2; the same of the accelerometer
 
 
 @dataclass(frozen=True, slots=True)
@@ -339,7 +342,7 @@ class FixedLagSmoother:
         if not square < c.velocity_gate:
             return
         self._vel[k] = value
-        weight = min(1.0, float(np.sqrt(c.velocity_chi2 / max(square, 1e-9))))
+        weight = min(1.0, float(np.sqrt(_VELOCITY_CHI2 / max(square, 1e-9))))
         self._vel_info[k] = weight * np.linalg.inv(rotation.T @ odometry.inflated @ rotation)
 
     def _relinearise_biases(self) -> None:
@@ -347,7 +350,7 @@ class FixedLagSmoother:
         c = self._config
         for k in range(self._n - 1):
             change = np.abs(self._state[k, 6:] - self._imu_bias[k])
-            if change[:3].max() > c.relinearise_gyro_rad_s or change[3:].max() > c.relinearise_accel_m_s2:
+            if change[:3].max() > _RELINEARISE_GYRO_RAD_S or change[3:].max() > _RELINEARISE_ACCEL_M_S2:
                 self._put_interval(
                     k, preintegrate(self._samples[k], self._state[k, 6:], self._calibration, c.imu_inflation)
                 )

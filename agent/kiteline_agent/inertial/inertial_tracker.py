@@ -14,7 +14,7 @@ from kiteline_agent.inertial.sample_buffer import SampleBuffer, without_held
 from kiteline_agent.inertial.scale_filter import ScaleFilter, camera_scaled
 from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuBatch, ImuCalibration
-from kiteline_core.geometry import se3
+from kiteline_core.geometry import disparity_offset, se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 
 _PRIOR_SIGMA = np.repeat([0.005, 0.1], 3)  # rad/s, m/s^2: of biases of earlier tracking, after a loss
@@ -200,7 +200,7 @@ class InertialTracker:
         if self._smoother.running:
             awaits = self._awaited(samples) is not None
             held = without_held(samples) if samples and awaits else samples
-            length_error = self._config.disparity_px * depth_m / self._bf if self._images_have_scale else 0.0
+            length_error = disparity_offset.GOOD_PX * depth_m / self._bf if self._images_have_scale else 0.0
             state = self._advance(held, points, velocity, length_error)
         self._watch_scale(t_ns, T_m_b_visual, depth_m, state)
         if state is None:

@@ -17,6 +17,14 @@ from kiteline_core.geometry import se3
 
 _ITERATIONS = 3
 _UNITS, _GRAVITY, _VELOCITY, _BIAS = 0, slice(1, 4), slice(4, 7), slice(7, 10)
+_START_GRAVITY_M_S2 = 0.1  # m/s^2; deviation of gravity at the start: that of a first window
+_START_VELOCITY_M_S = 0.1  # m/s; deviation of the velocity at the start
+_START_BIAS_M_S2 = 0.1  # m/s^2; deviation of the accelerometer's bias at the start
+_GRAVITY_SIGMA_M_S2 = 0.01  # m/s^2; of the length of gravity
+_KNOWN_SIGMA = 0.025  # relative deviation below which the scale may be corrected
+_LEAST = 0.015  # relative; smallest correction: each begins a new submap
+_LEAST_DEVIATIONS = 1.1  # smallest correction in its own deviations
+_LEAST_S = 4.0  # s between two corrections
 
 
 class ScaleFilter:
@@ -42,11 +50,10 @@ class ScaleFilter:
 
     def correction(self) -> float | None:
         """Factor by which the map is to be scaled; None if it is right as far as is known."""
-        c = self._config
         scale, sigma = self.scale
-        if not self.running or self.age_s < c.least_s or sigma > c.known_sigma * scale:
+        if not self.running or self.age_s < _LEAST_S or sigma > _KNOWN_SIGMA * scale:
             return None
-        return scale if abs(np.log(scale)) > max(c.least, c.least_deviations * sigma / scale) else None
+        return scale if abs(np.log(scale)) > max(_LEAST, _LEAST_DEVIATIONS * sigma / scale) else None
 
     def stop(self) -> None:
         """Forget all."""
@@ -57,7 +64,7 @@ class ScaleFilter:
         c = self._config
         self._inflation = c.imu_inflation * max(accel_noise, 1.0)
         self._x = np.concatenate([[1.0], gravity, velocity, bias[3:]])
-        sigma = np.repeat([c.start_scale, c.start_gravity_m_s2, c.start_velocity_m_s, c.start_bias_m_s2], [1, 3, 3, 3])
+        sigma = np.repeat([c.start_scale, _START_GRAVITY_M_S2, _START_VELOCITY_M_S, _START_BIAS_M_S2], [1, 3, 3, 3])
         self._cov = np.diag(sigma**2)
         self.running, self.age_s = True, 0.0
 
@@ -65,7 +72,7 @@ class ScaleFilter:
         """Continue after frames without images, at this velocity (3,) m/s in m."""
         self._x[_VELOCITY] = velocity
         self._cov[_VELOCITY], self._cov[:, _VELOCITY] = 0.0, 0.0
-        self._cov[_VELOCITY, _VELOCITY] = self._config.start_velocity_m_s**2 * np.eye(3)
+        self._cov[_VELOCITY, _VELOCITY] = _START_VELOCITY_M_S**2 * np.eye(3)
 
     def add(self, T_m_b0: F64, T_m_b1: F64, samples: Samples, gyro_bias: F64, depth_m: float) -> None:
         """Process an interval between two poses (4,4) by images, `depth_m` from what they see."""
@@ -91,7 +98,7 @@ class ScaleFilter:
         cov[_BIAS, _BIAS] += (c.accel_walk**2 + self._calibration.accel_walk**2) * dt * np.eye(3)
         # update by the displacement that the images give, and by the length of gravity
         seen = (T_m_b1[:3, 3] + T_m_b1[:3, :3] @ self._p_b_c) - (T_m_b0[:3, 3] + r @ self._p_b_c)
-        noise = np.diag(np.append(np.full(3, 2.0 * (c.image_rad * depth_m) ** 2), c.gravity_sigma_m_s2**2))
+        noise = np.diag(np.append(np.full(3, 2.0 * (c.image_rad * depth_m) ** 2), _GRAVITY_SIGMA_M_S2**2))
         self.age_s += dt
         now = before
         for _ in range(_ITERATIONS):  # at the updated displacement: noise of the prediction would bias the scale

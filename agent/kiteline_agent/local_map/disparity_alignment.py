@@ -18,7 +18,7 @@ from kiteline_agent.local_map import disparity_kernels as kernels
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_core.arrays import F64, I64
 from kiteline_core.geometry import se3
-from kiteline_core.geometry.disparity_offset import TERMS, none, terms
+from kiteline_core.geometry.disparity_offset import GOOD_PX, TERMS, none, terms
 from kiteline_core.ids import NO_KEYFRAME
 from kiteline_core.order_statistics import median
 
@@ -39,6 +39,8 @@ _MIN_SIDEWAYS = 0.2  # share of the motion across the optical axis below which e
 _FORWARD_SHARE = 1.0 / 9.0  # of the information about a worn rig that is believed then: errors were three deviations
 _FORWARD_KEYFRAMES = 12  # that tell something of their own then; more of them repeat errors of lens and tracks
 _FORWARD_GOOD_KEYFRAMES = 3  # the same of a good calibration's offset, which is no larger than these errors are
+_PAIR_EVERY_S = 0.18  # s between two pairs, at most: slow cameras, and frames that the governor skips
+_PARALLAX_GROWTH = 1.2  # of the parallax between two pairs of the same keyframe
 
 
 class DisparityAlignment:
@@ -62,7 +64,7 @@ class DisparityAlignment:
         self._share = np.ones(slots)
         self._evicted_sure_h, self._evicted_sure_b = np.zeros((TERMS, TERMS)), np.zeros(TERMS)
         self._refuted = False  # earlier flights were of another rig; the map still has their offset
-        self._good = np.eye(TERMS) / config.good_px**2
+        self._good = np.eye(TERMS) / GOOD_PX**2
         self._prior = np.diag(np.array([_PRIOR_PX, *[_PRIOR_SLOPE_RAD * camera.fx] * (TERMS - 1)]) ** -2.0)
         x, y = np.meshgrid(np.linspace(0.0, camera.width, 7), np.linspace(0.0, camera.height, 5))
         self._grid = terms(np.stack([(x.ravel() - camera.cx) / camera.fx, (y.ravel() - camera.cy) / camera.fy], 1))
@@ -105,7 +107,7 @@ class DisparityAlignment:
         self._frames += 1
         if self._pair_t_ns is None:
             self._pair_t_ns = t_ns
-        if self._frames < config.every and t_ns - self._pair_t_ns < config.every_s * 1e9:
+        if self._frames < config.every and t_ns - self._pair_t_ns < _PAIR_EVERY_S * 1e9:
             return None
         self._frames, self._pair_t_ns = 0, t_ns
         slots, counts = np.unique(rows // m.slot_size, return_counts=True)
@@ -114,7 +116,7 @@ class DisparityAlignment:
                 self._begin(slot)
         ratios = {slot: self._parallax_ratio(slot, T_c_m) for slot in slots[counts >= _MIN_POINTS].tolist()}
         slot = max(ratios, key=lambda s: ratios[s], default=None)
-        if slot is None or ratios[slot] < config.growth:
+        if slot is None or ratios[slot] < _PARALLAX_GROWTH:
             return None
         if self._add_pair(slot, T_c_m, rows, observed):
             self._solve()

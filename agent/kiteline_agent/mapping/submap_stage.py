@@ -32,6 +32,7 @@ from kiteline_core.ids import NO_KEYFRAME, KeyframeId, SubmapId
 
 _IGNORED = "imu: not used from here on: the images alone are flown, in a unit of length of their own, as with --no-imu"
 _FAILURES = 2  # failed searches in frames with texture before a new submap is opened
+_SCALE_SIGMA = 0.02  # relative deviation below which the metric scale of two views is used
 
 
 @dataclass(frozen=True, slots=True)
@@ -247,7 +248,7 @@ class SubmapStage:
         if self._two_view_start is None or ctx.number % limits.scale_every or not camera.submaps.room:
             return []
         correction = camera.motion.scale_correction()
-        unit_m = camera.motion.metres_per_unit(limits.scale_sigma) if correction is None else correction[0]
+        unit_m = camera.motion.metres_per_unit(_SCALE_SIGMA) if correction is None else correction[0]
         if unit_m is None:
             return []
         metric = metric_points(ctx, track, self._map, unit_m)

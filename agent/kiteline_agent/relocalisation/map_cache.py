@@ -19,7 +19,7 @@ from kiteline_core.ids import NO_KEYFRAME, KeyframeId, SubmapId
 from kiteline_core.imaging.descriptors import comparable
 from kiteline_core.imaging.matching import MatchConfig, Matches, match, match_near
 from kiteline_core.places.place_index import PlaceIndex, Vocabulary
-from kiteline_core.pose.pnp import RansacConfig, solve_pnp
+from kiteline_core.pose.pnp import PIXEL_CHI2, solve_pnp
 from kiteline_core.pose.pose_kernels import optimise_pose
 
 _MARGIN_PX = 4.0  # px beyond the border: landmarks just out of view have no corner
@@ -29,6 +29,7 @@ _OCTAVE_GAP = 1.2  # octaves between predicted and matched size
 _CORNER_PX = 1.0  # px at octave 0: standard deviation of a corner that was detected twice
 _MIN_MATCHES = 12  # matches that agree with one pose; chance matches reach 8
 _MIN_RELOCALISATION_MATCHES = 30  # the same with which a lost frame is relocalised
+_MIN_SHARE = 0.15  # of the landmarks that should be in view; not every one is a corner again
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +64,7 @@ class MapCache:
     """Cached keyframes, bounded in number: slot k holds a keyframe, row k * landmarks + i one of its landmarks."""
 
     def __init__(
-        self, camera: RectifiedCamera, config: MapCacheConfig, matching: MatchConfig, ransac: RansacConfig,
+        self, camera: RectifiedCamera, config: MapCacheConfig, matching: MatchConfig,
         vocabulary: Vocabulary | None,
     ) -> None:  # fmt: skip
         k, p = config.keyframes, config.landmarks
@@ -73,7 +74,6 @@ class MapCache:
         self._config = config
         self._beyond_px = float(round(config.beyond * camera.width))
         self._matching = matching
-        self._ransac = ransac
         self._vocabulary = vocabulary
         self._index: PlaceIndex | None = None  # filled at the first search
         self._indexed: set[int] = set()
@@ -179,7 +179,7 @@ class MapCache:
         observed = np.column_stack([seen.uv[found.b], np.full(len(found.b), -1.0)])
         sigma_px = _CORNER_PX * np.ldexp(1.0, seen.octave[found.b].astype(np.int32))
         T, inlier = T_c_m.copy(), np.ones(len(found.a), np.bool_)
-        inliers, _ = optimise_pose(T, xyz, ray, observed, sigma_px, self._intrinsics, 3, 4, self._ransac.chi2, inlier)
+        inliers, _ = optimise_pose(T, xyz, ray, observed, sigma_px, self._intrinsics, 3, 4, PIXEL_CHI2, inlier)
         if inliers < _MIN_MATCHES or not np.isfinite(T).all():
             return None
         T = se3.orthonormalise(T)
@@ -211,7 +211,7 @@ class MapCache:
             T_c_m = self._pose_from(slot, submap, seen, frame_number)
             matches = None if T_c_m is None else self.match_landmarks(T_c_m, submap, seen)
             if matches is not None and len(matches.corner) >= max(
-                _MIN_RELOCALISATION_MATCHES, self._config.min_share * matches.in_view
+                _MIN_RELOCALISATION_MATCHES, _MIN_SHARE * matches.in_view
             ):
                 return submap, matches
         return None
@@ -226,7 +226,7 @@ class MapCache:
         observed = np.column_stack([seen.uv[found.b], np.full(len(found.b), -1.0)])
         fit = solve_pnp(
             projected.xyz[found.a], projected.ray[found.a], observed, seen.octave[found.b], self._intrinsics,
-            frame_number, self._ransac,
+            frame_number,
         )  # fmt: skip
         return None if fit is None or fit.inliers < _MIN_MATCHES else fit.T_c_m
 

@@ -34,6 +34,7 @@ _AMBIGUOUS_SHARE = 0.6  # of the inliers: with so many another place is as likel
 _AMBIGUOUS_RATIO = 0.2  # of the depth: difference up to which two results are the same place
 _AMBIGUOUS_RAD = 0.15  # rad: the same for the rotation
 _AGREE_RAD = 0.035  # rad: rotation between two results beside a new submap, 2 degrees
+_MIN_SHARE = 0.4  # of the landmarks the tracker searched for; a place that only looks similar has fewer
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,7 +188,7 @@ class Relocaliser:
         observed = np.column_stack([seen.uv[matches.b], np.full(len(matches.b), -1.0)])
         fit = solve_pnp(
             around.xyz[matches.a], around.ray[matches.a], observed, seen.octave[matches.b], self._map.intrinsics,
-            seed, self._config.ransac,
+            seed,
         )  # fmt: skip
         return None if fit is None or fit.inliers < _MIN_PNP_INLIERS else fit
 
@@ -198,7 +199,7 @@ class Relocaliser:
         self._map.activate(submap)
         track = self._tracker.track(ctx, T_c_m)
         self._map.activate(active)
-        if track.inliers < limits.min_inliers or track.inliers < limits.min_share * track.tried:
+        if track.inliers < limits.min_inliers or track.inliers < _MIN_SHARE * track.tried:
             return None
         return track
 

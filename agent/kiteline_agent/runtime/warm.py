@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 
 from kiteline_agent.agent import Agent
-from kiteline_agent.config import AgentConfig, TwoViewConfig
+from kiteline_agent.config import AgentConfig
 from kiteline_agent.ekf.filter_warm import warm_filter
 from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_agent.imaging.alignment_kernels import TEMPLATE, TEMPLATE_LEVELS
@@ -115,7 +115,7 @@ def _warm_monocular(image: U8, draw: F64) -> None:
     """Both starts, on a cloud of points (3,n) drawn from 0 to 1 and on one point, and the search of a seed."""
     x, y, z = draw[0] - 0.5, draw[1] - 0.5, 1.0 + draw[2]
     a, b = (np.column_stack([200.0 * (x - shift) / z + 159.5, 200.0 * y / z + 119.5]) for shift in (0.0, 0.2))
-    two_view(a, b, np.array([200.0, 200.0, 159.5, 119.5]), TwoViewConfig(), 0)
+    two_view(a, b, np.array([200.0, 200.0, 159.5, 119.5]), 0)
     one, two, three, turn = np.ones((1, 1)), np.zeros((1, 1, 2)), np.zeros((1, 3)), np.eye(3)
     add_observations(
         two, two, one, 1.0, three[None], one, turn, turn[None], three, three[0], one[0], three, turn[None],

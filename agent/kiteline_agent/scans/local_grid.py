@@ -24,6 +24,11 @@ _RAYS = 5  # in each sector
 _IN_A_FRAME = 8  # scans that are drawn again in a frame: 1 ms
 _NONE: I8 = np.zeros((0, 0), np.int8)
 _LEAST_HEADING = 0.3  # horizontal part of the vehicle's forward axis: less has no heading
+_NEAR_M = 2.0  # m; nearer obstacles are told even if something before them is unknown
+_DOUBT_PX = 0.3  # px; deviation of disparities from which tiles of the base do not count: 6 cm at 3 m
+_GAP_M = 1.0  # m along a ray that may be unknown before an obstacle is told: a turn between two scans
+_LEVEL_RAD = 0.03  # rad; error of the vertical from which scans are levelled again: 0.1 m of height at 3 m
+LOST_S = 0.3  # s without a pose after which scans are forgotten: 0.15 m at a change of speed by 3 m/s^2
 
 
 @dataclass(slots=True)
@@ -128,7 +133,7 @@ class LocalGrid:
         self._take(error)
         T, scan = scanned.T_o_c, scanned.scan
         R_l_o = level_rotation(scan.up_c).T @ T[:3, :3].T
-        if self._R_g_o is None or float(self._R_g_o[2] @ R_l_o[2]) < np.cos(self._config.level_rad):
+        if self._R_g_o is None or float(self._R_g_o[2] @ R_l_o[2]) < np.cos(_LEVEL_RAD):
             self._level(R_l_o)
         assert self._R_g_o is not None
         drawn = _Drawn.of(self._R_g_o @ T[:3, 3], self._R_g_o @ R_l_o[0], scan, scanned.offset_px)
@@ -170,7 +175,7 @@ class LocalGrid:
 
     def _take(self, error: RangeError) -> None:
         """Take over what is known of ranges."""
-        if error.common_px > self._config.doubt_px or (self._error is not None and error.moved(self._error)):
+        if error.common_px > _DOUBT_PX or (self._error is not None and error.moved(self._error)):
             self._sure_scans = 0
         if self._error is None or error.differs(self._error):
             self._error, self._canvas.fits = error, False
@@ -216,8 +221,8 @@ class LocalGrid:
         climbed_m = abs(float(p[2]) - canvas.z_m)  # since the frame
         own = canvas.cells if climbed_m < config.slab_m + config.body_m else _NONE
         kernels.read_distances(
-            own, canvas.marks, config.cell_m, own_at, window, cell_m, tile_at, config.vehicle_m, config.gap_m,
-            config.near_m, config.reach_m, _RAYS, out,
+            own, canvas.marks, config.cell_m, own_at, window, cell_m, tile_at, config.vehicle_m, _GAP_M,
+            _NEAR_M, config.reach_m, _RAYS, out,
         )  # fmt: skip
         return Surroundings(out, config.reach_m)
 
@@ -251,7 +256,7 @@ class LocalGrid:
             return False
         canvas.number += 1
         clear_m, certain_m = drawn.ranges(self._error, config.sigma_m)
-        seen_m = np.minimum(np.maximum(certain_m, config.near_m), config.reach_m)
+        seen_m = np.minimum(np.maximum(certain_m, _NEAR_M), config.reach_m)
         kernels.draw_rays(
             canvas.cells, canvas.marks, canvas.number, drawn.x_m - canvas.corner[0], drawn.y_m - canvas.corner[1],
             drawn.heading, scan.azimuths_rad, scan.azimuth_step_rad, clear_m, seen_m, config.cell_m,

@@ -5,6 +5,7 @@ import numpy as np
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.governor.cost_model import Work
 from kiteline_agent.imaging import alignment_kernels
+from kiteline_agent.imaging.alignment_kernels import ALIGN_ITERATIONS, FINE_STEP_PX, MIN_NCC
 from kiteline_agent.local_map import projection_kernels
 from kiteline_agent.local_map.local_map import Candidates, LocalMap
 from kiteline_agent.tracking.frame_context import FrameContext
@@ -112,7 +113,7 @@ class Tracker:
         octave = self._map.octave.take(rows)
         found = np.zeros(len(rows), np.bool_)
         last = 1 if coarse_only else 0
-        step = _COARSE_STEP_PX if coarse_only else align.fine_step_px
+        step = _COARSE_STEP_PX if coarse_only else FINE_STEP_PX
         # Templates from a finer level than this frame has are aligned one level up.
         least = 0 if coarse_only else images.first
         raised = np.maximum(octave, least) - octave if least else np.zeros_like(octave)
@@ -122,7 +123,7 @@ class Tracker:
             place, aligned = uv[some], found[some]  # views, or copies that are written back
             alignment_kernels.align(
                 images.sampled, images.grid, self._map.templates, rows[some], octave[some], warp[some], place,
-                max(first, finest), finest, align.iterations, step, align.min_ncc, aligned, np.empty(len(place)),
+                max(first, finest), finest, ALIGN_ITERATIONS, step, MIN_NCC, aligned, np.empty(len(place)),
             )  # fmt: skip
             if len(parts) > 1:
                 uv[some], found[some] = place, aligned

@@ -24,6 +24,7 @@ from kiteline_core.ids import AgentId, SubmapId, agent_of_submap, submap_of_keyf
 
 _KEPT_RATIO = 1.5  # of the option reach_m; tiles farther away are removed
 _SOLID_WEIGHT = 4  # cells added for each one that became an obstacle, or is none any more
+_PERIOD_S = 1.0  # s between two plans
 
 
 @dataclass(slots=True)
@@ -63,7 +64,7 @@ class TilePlanner:
 
     def update(self, agent: AgentId, live: LivePose | None, channel: RecordChannel, now_ns: int) -> None:
         """Plan the tiles of an agent at `live` once a period, and send the changes over its channel."""
-        velocity = AgentVelocity(self._config.period_s)
+        velocity = AgentVelocity(_PERIOD_S)
         state = self._agents.setdefault(agent, _AgentTiles(self._config.most_credit_bytes, velocity))
         if not self._config.max_tiles or live is None or now_ns < state.due_ns or self._updates.behind:
             return
@@ -72,7 +73,7 @@ class TilePlanner:
         ground_m = self._updates.ground_below(live.keyframe)
         if S_w_m is None or T_m_k is None or ground_m is None:
             return
-        state.due_ns = now_ns + round(self._config.period_s * 1e9)
+        state.due_ns = now_ns + round(_PERIOD_S * 1e9)
         here = sim3.place(S_w_m, T_m_k @ live.T_k_c)[:3, 3]
         ahead = here + self._config.horizon_s * state.velocity.update(live.t_ns, submap, here)
         keyframes = sum(len(k) for s, k in self._map.submaps.items() if agent_of_submap(s) == agent)

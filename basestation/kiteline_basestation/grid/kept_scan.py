@@ -18,6 +18,8 @@ _MOST = 65535
 _ANGLE_STEPS = 1 << 16  # codes in 1 rad
 _LATTICE = 4  # positions along a cell's side, and of a scan's farthest end as it turns
 _SCALE_STEPS = 1 << 10
+_FENCE = 1.5  # interquartile ranges above the upper quartile: longer rays to the ground are cut (Segfloor eq. 5.3)
+_ACCURATE_SIGMA_M = 0.05  # m; up to this deviation of a range a view counts in full: a cell by default
 
 
 class Lattice(NamedTuple):
@@ -50,7 +52,7 @@ class KeptScan:
 
     def accurate_m(self, config: GridConfig) -> float:
         """Range up to which a view counts in full."""
-        return math.sqrt(config.accurate_sigma_m / self.sigma_per_m2) if self.sigma_per_m2 > 0.0 else config.max_range_m
+        return math.sqrt(_ACCURATE_SIGMA_M / self.sigma_per_m2) if self.sigma_per_m2 > 0.0 else config.max_range_m
 
     def ranges(self) -> F64:
         """Obstacle, bands, free from, free to and clear (5, n), ranges in m; inf without an obstacle."""
@@ -116,7 +118,7 @@ def keep(config: GridConfig, scan: ColumnScan, bf_px_m: float, unit_m: float = 1
     seen = scan.free_m[scan.free_m > 0.0]
     if len(seen):
         q1, q3 = np.quantile(seen, (0.25, 0.75))
-        free_limit_m = min(limit_m, float(q3 + config.fence * (q3 - q1)))
+        free_limit_m = min(limit_m, float(q3 + _FENCE * (q3 - q1)))
     else:
         free_limit_m = 0.0
     solid = (scan.bands > 0) & (scan.obstacle_m <= limit_m)

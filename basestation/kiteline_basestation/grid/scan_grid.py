@@ -33,6 +33,10 @@ from kiteline_basestation.grid.tile_store import Place, TileStore
 from kiteline_core.arrays import F64, I8, I16, I32, U16
 
 Name = int | tuple[int, int]
+_MAX_POSITION_M = 100_000.0  # m; scans farther from the origin are not drawn: only a faulty map has them
+_MAX_REACH_M = 100.0  # m; scans that reach farther are not drawn: only a faulty scale makes them
+_VIEW_M = 0.5  # m; scans of an agent whose cameras lie in a square of this side ...
+_VIEW_RAD = 0.39  # rad; ... and head the same way within this, a quarter of the field of view, are one view
 
 
 class _Placed(NamedTuple):
@@ -90,10 +94,10 @@ class ScanGrid:
         tile or storey, or of a scale that makes it reach too far, is not drawn.
         """
         config = self.config
-        if not np.isfinite(S_w_c).all() or np.abs(S_w_c[:3, 3]).max() > config.max_position_m:
+        if not np.isfinite(S_w_c).all() or np.abs(S_w_c[:3, 3]).max() > _MAX_POSITION_M:
             return self.remove(name)
         new = _Placed(scan.lattice(config, S_w_c), scan, source)
-        if not new.lattice.storeys or scale_of(new.lattice) * scan.reach_m > config.max_reach_m:
+        if not new.lattice.storeys or scale_of(new.lattice) * scan.reach_m > _MAX_REACH_M:
             return self.remove(name)
         if new == self._placed.get(name):
             return False
@@ -132,8 +136,8 @@ class ScanGrid:
 
     def _view(self, placed: _Placed) -> _View:
         config, lattice = self.config, placed.lattice
-        x, y = (floor(v * config.cell_m / config.view_m) for v in position_cells(lattice))
-        heading = floor(placed.scan.heading_rad(config, lattice) / config.view_rad)
+        x, y = (floor(v * config.cell_m / _VIEW_M) for v in position_cells(lattice))
+        heading = floor(placed.scan.heading_rad(config, lattice) / _VIEW_RAD)
         return _View(placed.source, lattice.storeys, x, y, heading)
 
     def storey_of(self, ground_m: float) -> int:

@@ -33,6 +33,8 @@ _SCALE_SPREAD = 0.2  # of the logarithm of depth ratios; ratios within it agree
 _SCALE_SHARE = 0.7  # of the depth ratios that must agree: two different objects fix no scale
 _CELL_INLIERS = 2  # inliers that fill a cell
 _MIN_CELLS = 8  # filled cells, of 24
+_SIGMA_DISPARITY_PX = 0.4  # px; standard deviation of the disparities behind the landmarks' depths
+MAX_NEIGHBOURS = 8  # covisible keyframes whose landmarks are matched too
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +111,7 @@ def verify_loop(
     """
     mine = observations_of(sparse_map, new) if view is None else view
     across = sparse_map.map_id(submap_of_keyframe(new)) != sparse_map.map_id(submap_of_keyframe(old))
-    theirs = local_landmarks(sparse_map, old, config.max_neighbours if across else 0)
+    theirs = local_landmarks(sparse_map, old, MAX_NEIGHBOURS if across else 0)
     if not across:  # loops in one map wait for near views, which correct it best
         config = replace(config, min_inliers_local=config.min_inliers)
     wanted, offered = comparable(mine.descriptor, theirs.descriptor)
@@ -169,7 +171,7 @@ def _solve_pnp(
     rays = _depth_rays(sparse_map, theirs.points, theirs.xyz, config)
     observed = np.column_stack([mine.uv, mine.disparity])
     camera = sparse_map.keyframes.camera[sparse_map.rows[new]].copy()
-    fit = pnp.solve_pnp(theirs.xyz[b], rays[b], observed[a], mine.octave[a], camera, _seed(new, old), config.ransac)
+    fit = pnp.solve_pnp(theirs.xyz[b], rays[b], observed[a], mine.octave[a], camera, _seed(new, old))
     if fit is None or fit.inliers < config.min_inliers_local:
         return None
     a, b = a[fit.inlier], b[fit.inlier]
@@ -199,7 +201,7 @@ def _solve_similarity(
     fit = align_views(
         in_old, uv_old, sparse_map.keypoints.octave[theirs.points[b]], lens_old,
         se3.transform(se3.inverse(T_new), mine.xyz[a]), mine.uv[a], mine.octave[a], lens_new,
-        with_scale=True, seed=_seed(new, old), config=config.ransac,
+        with_scale=True, seed=_seed(new, old),
     )  # fmt: skip
     if fit is None or fit.inliers < config.min_inliers_local or not np.isfinite(fit.S_a_b).all():
         return None
@@ -270,7 +272,7 @@ def _match_neighbours(
     scale: of the old over the new map. Returns the pose, rows of `mine` and landmark slots (k,) that agree, and their
     share of the landmarks expected in view.
     """
-    around = [old, *sparse_map.covisible_keyframes(old, 1)[: config.max_neighbours]]
+    around = [old, *sparse_map.covisible_keyframes(old, 1)[:MAX_NEIGHBOURS]]
     points = sparse_map.sorted_by_id(np.concatenate([sparse_map.landmarks_of(k) for k in around]))
     _, known = sparse_map.positions(points)
     points = points[known & is_described(sparse_map.keypoints.descriptor[points])]
@@ -292,10 +294,10 @@ def _match_neighbours(
         xyz, _ = sparse_map.positions(b)
         inlier = np.ones(len(a), np.bool_)
         T = T.copy()
-        sigma = config.ransac.sigma_px * np.ldexp(1.0, mine.octave[a].astype(np.int32))
+        sigma = pnp.CORNER_SIGMA_PX * np.ldexp(1.0, mine.octave[a].astype(np.int32))
         optimise_pose(
             T, xyz, _depth_rays(sparse_map, b, xyz, config), np.ascontiguousarray(observed[a]), sigma, camera, 3, 5,
-            config.ransac.chi2, inlier,
+            pnp.PIXEL_CHI2, inlier,
         )  # fmt: skip
         if not np.isfinite(T).all():
             return None
@@ -336,4 +338,4 @@ def _depth_rays(sparse_map: SparseMap, points: I32, xyz: F64, config: LoopConfig
     depth = np.maximum(np.einsum("ni,ni->n", pose[:, :3, 2], ray), 1e-3)
     bf = np.maximum(sparse_map.keyframes.camera[rows, 4], 1.0)
     own = depth / sparse_map.keyframes.scale[rows]
-    return np.ascontiguousarray(ray * (config.sigma_disparity_px * own / bf)[:, None])
+    return np.ascontiguousarray(ray * (_SIGMA_DISPARITY_PX * own / bf)[:, None])

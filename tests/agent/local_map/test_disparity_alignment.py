@@ -14,7 +14,7 @@ from kiteline_agent.mapping.right_camera import RightCamera
 from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraModel, CameraRig, Rectifier
-from kiteline_core.geometry.disparity_offset import TERMS, terms
+from kiteline_core.geometry.disparity_offset import GOOD_PX, TERMS, terms
 from kiteline_core.ids import AgentId
 from tests.agent.disparity_flights import AHEAD, CAMERA, NOTHING, SIDEWAYS, WORN, Flight, normalised
 
@@ -160,7 +160,7 @@ def test_forward_motion_does_not_tell_of_a_rig_that_is_worn_a_little() -> None:
     flight = Flight(WORN, 1, AHEAD)
     assert flight.fly(60)  # as far off as good calibrations may be
     assert flight.alignment.is_good_offset and flight.alignment.applied_sigma_px is None
-    good_px = np.full(TERMS, DisparityAlignmentConfig().good_px)
+    good_px = np.full(TERMS, GOOD_PX)
     assert np.sqrt(np.mean((flight.map.disparity_offset / good_px) ** 2)) < 3.0
 
 

@@ -17,7 +17,6 @@ from kiteline_codec.channel import CodedChannel, RecordChannel, coded_channel
 from kiteline_codec.pacing.profiles import RADIO, WIFI, Profile
 from kiteline_codec.schema import Key, KeyframeScan, Record, ScanImages, messages
 from kiteline_core.frame import Frame
-from kiteline_core.ground.config import GroundConfig
 from kiteline_core.ground.disparity import DisparityCamera
 from kiteline_core.ground.ground_height import GroundHeight
 from kiteline_core.ground.image_codes import decode_pair
@@ -115,7 +114,7 @@ def test_the_base_draws_what_the_images_show_and_they_are_gone(recording: Path) 
     agent, frames = agent_of(recording, by_base(), channel)
     station = Station(BaseConfig(), open_end)
     station.join(AgentId(0))
-    known: GroundHeight[KeyframeScan] = GroundHeight(GroundConfig())
+    known: GroundHeight[KeyframeScan] = GroundHeight()
     known.start_at(BEGINNING)
     station.mapper.image_scans._ground_of = lambda record: known  # type: ignore[method-assign]
     done: tuple[JobDone, ...] = ()

@@ -1,4 +1,4 @@
-"""Which matches agree on one correction, against plain similarities; which outvote the expected drift."""
+"""Which matches agree on one correction, against plain similarities; which show more than the expected drift."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -103,18 +103,18 @@ def weighed(sparse_map: SparseMap, matches: Sequence[LoopMatch], words: Any) -> 
     return [detector._weigh(match) for match in matches]
 
 
-def test_keyframes_along_a_path_outvote_the_expected_drift(drifted: Any, words: Any) -> None:
+def test_keyframes_along_a_path_show_more_than_the_expected_drift(drifted: Any, words: Any) -> None:
     sparse_map, matches = drifted([0.5 * n for n in range(12)])
     found = weighed(sparse_map, matches, words)
     assert found[:-1] == [None] * 11 and isinstance(found[-1], LoopClosure)
 
 
-def test_keyframes_that_go_to_and_fro_are_one_vote(drifted: Any, words: Any) -> None:
+def test_keyframes_that_go_to_and_fro_are_one_match(drifted: Any, words: Any) -> None:
     sparse_map, matches = drifted([0.5 * (n % 3) for n in range(20)])
     assert weighed(sparse_map, matches, words) == [None] * 20
 
 
-def test_keyframes_that_see_two_places_are_no_votes(drifted: Any, words: Any) -> None:
+def test_keyframes_that_see_two_places_do_not_agree(drifted: Any, words: Any) -> None:
     sparse_map, matches = drifted([0.5 * n for n in range(12)])
     away = se3.from_rt(np.eye(3), np.array([0.0, 0.0, 2.0]))
     elsewhere = [replace(m, old=keyframe_id(A, 0), T_old_new=away @ m.T_old_new) for m in matches]

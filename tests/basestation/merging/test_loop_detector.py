@@ -82,11 +82,13 @@ def test_loop_is_closed_while_keyframes_arrive(around: Any, late: int) -> None:
         assert np.allclose(last[keyframe], mapper.map.pose(keyframe), atol=1e-9)
 
 
-@pytest.mark.parametrize(("votes", "most_drift", "closed"), [(6, 1000.0, True), (1000, 1000.0, False), (6, 1.0, False)])
-def test_many_votes_close_a_loop_that_drifted_more_than_expected(
-    around: Any, words: Any, votes: int, most_drift: float, closed: bool
+@pytest.mark.parametrize(
+    ("matches", "most_drift", "closed"), [(6, 1000.0, True), (1000, 1000.0, False), (6, 1.0, False)]
+)
+def test_many_matches_close_a_loop_that_drifted_more_than_expected(
+    around: Any, words: Any, matches: int, most_drift: float, closed: bool
 ) -> None:
-    strict = replace(BaseConfig().loops, drift_m=0.001, drift_path=0.0, drift_votes=votes, most_drift=most_drift)
+    strict = replace(BaseConfig().loops, drift_m=0.001, drift_path=0.0, drift_matches=matches, most_drift=most_drift)
     flight, blind = around(-1)[:2]
     detector = LoopDetector(strict, blind.map, words)
     closures = []
