@@ -51,6 +51,7 @@ from kiteline_core.places.place_index import Vocabulary
 # Forward, right, down of a vehicle that flies where its camera looks.
 _T_C_F = np.array([[0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 _STILL_PX = 0.3  # by which a rolling shutter moves pixels of a vehicle that stands still, at most
+_OBSTACLE_TOLD_S = 1.0  # s between two lines of the log about the nearest obstacle
 
 
 class Agent:
@@ -112,7 +113,7 @@ class Agent:
                 self._camera, self._rectifier, self.map, maker, self._governor, channel, config.scan, config.ground,
                 self.work, config.detector.covered_parts,
             )  # fmt: skip
-        self._local_grid = LocalGrid(config.local_grid)
+        self._local_grid = LocalGrid(config.local_grid, config.ground.slab_m)
         self._loss = LossStage(
             self._camera, self._keyframes, self._submaps, self._relocaliser, self._governor,
             monocular=not self._has_depth,
@@ -310,7 +311,7 @@ class Agent:
         if scanned is None or error is None:
             return []
         self._local_grid.add(scanned, error)
-        if ctx.t_ns - self._obstacle_event_ns < self._full_config.scan.told_s * 1e9:
+        if ctx.t_ns - self._obstacle_event_ns < _OBSTACLE_TOLD_S * 1e9:
             return []
         self._obstacle_event_ns = ctx.t_ns
         around = self._local_grid.around(T_o_c @ _T_C_F, None, {}, self._full_config.ground.bands_m)

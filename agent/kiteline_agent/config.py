@@ -122,7 +122,6 @@ class DepthFromMotionConfig:
     off_line_px: float = 1.5  # px at octave 0 between the aligned pixel and the epipolar line
     gate: float = 3.0  # standard deviations between measured and held inverse depth
     sigma_px: float = 0.5  # px: standard deviation of an aligned pixel, with the pose's own error
-    known: float = 0.12  # deviation over inverse depth below which a seed becomes a landmark
     min_hits: int = 3  # frames that agree
     max_misses: int = 6  # frames without a match: it moved, or was an occlusion edge
 
@@ -135,8 +134,6 @@ class DisparityAlignmentConfig:
     every: int = 4  # frames between two pairs, at most: each costs 0.3 ms
     points: int = 120  # most of them that are used
     sigma_px: float = 0.3  # px at octave 0; of aligned coordinates and disparities
-    worn_share: float = 0.2  # probability of a worn rig before the flight
-    sure: float = 0.95  # the same, above which the offset is applied
 
 
 @dataclass(frozen=True, slots=True)
@@ -235,7 +232,6 @@ class LogConfig:
     every: int = 1  # frames; of so many, the images of one are logged, 0: none. Only a log with all can be replayed
     compressed: bool = True  # PNG of half an image's size for some 2.7 ms of a fast core, else stored for 0.25 ms
     apart: bool = True  # live flights encode in another process: 0.2 ms of the agent's CPU time for a pair, not 5
-    waiting: int = 12  # images that wait to be encoded, 9 MB; then live flights store images, others wait
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 class CornerTracksConfig:
     """How corners are found and followed."""
 
-    corners: int = 200  # followed at once; a bundle of 100 long tracks is as accurate as one of 300
     cell_px: int = 32  # px: one corner a cell
     keyframes: int = 45  # of a window, whose cost grows with their square; of more, every second old one is left out
 
@@ -27,7 +26,6 @@ class InertialBundleConfig:
     lens_centre_px: float = 1.0  # px; the same of the centre
     lens_radial: float = 0.005  # of pixels over focal length where r is 1: half a pixel in between
     camera_turn_rad: float = 0.003  # rad about an axis; the same of the camera's rotation in the body
-    settled: float = 0.1  # fall of the cost below which the last one ends: a deviation of the scale is worth 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +42,6 @@ class InertialStartConfig:
 
     landmarks: int = 220  # of the window, with the longest tracks: errors of few add up to a wrong turn and motion
     min_flow: float = 0.02  # of the focal length, median: with less the camera has not moved
-    scale_sigma: float = 0.02  # relative deviation of the scale below which it is metric
 
     contradiction: ContradictionConfig = field(default_factory=ContradictionConfig)
     corner_tracks: CornerTracksConfig = field(default_factory=CornerTracksConfig)

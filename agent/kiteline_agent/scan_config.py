@@ -22,7 +22,6 @@ class ScanConfig:
         0.2  # m; motion since the last scan: it sees a wall at 3 m from another angle, by 4 degrees; 0: any
     )
     turned_rad: float = 0.17  # rad; rotation since the last scan: a tenth of the field of view is new; 0: any
-    told_s: float = 1.0  # s; time between two lines of the log about the nearest obstacle
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +33,6 @@ class LocalGridConfig:
     sigma_m: float = 0.07  # m; deviation of a range up to which own scans count: 4 m with 0.11 m of baseline
     scans: int = 48  # newest ones that are kept: 10 m of flight, or more than a turn
     slab_m: float = 0.1  # m that the camera climbs until scans are drawn anew
-    seen_m: float = 0.2  # m above and below the camera that a scan's line of sight covers: `ground.slab_m`
     body_m: float = 0.25  # m above and below the vehicle where an obstacle stands in its way: a small drone
     repeats: int = 4  # newest scans of one view that are kept: as many as turn a cell that was free
     vehicle_m: float = 0.15  # m about its middle where the vehicle is itself

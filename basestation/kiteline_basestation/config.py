@@ -41,7 +41,6 @@ class OdometryFactorConfig:
     worn_px: float = (
         0.5  # px per sqrt(s) between them, for both: of a worn rig, whose disparity offset is counted apart
     )
-    run: int = 20  # keyframes; consecutive rotations whose common error is estimated together
     sigma_px: float = 0.15  # px; of each of 12 synthetic points if the keyframe has no observations
 
 
@@ -78,7 +77,6 @@ class LoopConfig:
     min_inliers_all: int = 35  # landmarks that agree, with those of the neighbours, to merge maps
     min_inliers_loop: int = 40  # landmarks that agree, with those of the neighbours, to close a loop in one map
     min_matched_share: float = 0.25  # of the landmarks expected in view: less is an object that stands in two places
-    scale_sigma: float = 0.02  # standard error of the scale's logarithm: the bundle corrects a few percent
     columns: int = 6  # cells across the image: a poster that hangs twice fills few of them
     rows: int = 4  # cells down the image
     predecessors: int = 4  # keyframes beside matched ones that are verified too: their views still overlap
@@ -107,7 +105,6 @@ class GraphConfig:
 class DisparityCalibrationConfig:
     """Calibration of each agent's disparity offset by bundles of a whole map."""
 
-    worn: float = 15.0  # factor on both deviations for a rig that has changed since its calibration: one or two pixels
     contradicts: float = (
         6.0  # squared distance of the data from a good calibration, inflated; of true rigs it is below 1
     )
@@ -166,11 +163,9 @@ class TileConfig:
     reach_m: float = 14.0  # m; tiles whose centres are nearer are sent: distances are told up to 10 m
     keyframe_bytes: float = 100.0  # bytes that each of the agent's keyframes earns: two thirds of a scan upwards
     most_credit_bytes: float = 3000.0  # bytes at once: after a loop closure, or when an agent comes to a known place
-    overhead_bytes: int = 14  # of a tile in a packet: its key, version and a share of headers
     min_changes: int = (
         96  # cells that differ before a tile is sent again: its newest edges are in the agent's own scans
     )
-    near_m: float = 4.0  # m; added to distances: among near tiles changes decide
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,12 +192,6 @@ class GridConfig:
     fair_sigmas: float = 1.0  # fewer of them from which on it is less far before: 0.3 % are wrong with no sign near
     side_columns: int = (
         2  # of a scan at either side of its view that count as far ones: what stands there is not seen whole
-    )
-    occupied_from: int = 9  # 1/32; log-odds from which a band is occupied: one near view, two far ones
-    free_from: int = 4  # 1/32; a cell is free if all bands lie at or below minus this: one sure view, two far ones
-    free_clear: int = 3  # 1/32; the same with no sign of an obstacle within two cells: one fair view
-    free_beside: int = (
-        10  # 1/32; the same beside an occupied cell: a near view and a sure one, as one may lie a cell off
     )
     hole_neighbours: int = (
         5  # of 8 that are free, none occupied: a cell that no view spoke against is free too (a gap between two rays)

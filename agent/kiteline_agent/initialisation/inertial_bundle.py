@@ -39,6 +39,7 @@ _ROUNDS = 2  # in which corners are left out, each followed by another solution
 _FIRST_DEPTH_M = 3.0  # m at which all landmarks start; only the sign matters
 _STRUCTURE_ITERATIONS, _ITERATIONS = 25, 20  # steps of the first stage, of which nothing is known, and of the last
 _STRUCTURE_SETTLED = 1e-3  # relative fall of the cost below which the first stage ends
+_SETTLED = 0.1  # fall of the cost below which the last one ends: a deviation of the scale is worth 0.5
 
 
 @dataclass(slots=True)
@@ -245,8 +246,7 @@ class InertialBundle:
                 if damping > _MAX_DAMPING:
                     break
                 continue
-            config = self._config
-            enough = config.settled if inertial else _STRUCTURE_SETTLED * system.cost
+            enough = _SETTLED if inertial else _STRUCTURE_SETTLED * system.cost
             settled = system.cost - cost < enough
             state, damping = moved, max(0.1 * damping, 1e-9)
             if self._terms.biases_moved(state):

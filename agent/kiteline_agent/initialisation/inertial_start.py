@@ -13,7 +13,7 @@ from kiteline_agent.inertial.preintegration import BiasPrior, Samples, preintegr
 from kiteline_agent.inertial.sample_buffer import SampleBuffer
 from kiteline_agent.initialisation import corner_tracks, lens_correction
 from kiteline_agent.initialisation.contradiction import ContradictionWatch, contradicts, exceeds_lens_errors
-from kiteline_agent.initialisation.corner_tracks import KEYFRAME_S, CornerObservations, CornerTracks, TrackedKeyframe
+from kiteline_agent.initialisation.corner_tracks import CornerObservations, CornerTracks, TrackedKeyframe
 from kiteline_agent.initialisation.inertial_bundle import InertialBundle, lens_prior
 from kiteline_agent.initialisation.inertial_window import (
     InParts,
@@ -52,6 +52,7 @@ _LEAST_ACCEL_NOISE = 0.5  # times the noise of single samples: vibration average
 _STATE_INFLATION = 2.0  # of the deviations of the state with which tracking begins
 _DEPTH_SIGMA = 0.25  # relative deviation above which a landmark has no depth yet
 _STRUCTURE_PX = 1.2  # px; median error of corners with the gyro's rotations: 0.3 if these are right, else 2
+_SCALE_SIGMA = 0.02  # relative deviation of the scale below which it is metric
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,11 +104,9 @@ class InertialStart:
         self._may_go_on = may_go_on
         self._attempt: InParts[InertialMap | None] | None = None  # that has begun
         start = config.inertial_start
-        detector = replace(
-            config.detector, cell_px=start.corner_tracks.cell_px, max_corners=start.corner_tracks.corners
-        )
+        detector = replace(config.detector, cell_px=start.corner_tracks.cell_px, max_corners=corner_tracks.CORNERS)
         self._tracks = CornerTracks(camera, detector, start.corner_tracks)
-        self.waiting = WaitingFrames(KEYFRAME_S)
+        self.waiting = WaitingFrames(corner_tracks.KEYFRAME_S)
         self._buffer = SampleBuffer(_MAX_SPAN_S + 1.0, config.inertial.max_gap_s)
         self._before: SolvedWindow | None = None
         self._noise: WindowNoise | None = None  # as the windows so far show it
@@ -238,7 +237,7 @@ class InertialStart:
             return None
         solution, modelled = found.solution, self._noise
         noise, sigma = self._seen_noise(solution)
-        if sigma < _NEARLY * config.scale_sigma:
+        if sigma < _NEARLY * _SCALE_SIGMA:
             self._work.alignments += int(np.count_nonzero(observations.seen))
             aligned = realigned(
                 keyframes, observations, solution.state, found.xyz, found.first, self._camera, self._config.align
@@ -254,7 +253,7 @@ class InertialStart:
         self._before = SolvedWindow(stamps, observations.ids, found.xyz, solution)
         (wrong, by_imu), fits = self._contradicts(solution, noise), solution.converged and solution.fits
         self._note_contradiction(ctx.t_ns, contradicts=wrong if wrong or fits else None, by_imu=by_imu)
-        known = fits and sigma < config.scale_sigma and not wrong
+        known = fits and sigma < _SCALE_SIGMA and not wrong
         agrees = before is not None and self._agrees(before, self._before)
         self._noise = modelled
         if known and agrees and warm is not None:

@@ -31,6 +31,7 @@ _STEP_PX = 0.7  # px of the level between two tries: half the width of the corre
 _DISTINCT = 0.93  # share of the best correlation that nothing else on the segment may reach
 _INFLATION = 2.0  # factor on variances of seeds: successive frames share the template's error
 _NEARER = 2.0  # times the inverse depth of the nearest twentieth of the landmarks: end of the search
+_KNOWN = 0.12  # deviation over inverse depth below which a seed becomes a landmark
 
 
 class DepthFromMotion:
@@ -133,7 +134,7 @@ class DepthFromMotion:
         prior = sigma[rows] ** 2
         rho[rows] = np.maximum((rho[rows] * variance + measured * prior) / (variance + prior), 1e-6)
         sigma[rows] = np.sqrt(variance * prior / (variance + prior))
-        known = (sigma[rows] < config.known * np.maximum(rho[rows], _FAR_SHARE * typical)) & (
+        known = (sigma[rows] < _KNOWN * np.maximum(rho[rows], _FAR_SHARE * typical)) & (
             self._map.hits[rows] >= config.min_hits
         )
         self._map.promote(rows[known])

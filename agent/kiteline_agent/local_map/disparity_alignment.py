@@ -41,6 +41,8 @@ _FORWARD_KEYFRAMES = 12  # that tell something of their own then; more of them r
 _FORWARD_GOOD_KEYFRAMES = 3  # the same of a good calibration's offset, which is no larger than these errors are
 _PAIR_EVERY_S = 0.18  # s between two pairs, at most: slow cameras, and frames that the governor skips
 _PARALLAX_GROWTH = 1.2  # of the parallax between two pairs of the same keyframe
+_WORN_SHARE = 0.2  # probability of a worn rig before the flight
+_SURE = 0.95  # probability of a worn rig above which the offset is applied
 
 
 class DisparityAlignment:
@@ -75,9 +77,9 @@ class DisparityAlignment:
         # If the rig is not worn: what was expected of it, its most probable offset, and whether another one than the
         # expected is likelier, and differs from that by more than its deviation.
         self.expected_px, self._good_estimate, self._good_is_known = none(), none(), False
-        self._prior_log_odds = math.log(config.worn_share / (1.0 - config.worn_share))  # of a worn rig
+        self._prior_log_odds = math.log(_WORN_SHARE / (1.0 - _WORN_SHARE))  # of a worn rig
         self._log_odds = self._prior_log_odds  # by disparities alone
-        self.worn = self.rig_worn = config.worn_share  # probability of it: by disparities alone, and with rows
+        self.worn = self.rig_worn = _WORN_SHARE  # probability of it: by disparities alone, and with rows
         self._row_evidence = 0.0  # see add_row_evidence
         self.applied = False  # the rig is worn: an offset found here was applied
         self._applied_sigma_px = np.inf  # of the estimate that was applied
@@ -283,13 +285,13 @@ class DisparityAlignment:
         In forward motion, where disparities tell little, the rows of the right image count as well.
         """
         rows = 0.0 if self._moves_sideways() else self._row_evidence
-        if _probability(self._log_odds + rows) < self._config.sure:
+        if _probability(self._log_odds + rows) < _SURE:
             return False
         share = self._own_share(_FORWARD_KEYFRAMES) * self._believed_share()
         h = share * (self._evicted_sure_h + np.einsum("s,sij->ij", self._share, self._pair_h)) + self._earlier_h
         b = share * (self._evicted_sure_b + self._share @ self._pair_b) + self._earlier_b
         odds = self._prior_log_odds + _log_evidence(h, b, self._prior) - _log_evidence(h, b, self._good)
-        return _probability(odds + rows) >= self._config.sure
+        return _probability(odds + rows) >= _SURE
 
     def _own_share(self, most: int) -> float:
         """Share of the pairs' information, if in forward motion no more than so many keyframes tell on their own."""

@@ -15,6 +15,7 @@ from kiteline_codec.schema import GridTile
 from kiteline_codec.schema.base.grid_tile import FREE, TILE_CELLS
 from kiteline_core.arrays import F64, I8
 from kiteline_core.ground.column_scan import ColumnScan, level_rotation
+from kiteline_core.ground.config import GroundConfig
 
 SECTORS = 72  # of 5 degrees
 _CELLS = 512  # along each side of the local grid
@@ -112,8 +113,9 @@ class LocalGrid:
     or more is known of the errors of ranges, all are drawn again on another canvas, some in each frame.
     """
 
-    def __init__(self, config: LocalGridConfig) -> None:
-        self._config = config
+    def __init__(self, config: LocalGridConfig, sight_m: float = GroundConfig().slab_m) -> None:
+        """sight_m: above and below the camera that a scan's line of sight covers."""
+        self._config, self._sight_m = config, sight_m
         self._error: RangeError | None = None  # by which scans are drawn
         self._told: RangeError | None = None  # the last one that `follow` was given
         self._sure_scans = config.scans  # in a row, since the rig was in doubt
@@ -260,7 +262,7 @@ class LocalGrid:
         kernels.draw_rays(
             canvas.cells, canvas.marks, canvas.number, drawn.x_m - canvas.corner[0], drawn.y_m - canvas.corner[1],
             drawn.heading, scan.azimuths_rad, scan.azimuth_step_rad, clear_m, seen_m, config.cell_m,
-            away_m <= config.seen_m - config.slab_m,
+            away_m <= self._sight_m - config.slab_m,
         )  # fmt: skip
         return True
 

@@ -25,6 +25,8 @@ from kiteline_core.ids import AgentId, SubmapId, agent_of_submap, submap_of_keyf
 _KEPT_RATIO = 1.5  # of the option reach_m; tiles farther away are removed
 _SOLID_WEIGHT = 4  # cells added for each one that became an obstacle, or is none any more
 _PERIOD_S = 1.0  # s between two plans
+_NEAR_M = 4.0  # m; added to distances: among near tiles changes decide
+_OVERHEAD_BYTES = 14  # bytes of a tile in a packet: its key, version and a share of headers
 
 
 @dataclass(slots=True)
@@ -145,14 +147,14 @@ class TilePlanner:
                 np.count_nonzero(other & ((cells > 0) != (before > 0)))
             )
             if changes >= self._config.min_changes:
-                ranked.append((-changes / (distance + self._config.near_m), place, cells))
+                ranked.append((-changes / (distance + _NEAR_M), place, cells))
             elif held is not None and not changes:
                 held.revision = grid.revision
         for _, place, cells in sorted(ranked, key=lambda item: item[:2]):
             if room <= 0 or state.credit_bytes <= 0.0:
                 return
             record = GridTile(place.column, place.row, place.storey, grid.config.cell_m, cells)
-            state.credit_bytes -= messages.length(record) + self._config.overhead_bytes
+            state.credit_bytes -= messages.length(record) + _OVERHEAD_BYTES
             channel.put(record)
             state.sent[place] = _Sent(cells, grid.revision)
             room -= 1

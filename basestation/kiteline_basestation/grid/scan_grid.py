@@ -55,11 +55,21 @@ class _View(NamedTuple):
     heading: int
 
 
+class CellRules(NamedTuple):
+    """Log-odds, in 1/32, from which a cell is occupied or free. A band is occupied, a cell is free in all bands."""
+
+    occupied_from: int = 9  # one near view, two far ones
+    free_from: int = 4  # below minus this: one sure view, two far ones
+    free_clear: int = 3  # the same with no sign of an obstacle within two cells: one fair view
+    free_beside: int = 10  # the same beside an occupied cell: a near view and a sure one, as one may lie a cell off
+
+
 class ScanGrid:
     """Tiles of log-odds, and the scans that are drawn in them, by name."""
 
-    def __init__(self, config: GridConfig) -> None:
+    def __init__(self, config: GridConfig, rules: CellRules | None = None) -> None:
         self.config = config
+        self._rules = rules or CellRules()
         self.revision = 0  # number of changes so far
         self.touched: dict[
             Place, int
@@ -176,10 +186,7 @@ class ScanGrid:
             slots,
             self._store.pool,
             bands,
-            config.occupied_from,
-            config.free_from,
-            config.free_clear,
-            config.free_beside,
+            *self._rules,
             config.hole_neighbours,
             int(config.opening),
             cells,
@@ -187,9 +194,9 @@ class ScanGrid:
         self._store.close()
         return cells, int(known)
 
-    def redrawn(self, config: GridConfig) -> "ScanGrid":
+    def redrawn(self, config: GridConfig, rules: CellRules) -> "ScanGrid":
         """The same scans where they lie now, all of them, drawn with other weights and thresholds."""
-        grid = ScanGrid(config)
+        grid = ScanGrid(config, rules)
         for placed in self._placed.values():
             grid._draw(placed, 1)
         return grid

@@ -35,6 +35,7 @@ _CELL_INLIERS = 2  # inliers that fill a cell
 _MIN_CELLS = 8  # filled cells, of 24
 _SIGMA_DISPARITY_PX = 0.4  # px; standard deviation of the disparities behind the landmarks' depths
 MAX_NEIGHBOURS = 8  # covisible keyframes whose landmarks are matched too
+_SCALE_SIGMA = 0.02  # standard error of the scale's logarithm: the bundle corrects a few percent
 
 
 @dataclass(frozen=True, slots=True)
@@ -236,7 +237,7 @@ def depth_scale(own: F64, other: F64, config: LoopConfig) -> float | None:
     apart = np.abs(ratio - middle)
     close = apart < _SCALE_SPREAD
     sigma = 1.2533 * 1.4826 * float(np.median(apart)) / np.sqrt(len(ratio))  # standard error of a median
-    if float(np.mean(close)) < _SCALE_SHARE or sigma > config.scale_sigma:
+    if float(np.mean(close)) < _SCALE_SHARE or sigma > _SCALE_SIGMA:
         return None
     return float(np.exp(middle))
 

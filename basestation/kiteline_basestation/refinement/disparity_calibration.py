@@ -22,6 +22,7 @@ _MIN_SIGNIFICANCE = 0.5  # standard deviations; from which an offset is accepted
 _TAIL = 6.0  # standard deviations, inflated: beyond two of the prior's own it yields to the data
 _DETERMINED = 0.7  # share of the prior's deviation; a term yields that data alone determine better
 CALIBRATED_PX = 0.03  # px; standard deviation of the offset below which it counts as known
+_WORN = 15.0  # factor on both deviations for a rig that has changed since its calibration: one or two pixels
 
 
 def at_keypoints(sparse_map: SparseMap, slots: I32) -> F64:
@@ -63,7 +64,7 @@ def with_border(
     prior = _prior_px(focal)
     onboard = [sparse_map.onboard_sigma_px.get(a) for a in agents]
     tells = sideways_share(problem.T_c_m) >= config.min_sideways
-    worn = prior * config.worn  # where forward motion told an agent no more than that its rig is worn
+    worn = prior * _WORN  # where forward motion told an agent no more than that its rig is worn
     sigma = np.stack([
         prior if s is None else worn if s > GOOD_PX and not tells else np.full(TERMS, s) for s in onboard
     ])  # fmt: skip
@@ -73,7 +74,7 @@ def with_border(
     believed = np.array([s is None and (tells or has_bent(sparse_map, a)) for a, s in zip(agents, onboard)])
     border = Border(
         group, at_keypoints(sparse_map, slots), start, sigma / config.inflation, _TAIL, _DETERMINED,
-        config.worn, np.where(believed, config.inflation**2 * config.contradicts, np.inf), mean,
+        _WORN, np.where(believed, config.inflation**2 * config.contradicts, np.inf), mean,
     )  # fmt: skip
     return replace(problem, measured=measured, border=border), agents
 

@@ -14,7 +14,6 @@ class GroundConfig:
     lower: float = 0.067  # of its height by which their view lies lower: 32 of 480 px, of 15 to 70; 0: not lower
     disparities: int = 48  # px searched, a multiple of 16: from 0.5 m on with 0.11 m of baseline; less CPU if fewer
     stripes: int = 2  # in which a pair is matched, one a frame: 2 ms each of a fast core at 752x480; a whole one is 3.5
-    texture: int = 4  # grey levels over two pixels along a row, at least: six times the noise of a plain floor
     sigma_px: float = 0.25  # px; error of a disparity
     depth_sigma: float = 2.85e-3  # 1/m; error of inverse depth of a depth camera (K. Khoshelham, S. Elberink, 2012)
     largest_height_m: float = 8.0  # m; the same at most: from higher up, disparities of half a pixel say little

@@ -60,6 +60,7 @@ _LEAST_KNOWN = 0.7  # of a column's pixels below the horizon: among more unknown
 _COLUMN_PIXELS = 5  # of an obstacle in a column, at least: fewer are chance
 _MAX_RANGE_M = 60.0  # m; farther ground and obstacles are left out
 _MAX_RANGE_SIGMA = 0.1  # relative deviation of a range, at most: a disparity of 2.5 px
+_TEXTURE = 4  # grey levels over two pixels along a row, at least: six times the noise of a plain floor
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,7 +156,6 @@ class GroundSegmenter:
         up_c: (3,) unit vector against gravity. offset_px: (5,) error of disparities. expected: where the
         height is known: what lies there is ground, however little of it is seen.
         """
-        config = self.config
         offset_px = disparity_offset.none() if offset_px is None else offset_px
         view = _View(up_c, np.ascontiguousarray(level_rotation(up_c).T), offset_px, pair)
         self._known.fill(0)
@@ -164,7 +164,7 @@ class GroundSegmenter:
             self._column, self._known,
         )  # fmt: skip
         if pair is not None:
-            label_kernels.mark_texture(pair[0], config.texture, _TEXTURE_PX, self._textured)
+            label_kernels.mark_texture(pair[0], _TEXTURE, _TEXTURE_PX, self._textured)
         self._depths.fill(0)
         level_kernels.count_depths(
             self.x, self.z, self._column, (_LOWEST_AHEAD_M, _LOWEST_SIGMA_M), _LOWEST_SLOPE,

@@ -7,9 +7,10 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from kiteline_agent.config import AgentConfig, DisparityAlignmentConfig
+from kiteline_agent.config import AgentConfig
 from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_agent.governor.cost_model import Work
+from kiteline_agent.local_map.disparity_alignment import _WORN_SHARE
 from kiteline_agent.mapping.right_camera import RightCamera
 from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
@@ -29,7 +30,7 @@ def test_the_offset_of_a_worn_rig_is_found_and_corrects_the_map(seed: int) -> No
     grid = terms(normalised(np.array([[x, y] for x in (60.0, 376.0, 690.0) for y in (60.0, 240.0, 420.0)])))
     left = np.sqrt(np.mean((grid @ (WORN - flight.map.disparity_offset)) ** 2))
     assert left < 0.3 * np.sqrt(np.mean((grid @ WORN) ** 2))
-    worn_rig = np.trace(before) / DisparityAlignmentConfig().worn_share
+    worn_rig = np.trace(before) / _WORN_SHARE
     assert np.trace(flight.alignment.expected_cov) < 0.08 * worn_rig
     off = flight.map.rho[0, :160] - 1.0 / flight.depth
     assert abs(np.median(off * CAMERA.bf)) < 0.15
@@ -70,7 +71,7 @@ def test_a_true_rig_is_left_alone(seed: int) -> None:
 
 def test_rows_that_are_off_tell_of_a_worn_rig_before_it_moves() -> None:
     alignment = Flight(NOTHING, 0, SIDEWAYS).alignment
-    doubtful, prior, share = alignment.expected_cov, alignment.cov, DisparityAlignmentConfig().worn_share
+    doubtful, prior, share = alignment.expected_cov, alignment.cov, _WORN_SHARE
     assert alignment.rig_worn == pytest.approx(share)
     alignment.add_row_evidence(12.0)
     assert alignment.rig_worn > 0.999

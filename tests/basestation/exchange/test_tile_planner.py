@@ -7,7 +7,7 @@ import pytest
 
 from kiteline_basestation.config import BaseConfig, TileConfig
 from kiteline_basestation.exchange.agent_velocity import AgentVelocity
-from kiteline_basestation.exchange.tile_planner import TilePlanner
+from kiteline_basestation.exchange.tile_planner import _OVERHEAD_BYTES, TilePlanner
 from kiteline_basestation.grid.grid_updates import GridUpdates
 from kiteline_basestation.grid.tile_store import Place
 from kiteline_basestation.map.sparse_map import SparseMap
@@ -56,7 +56,7 @@ class Flight:
                 for record in b.receive(a.poll(self.now_ns), self.now_ns):
                     assert isinstance(record, GridTile)
                     self.tiles[record.column, record.row, record.storey] = record
-                    self.tile_bytes += messages.length(record) + TileConfig().overhead_bytes
+                    self.tile_bytes += messages.length(record) + _OVERHEAD_BYTES
             for key in self.agent.take_removed():
                 self.tiles.pop(GridTile.place(key), None)
             self.now_ns += S // 20
