@@ -26,7 +26,7 @@ from kiteline_agent.mapping.loss_stage import FrameOutcome, LossStage
 from kiteline_agent.mapping.pose_report import PoseReport
 from kiteline_agent.mapping.right_camera import RightCamera
 from kiteline_agent.mapping.submap_stage import SubmapStage
-from kiteline_agent.motion.extrapolation import MAX_PREDICTION_S
+from kiteline_agent.motion.extrapolation import LEAST_PREDICTION_PERCENT, MAX_PREDICTION_S
 from kiteline_agent.relocalisation.map_cache import MapCache
 from kiteline_agent.relocalisation.relocaliser import Relocaliser
 from kiteline_agent.scans.local_grid import LOST_S, LocalGrid, Surroundings
@@ -146,7 +146,7 @@ class Agent:
             if tracked:
                 estimate, more = self._process_next(step_input.frame)
                 events += more
-            elif self._full_config.governor.cpu_percent >= self._full_config.prediction.least_cpu_percent:
+            elif self._full_config.governor.cpu_percent >= LEAST_PREDICTION_PERCENT:
                 predicted = self.predict(step_input.frame.t_ns)
         elif step_input.predict_ns is not None:
             predicted = self.predict(step_input.predict_ns)

@@ -57,7 +57,6 @@ class AlignConfig:
 
     MAY_BE_ZERO: ClassVar = ("fine_from",)
 
-    coarse_points: int = 80  # landmarks of the coarse pass, which corrects the prediction
     points: int = 240  # landmarks of the fine pass; more cost time and gain little
     cell_px: int = 32  # px: candidates are spread over cells of this size
     fine_from: int = 1  # template level at which the fine pass begins; 0: cheaper, and converges from less far
@@ -206,7 +205,6 @@ class PredictionConfig:
     MAY_BE_ZERO: ClassVar = ("rate_hz",)
 
     rate_hz: float = 30.0  # 1/s: poses to a flight controller, predicted to the time of sending; 0: frames only
-    least_cpu_percent: float = 10.0  # of a core: with less, predictions of skipped frames would take half of the budget
 
 
 @dataclass(frozen=True, slots=True)

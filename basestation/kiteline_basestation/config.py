@@ -73,7 +73,6 @@ class LoopConfig:
     match: MatchConfig = field(default_factory=MatchConfig)
     radius_px: float = 10.0  # px at octave 0; search radius around predicted projections, halved in the second round
     min_inliers: int = 20  # landmarks that are enough to judge a keyframe, a plane or a merge by
-    min_inliers_local: int = 13  # between two maps, landmarks that agree before guided matching: by chance up to 10
     min_inliers_all: int = 35  # landmarks that agree, with those of the neighbours, to merge maps
     min_inliers_loop: int = 40  # landmarks that agree, with those of the neighbours, to close a loop in one map
     min_matched_share: float = 0.25  # of the landmarks expected in view: less is an object that stands in two places

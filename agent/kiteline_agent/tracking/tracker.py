@@ -17,6 +17,7 @@ from kiteline_core.order_statistics import median
 from kiteline_core.pose import pose_kernels
 
 _SURE_PX = 0.4  # px of the octave: deviation of the predicted disparity below which no coarser level is searched
+_COARSE = 3  # times fewer landmarks in the coarse pass than in the fine one
 _COARSEST = 2  # template level at which the coarse pass begins
 _MARGIN_PX = 8.0  # nearer to the border a template hangs over the edge
 _COARSE_STEP_PX = 7.0  # px of the coarse level: half a template
@@ -32,11 +33,11 @@ class Tracker:
 
     def track(self, ctx: FrameContext, predicted_T_c_m: F64) -> Track:
         """Measure the pose of a frame from a prediction (4,4) that is good to some 28 px."""
-        align = ctx.config.align
+        align, least = ctx.config.align, 2 * ctx.config.pose.min_inliers
         T_c_m = predicted_T_c_m.copy()
         # Coarse pass: few landmarks and large steps on small images correct the prediction.
         coarse = self._map.candidates(T_c_m, _MARGIN_PX, align.max_scale)
-        chosen = self._choose(coarse, ctx.number, align.coarse_points, 1, 2 * align.cell_px)
+        chosen = self._choose(coarse, ctx.number, max(align.points // _COARSE, least), 1, 2 * align.cell_px)
         rough = self._measure(ctx, coarse, chosen, T_c_m, _COARSEST, coarse_only=True)
         if rough.inliers >= ctx.config.pose.min_inliers // 2:
             T_c_m = rough.T_c_m

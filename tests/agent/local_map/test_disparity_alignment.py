@@ -1,13 +1,14 @@
 """The offset of disparities is found on board, by the parallax of landmarks."""
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
 import pytest
 
-from kiteline_agent.config import AgentConfig
+from kiteline_agent.config import AgentConfig, DisparityAlignmentConfig
 from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_agent.governor.cost_model import Work
 from kiteline_agent.local_map.disparity_alignment import _WORN_SHARE
@@ -298,3 +299,13 @@ def test_it_is_deterministic() -> None:
         return flight.map.disparity_offset.tobytes() + flight.alignment.expected_cov.tobytes()
 
     assert found() == found()
+
+
+@pytest.mark.parametrize("on", [True, False])
+def test_it_may_be_left_to_the_base(on: bool) -> None:
+    lens = CameraModel(752, 480, 430.0, 430.0, 376.0, 240.0)
+    rectifier = Rectifier(CameraRig(lens, lens, np.eye(4), se3.from_rt(np.eye(3), np.array([0.11, 0.0, 0.0]))))
+    config = replace(AgentConfig(), disparities=DisparityAlignmentConfig(on=on))
+    flight = Flight(WORN, 0, SIDEWAYS)
+    right = RightCamera(AgentId(0), cast("Any", Camera()), flight.map, rectifier, config, NoBaseChannel(), Work())
+    assert (right.disparities is not None) == on

@@ -89,6 +89,15 @@ def test_images_are_sent_and_nothing_is_matched_on_board(recording: Path) -> Non
     assert [messages.encode(r) for r in again.images] == [messages.encode(r) for r in channel.images]
 
 
+def test_images_of_lower_quality_take_fewer_bytes(recording: Path) -> None:
+    sizes = []
+    for jpeg_quality in (90, 50):
+        channel, config = Heard(), by_base()
+        flown(recording, replace(config, scan=replace(config.scan, jpeg_quality=jpeg_quality)), channel)
+        sizes.append(sum(len(record.images) for record in channel.images))
+    assert sizes[1] < 0.6 * sizes[0]
+
+
 def test_while_images_do_not_arrive_the_agent_makes_its_scans(recording: Path) -> None:
     channel = Heard(busy=True)
     _, matched = flown(recording, by_base(), channel)

@@ -130,6 +130,16 @@ def test_storeys_lie_apart_and_a_ramp_joins_them() -> None:
     assert {p.storey for p in ramp.places} == {0, 1}
 
 
+def test_higher_storeys_lie_farther_apart() -> None:
+    storeys = []
+    for storey_m in (2.5, 10.0):
+        grid = ScanGrid(replace(CONFIG, storey_m=storey_m))
+        for z in (0.0, 2.8):
+            grid.put(round(z), kept(scan_of(ROOM, 3.0, -2.0, 0.0)), camera(3.0, -2.0, 0.0, z=z))
+        storeys.append({place.storey for place in grid.places})
+    assert storeys == [{0, 1}, {0}]
+
+
 def test_memory_goes_by_tiles_touched_and_a_far_outlier_costs_nothing() -> None:
     config = replace(CONFIG, resident_tiles=64)
     scan = kept(scan_of(np.array(box(-60.0, -60.0, 60.0, 60.0)), 0.0, 0.0, 0.0), config)

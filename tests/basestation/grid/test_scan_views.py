@@ -208,6 +208,12 @@ def test_overlong_and_far_rays_are_cut_and_unknown_ground_is_not_drawn() -> None
     assert keep(CONFIG, replace(scan, camera_height_m=np.nan), BF) is None
 
 
+def test_scans_are_drawn_as_far_as_is_asked() -> None:
+    for max_range_m in (2.0, 20.0):
+        found = keep(replace(CONFIG, max_range_m=max_range_m), scan_of(ROOM, -3.0, 2.5, 0.0), 1e4)
+        assert found is not None and (found.reach_m > 2.01) == (max_range_m > 2.0)
+
+
 def test_nothing_is_free_close_before_an_obstacle_that_is_too_far_to_be_drawn() -> None:
     """Its range is as uncertain as that of one that is drawn."""
     sigma_per_m2 = CONFIG.sigma_px / 20.0

@@ -104,6 +104,19 @@ def test_many_matches_close_a_loop_that_drifted_more_than_expected(
         assert np.linalg.norm(error[:3, 3]) < 0.1
 
 
+@pytest.mark.parametrize(
+    "demand", [{}, {"min_inliers_all": 10_000}, {"min_inliers_loop": 10_000}, {"min_matched_share": 1.1}]
+)
+def test_how_much_a_loop_has_to_show_is_an_option(around: Any, words: Any, demand: dict[str, float]) -> None:
+    flight, blind = around(-1)[:2]
+    detector = LoopDetector(replace(BaseConfig().loops, drift_m=10.0, **demand), blind.map, words)  # type: ignore[arg-type]
+    closed = False
+    for keyframe in flight.keyframes:
+        detector.add(keyframe)
+        closed |= isinstance(detector.query(keyframe), LoopClosure)
+    assert closed == (not demand)
+
+
 def test_loop_without_drift_is_counted_and_the_same_flight_gives_the_same_map(
     make_flight: MakeFlight, words: Any
 ) -> None:

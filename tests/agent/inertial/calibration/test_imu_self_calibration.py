@@ -183,6 +183,13 @@ def test_without_motion_nothing_is_learned() -> None:
     assert calibration.gyro.offset_sigma_s > config.offset_trusted_s  # gyro noise looks like some motion
 
 
+def test_a_flight_begins_with_the_deviations_of_the_data_sheet() -> None:
+    config = SelfCalibrationConfig(sensor_scale_sigma=0.03, misalignment_sigma=0.02)
+    gyro = SelfCalibration(CALIBRATION, config, P_B_C, 9.81).gyro
+    sigma = np.sqrt(np.diag(gyro.axes_cov)).reshape(3, 3)
+    np.testing.assert_allclose(sigma, np.where(np.eye(3) > 0.0, 0.03, 0.02))
+
+
 def test_a_map_that_is_moved_changes_nothing() -> None:
     f = flight(12.0, 3, GYRO, ACCEL)
     still, turned = calibrated(f), calibrated(f, turn_map_at=120)
