@@ -172,7 +172,6 @@ class MapCacheConfig:
     """Cached keyframes sent by the base, and how they are matched."""
 
     keyframes: int = 32  # slots; the base sends fewer, but those of an earlier base may still be there
-    landmarks: int = 128  # of a cached keyframe
     sigma_px: float = 0.15  # px: virtual disparity error of a cached landmark, which rests on many views
     radius_px: float = 6.0  # px at octave 0: search radius around a projection, the error that P3P leaves
     candidates: int = 3  # cached keyframes tried in a lost frame

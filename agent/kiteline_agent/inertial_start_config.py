@@ -40,7 +40,6 @@ class ContradictionConfig:
 class InertialStartConfig:
     """When a monocular camera with an IMU knows its scale, and begins a map in metres."""
 
-    landmarks: int = 220  # of the window, with the longest tracks: errors of few add up to a wrong turn and motion
     min_flow: float = 0.02  # of the focal length, median: with less the camera has not moved
 
     contradiction: ContradictionConfig = field(default_factory=ContradictionConfig)

@@ -53,6 +53,7 @@ _STATE_INFLATION = 2.0  # of the deviations of the state with which tracking beg
 _DEPTH_SIGMA = 0.25  # relative deviation above which a landmark has no depth yet
 _STRUCTURE_PX = 1.2  # px; median error of corners with the gyro's rotations: 0.3 if these are right, else 2
 _SCALE_SIGMA = 0.02  # relative deviation of the scale below which it is metric
+_LANDMARKS = 220  # of the window, with the longest tracks: errors of few add up to a wrong turn and motion
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,7 +121,7 @@ class InertialStart:
         self._last_samples_ns: int | None = None  # stamp of the last frame with samples
 
     def add_samples(self, ctx: FrameContext) -> bool:
-        """Buffer the IMU samples of a frame. False if none has come for `silent_s`."""
+        """Buffer the IMU samples of a frame. False if none has come for SILENT_S."""
         self._buffer.push(ctx.imu)
         if self._last_samples_ns is None or (ctx.imu is not None and len(ctx.imu.t_ns)):
             self._last_samples_ns = ctx.t_ns
@@ -217,11 +218,10 @@ class InertialStart:
         self, ctx: FrameContext, keyframes: list[TrackedKeyframe], intervals: list[Samples], prior: BiasPrior
     ) -> InParts[InertialMap | None]:
         """Solve the window; align its landmarks again and solve it once more when the scale seems to be known."""
-        config = self._config.inertial_start
         all_corners = self._tracks.observations()
         if len(all_corners.ids) < self._config.local_map.first_points:
             return None
-        columns = corner_tracks.covering(all_corners, config.landmarks, _LANDMARKS_EACH)
+        columns = corner_tracks.covering(all_corners, _LANDMARKS, _LANDMARKS_EACH)
         observations = all_corners.part(columns)
         before, stamps = self._before, tuple(k.t_ns for k in keyframes)
         self._measure_vibration(intervals)

@@ -23,7 +23,7 @@ from kiteline_core.ids import NO_KEYFRAME
 from kiteline_core.order_statistics import median
 
 _LEAST_RHO = 1e-4  # 1/m
-_LEAST_PARALLAX = 0.02  # distance over depth of a first pair, but for `growth`
+_LEAST_PARALLAX = 0.02  # distance over depth of a first pair, but for _PARALLAX_GROWTH
 _MIN_POINTS = 30  # landmarks of a pair; eleven numbers are estimated from them
 _USUAL_SQUARE = 0.45  # mean squared error above which a pair counts less before an offset is applied
 _KNOWN_PX = 0.1  # px; by which each number of an offset changes between two flights: mounts and temperature

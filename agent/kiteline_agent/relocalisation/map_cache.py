@@ -30,6 +30,7 @@ _CORNER_PX = 1.0  # px at octave 0: standard deviation of a corner that was dete
 _MIN_MATCHES = 12  # matches that agree with one pose; chance matches reach 8
 _MIN_RELOCALISATION_MATCHES = 30  # the same with which a lost frame is relocalised
 _MIN_SHARE = 0.15  # of the landmarks that should be in view; not every one is a corner again
+_LANDMARKS = 128  # of a cached keyframe
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +68,7 @@ class MapCache:
         self, camera: RectifiedCamera, config: MapCacheConfig, matching: MatchConfig,
         vocabulary: Vocabulary | None,
     ) -> None:  # fmt: skip
-        k, p = config.keyframes, config.landmarks
+        k, p = config.keyframes, _LANDMARKS
         self._camera = camera
         self._intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy, camera.bf])
         self._size = np.array([camera.width, camera.height], np.float64)
@@ -142,9 +143,9 @@ class MapCache:
         """Store the landmarks of all parts that arrived, up to the capacity."""
         self._remove_from_index(slot)
         parts = [self._parts[slot][k] for k in sorted(self._parts[slot])]
-        keep = np.flatnonzero(np.concatenate([part.inv_depth for part in parts]) > 0.0)[: self._config.landmarks]
+        keep = np.flatnonzero(np.concatenate([part.inv_depth for part in parts]) > 0.0)[:_LANDMARKS]
         n, c = len(keep), self._camera
-        rows = slice(slot * self._config.landmarks, slot * self._config.landmarks + n)
+        rows = slice(slot * _LANDMARKS, slot * _LANDMARKS + n)
         uv = np.concatenate([part.uv for part in parts]).astype(np.float64)[keep]
         self._bearing[slot, :n] = (uv - (c.cx, c.cy)) / (c.fx, c.fy)
         self._rho[slot, :n] = np.concatenate([part.inv_depth for part in parts])[keep]

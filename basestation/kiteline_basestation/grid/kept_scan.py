@@ -107,7 +107,7 @@ def keep(config: GridConfig, scan: ColumnScan, bf_px_m: float, unit_m: float = 1
 
     bf_px_m: focal length times baseline: ranges are used up to where their deviation passes a limit. 0: it never does.
     unit_m: metres in a unit of the keyframe's submap, as it is known now: the scan is rescaled with its submap.
-    Free ranges are cut at the third quartile and `fence` interquartile ranges (Segfloor, equation 5.3).
+    Free ranges are cut at the third quartile and _FENCE interquartile ranges (Segfloor, equation 5.3).
     """
     if not math.isfinite(scan.camera_height_m):
         return None

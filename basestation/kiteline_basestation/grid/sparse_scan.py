@@ -68,7 +68,7 @@ def sparse_scan(
     band = np.searchsorted(config.bands_m[1:-1], above, side="right").astype(np.uint8)
     front = solid & (distance <= obstacle[column] + _DEPTH_M)
     np.bitwise_or.at(bands, column[front], np.uint8(1) << band[front])
-    # A ray frees the cells over which it is lower than `free_below_m`.
+    # A ray frees the cells over which it is lower than _FREE_BELOW_M.
     drop = np.maximum(height - np.where(solid, above, 0.0), 1e-6)
     start = np.where(
         solid & (above >= _FREE_BELOW_M),
