@@ -61,7 +61,6 @@ class AlignConfig:
     cell_px: int = 32  # px: candidates are spread over cells of this size
     fine_from: int = 1  # template level at which the fine pass begins; 0: cheaper, and converges from less far
     sigma_px: float = 0.30  # px at octave 0: standard deviation of an aligned coordinate
-    max_scale: float = 2.5  # change of distance since the template was cut, as a factor
 
 
 @dataclass(frozen=True, slots=True)

@@ -58,7 +58,7 @@ class DepthFromMotion:
         typical, steepest = quantiles(near, (0.5, 0.95))
         ceiling = steepest * _NEARER
         self._map.initialise_seeds(typical, ceiling)
-        seeds = self._map.candidates(track.T_c_m, _MARGIN_PX, self._config.align.max_scale, seeds=True)
+        seeds = self._map.candidates(track.T_c_m, _MARGIN_PX, seeds=True)
         chosen = self._choose(seeds, images.first)
         if len(chosen) == 0:
             return 0

@@ -107,9 +107,7 @@ class Relocaliser:
         slot = self._map.slot_of(keyframe)
         first = slot * self._map.slot_size
         own = np.arange(first, first + int(self._map.counts[slot]))
-        in_view = self._map.candidates(
-            se3.inverse(self._map.T_m_k[slot]), 0.0, self._config.align.max_scale, submap=submap_of_keyframe(keyframe)
-        )
+        in_view = self._map.candidates(se3.inverse(self._map.T_m_k[slot]), 0.0, submap=submap_of_keyframe(keyframe))
         index.add(keyframe, self._map.descriptor[np.union1d(own, in_view.rows)])
 
     def start_joining(self, t_ns: int) -> None:
@@ -176,9 +174,7 @@ class Relocaliser:
     def _pose_from(self, keyframe: KeyframeId, seen: FrameFeatures, seed: int) -> PoseFit | None:
         """P3P on matches with the landmarks in view of a keyframe, or a little beyond its border."""
         T_m_k = self._map.T_m_k[self._map.slot_of(keyframe)]
-        around = self._map.candidates(
-            se3.inverse(T_m_k), -self._beyond_px, self._config.align.max_scale, submap=submap_of_keyframe(keyframe)
-        )
+        around = self._map.candidates(se3.inverse(T_m_k), -self._beyond_px, submap=submap_of_keyframe(keyframe))
         matches = matching.match(
             self._map.descriptor[around.rows], self._map.angle[around.rows], seen.descriptor, seen.angle,
             self._config.matching,

@@ -36,7 +36,7 @@ class Tracker:
         align, least = ctx.config.align, 2 * ctx.config.pose.min_inliers
         T_c_m = predicted_T_c_m.copy()
         # Coarse pass: few landmarks and large steps on small images correct the prediction.
-        coarse = self._map.candidates(T_c_m, _MARGIN_PX, align.max_scale)
+        coarse = self._map.candidates(T_c_m, _MARGIN_PX)
         chosen = self._choose(coarse, ctx.number, max(align.points // _COARSE, least), 1, 2 * align.cell_px)
         rough = self._measure(ctx, coarse, chosen, T_c_m, _COARSEST, coarse_only=True)
         if rough.inliers >= ctx.config.pose.min_inliers // 2:
@@ -58,7 +58,7 @@ class Tracker:
         first: template level at which alignment begins. near_px: see `_measure`.
         """
         align = ctx.config.align
-        fine = self._map.candidates(T_c_m, _MARGIN_PX, align.max_scale)
+        fine = self._map.candidates(T_c_m, _MARGIN_PX)
         chosen = self._choose(fine, ctx.number, align.points, 2, align.cell_px)
         return self._measure(ctx, fine, chosen, T_c_m, first, coarse_only=False, near_px=near_px)
 
