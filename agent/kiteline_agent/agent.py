@@ -75,7 +75,7 @@ class Agent:
         self._has_depth = rig.right is not None or rig.has_depth
         self.work = Work()  # operations of the last step
         self.map = LocalMap(camera, config.local_map)
-        self.map_cache = MapCache(camera, config.map_cache, config.matching, vocabulary)
+        self.map_cache = MapCache(camera, config.map_cache, vocabulary)
         self._governor = Governor(config.governor)
         self._effort = FULL
         self._camera = CameraState(rig, imu, config, identity, self.map)

@@ -13,7 +13,6 @@ from kiteline_agent.known_rig import KnownRigConfig
 from kiteline_agent.scan_config import LocalGridConfig as LocalGridConfig
 from kiteline_agent.scan_config import ScanConfig as ScanConfig
 from kiteline_core.ground.config import GroundConfig
-from kiteline_core.imaging.matching import MatchConfig
 
 
 @dataclass(frozen=True, slots=True)
@@ -256,7 +255,6 @@ class AgentConfig:
     relocalisation: RelocalisationConfig = field(default_factory=RelocalisationConfig)
     map_cache: MapCacheConfig = field(default_factory=MapCacheConfig)
     smoothing: SmoothingConfig = field(default_factory=SmoothingConfig)
-    matching: MatchConfig = field(default_factory=MatchConfig)
     scan: ScanConfig = field(default_factory=ScanConfig)
     local_grid: LocalGridConfig = field(default_factory=LocalGridConfig)
     ground: GroundConfig = field(default_factory=GroundConfig)

@@ -17,7 +17,6 @@ class InertialBundleConfig:
 
     sigma_px: float = 1.0  # px of an observation; the drift of a corner is alike in all keyframes
     huber: float = 0.5  # deviations beyond which an observation counts linearly: many corners drift
-    max_rms: float = 3.0  # deviations, and times the median, beyond which a corner moves and is left out; most have 0.6
     imu_inflation: float = 3.0  # of the calibration's noise densities: vibration
     accel_walk: float = 0.015  # m/s^2 per sqrt(s), beside the calibration's: errors of scale and axes, vibration
     gyro_bias_rad_s: float = 0.1  # deviation of an unknown gyro bias

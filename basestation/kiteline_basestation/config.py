@@ -4,7 +4,6 @@ from dataclasses import dataclass, field
 from typing import ClassVar
 
 from kiteline_core.ground.config import GroundConfig
-from kiteline_core.imaging.matching import MatchConfig
 from kiteline_core.optimisation.bundle import BundleConfig
 
 
@@ -70,7 +69,6 @@ class LoopConfig:
     enabled: bool = True  # False: no loops are closed and no maps merged
     candidates: int = 8  # most similar keyframes of other maps that are verified: a room's map has as many views
     min_likeness: float = 0.002  # similarity of places, 0..1: unrelated images 0.01, one from 0.5 m beside no more
-    match: MatchConfig = field(default_factory=MatchConfig)
     radius_px: float = 10.0  # px at octave 0; search radius around predicted projections, halved in the second round
     min_inliers: int = 20  # landmarks that are enough to judge a keyframe, a plane or a merge by
     min_inliers_all: int = 35  # landmarks that agree, with those of the neighbours, to merge maps
@@ -79,11 +77,6 @@ class LoopConfig:
     columns: int = 6  # cells across the image: a poster that hangs twice fills few of them
     rows: int = 4  # cells down the image
     predecessors: int = 4  # keyframes beside matched ones that are verified too: their views still overlap
-    agree_m: float = 0.10  # m; between two corrections that agree
-    agree_depth: float = 0.04  # added share of the median depth
-    agree_path: float = 0.02  # added share of the path between the two keyframes
-    agree_rad: float = 0.05  # rad; between two corrections that agree
-    agree_scale: float = 0.05  # difference of the logarithms of two scales that agree
     drift_m: float = 0.3  # m; correction of a loop that drift explains
     drift_path: float = 0.02  # added share of the path between the two keyframes
     drift_matches: int = 12  # matches that agree, none against them, after which drift may be larger in one submap
@@ -178,17 +171,11 @@ class GridConfig:
         0.25  # m; ranges with a larger deviation are not used: a wall would be as thick as a door is wide
     )
     bands_m: tuple[float, ...] = (0.1, 0.5, 1.2, 2.0)  # m; limits of the height bands, as the agents' scans have them
-    gap_sigmas: float = 3.0  # standard deviations before an obstacle within which ground is not freed
     log_hit: int = 12  # 1/32; log-odds of one near view of an obstacle (p = 0.59); in inverse proportion to the range
     log_free: int = 6  # 1/32; of one near view of free space (p = 0.45): half, as an edge is seen beside itself
     log_free_sure: int = 4  # 1/32; the same of a far view well before what it sees
     log_free_fair: int = 3  # 1/32; of a far view less far before it
     log_free_far: int = 2  # 1/32; of a far view elsewhere (box and wall may be one surface), and before seen ground
-    sure_sigmas: float = (
-        2.0  # standard deviations beyond gap_sigmas from which on a far view is well before what it sees
-    )
-    open_sigmas: float = 1.0  # the same before a scan's end without an obstacle, which lies two before the last ground
-    fair_sigmas: float = 1.0  # fewer of them from which on it is less far before: 0.3 % are wrong with no sign near
     side_columns: int = (
         2  # of a scan at either side of its view that count as far ones: what stands there is not seen whole
     )

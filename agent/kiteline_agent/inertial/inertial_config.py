@@ -37,25 +37,11 @@ class StartDeviations:
 
 
 @dataclass(frozen=True, slots=True)
-class ScaleFilterConfig:
-    """How the scale of a monocular map is watched after its start."""
-
-    interval_s: float = 0.39  # between two compared poses, and of inertial steps: velocity changes more than images err
-    start_scale: float = 0.022  # relative deviation of the start's scale: that of a first window, as those below
-    accel_walk: float = 0.02  # m/s^2 per sqrt(s): errors of scale and axes, of the map's rotations
-    scale_walk: float = 0.006  # per sqrt(s): the map's own scale drifts while it grows
-    image_rad: float = 7e-4  # error of a position by images, over the depth that they see
-    imu_inflation: float = 3.0  # of the calibration's noise densities, beside the factor that the start found
-    chi2: float = 16.27  # 99.9 % with 3 degrees of freedom: beyond it an interval is left out, the images jumped
-
-
-@dataclass(frozen=True, slots=True)
 class InertialConfig:
     """How the inertial state is initialised, and how long dead reckoning is trusted."""
 
     smoother: FixedLagConfig = field(default_factory=FixedLagConfig)
     calibration: SelfCalibrationConfig = field(default_factory=SelfCalibrationConfig)
-    scale_filter: ScaleFilterConfig = field(default_factory=ScaleFilterConfig)
     gravity_m_s2: float = 9.81  # differs by 0.3 % over the earth, which the accelerometer bias absorbs
     max_gap_s: float = 0.2  # a longer gap in the samples makes an interval unknown: a bus was blocked
     rest_gyro_rad_s: float = 0.02  # standard deviation of the gyro below which the vehicle stands still

@@ -11,7 +11,7 @@ from kiteline_agent.inertial.imu_initialisation import ImuInitialiser, InertialS
 from kiteline_agent.inertial.inertial_config import InertialConfig, StartDeviations
 from kiteline_agent.inertial.preintegration import BiasPrior, Preintegrated, Samples, preintegrate
 from kiteline_agent.inertial.sample_buffer import SampleBuffer, without_held
-from kiteline_agent.inertial.scale_filter import ScaleFilter, camera_scaled
+from kiteline_agent.inertial.scale_filter import INTERVAL_S, ScaleFilter, camera_scaled
 from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuBatch, ImuCalibration
 from kiteline_core.geometry import disparity_offset, se3
@@ -60,7 +60,7 @@ class InertialTracker:
             config, calibration, self._p_b_c, self._buffer, self.self_calibration.correct
         )
         self._reported_s = config.calibration.offset_s
-        self._scale = ScaleFilter(config.scale_filter, calibration, config.gravity_m_s2, self._p_b_c)
+        self._scale = ScaleFilter(calibration, config.gravity_m_s2, self._p_b_c)
         self._scale_from: tuple[int, F64] | None = None  # stamp and pose by images at which its interval begins
         self._cached: tuple[tuple[int, int, int | None], Samples | None] | None = (
             None  # interval that was asked for last
@@ -371,7 +371,7 @@ class InertialTracker:
         if self._scale_from is None:
             self._scale.resume(state.velocity)
             self._scale_from = (t_ns, T_m_b)
-        elif (t_ns - self._scale_from[0]) * 1e-9 >= self._config.scale_filter.interval_s:
+        elif (t_ns - self._scale_from[0]) * 1e-9 >= INTERVAL_S:
             samples = self.samples_between(self._scale_from[0], t_ns)
             if samples is not None and depth_m > 0.0:
                 self._scale.add(self._scale_from[1], T_m_b, samples, state.bias[:3], depth_m)

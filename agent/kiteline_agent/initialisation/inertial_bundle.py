@@ -38,8 +38,8 @@ _MOST_GROWTH = 0.5  # of all lengths in one step
 _ROUNDS = 2  # in which corners are left out, each followed by another solution
 _FIRST_DEPTH_M = 3.0  # m at which all landmarks start; only the sign matters
 _STRUCTURE_ITERATIONS, _ITERATIONS = 25, 20  # steps of the first stage, of which nothing is known, and of the last
-_STRUCTURE_SETTLED = 1e-3  # relative fall of the cost below which the first stage ends
-_SETTLED = 0.1  # fall of the cost below which the last one ends: a deviation of the scale is worth 0.5
+_STRUCTURE_SETTLED, _SETTLED = 1e-3, 0.1  # fall of the cost, relative and not: a deviation of the scale is worth 0.5
+_MAX_RMS = 3.0  # deviations, and times the median, beyond which a corner moves and is left out; most have 0.6
 
 
 @dataclass(slots=True)
@@ -223,7 +223,7 @@ class InertialBundle:
         rms = np.sqrt(square.sum(axis=0) / np.maximum(self._obs.seen.sum(axis=0), 1))
         if not self._used.any():
             return False
-        fits = rms < self._config.max_rms * max(1.0, float(np.median(rms[self._used])))
+        fits = rms < _MAX_RMS * max(1.0, float(np.median(rms[self._used])))
         changed = bool((self._used & ~fits).any())
         self._used &= fits
         return changed
@@ -312,7 +312,7 @@ class InertialBundle:
         self._error = norm
         weight = np.where(norm < k, 1.0, k / np.maximum(norm, 1e-9)) * used
         # so that costs with different corners can be compared, those left out cost what they would just before
-        left_out = k * (self._config.max_rms - 0.5 * k) * float(np.count_nonzero(self._obs.seen & ~self._used))
+        left_out = k * (_MAX_RMS - 0.5 * k) * float(np.count_nonzero(self._obs.seen & ~self._used))
         return float(np.where(norm < k, 0.5 * norm**2, k * (norm - 0.5 * k)).sum()) + left_out, weight
 
     def _cost(self, state: WindowState, *, inertial: bool) -> float:

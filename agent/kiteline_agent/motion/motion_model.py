@@ -14,6 +14,7 @@ from kiteline_agent.inertial.imu_initialisation import InertialStartState
 from kiteline_agent.inertial.imu_watch import SILENT_S, ImuWatch
 from kiteline_agent.inertial.inertial_config import InertialConfig
 from kiteline_agent.inertial.inertial_tracker import InertialTracker
+from kiteline_agent.inertial.scale_filter import INTERVAL_S
 from kiteline_agent.motion.extrapolation import Extrapolation, MotionSource, along_twist
 from kiteline_agent.motion.loss_motion import LossMotionEstimator
 from kiteline_agent.motion.odometer import Odometer
@@ -61,7 +62,7 @@ class MotionModel:
         self._pose = pose
         self._metric = metric
         self.tracker = None if imu is None else InertialTracker(camera, imu, config, metric=metric)
-        self._steps = None if imu is None or metric else StepRecorder(imu, config.scale_filter.interval_s)
+        self._steps = None if imu is None or metric else StepRecorder(imu, INTERVAL_S)
         self.loss_motion: LossMotionEstimator | None = None
         if self.tracker is not None and imu is not None and metric:
             self.loss_motion = LossMotionEstimator(self.tracker, imu, config.gravity_m_s2)

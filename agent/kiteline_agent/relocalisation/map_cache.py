@@ -17,7 +17,7 @@ from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, KeyframeId, SubmapId
 from kiteline_core.imaging.descriptors import comparable
-from kiteline_core.imaging.matching import MatchConfig, Matches, match, match_near
+from kiteline_core.imaging.matching import Matches, match, match_near
 from kiteline_core.places.place_index import PlaceIndex, Vocabulary
 from kiteline_core.pose.pnp import PIXEL_CHI2, solve_pnp
 from kiteline_core.pose.pose_kernels import optimise_pose
@@ -65,7 +65,7 @@ class MapCache:
     """Cached keyframes, bounded in number: slot k holds a keyframe, row k * landmarks + i one of its landmarks."""
 
     def __init__(
-        self, camera: RectifiedCamera, config: MapCacheConfig, matching: MatchConfig,
+        self, camera: RectifiedCamera, config: MapCacheConfig,
         vocabulary: Vocabulary | None,
     ) -> None:  # fmt: skip
         k, p = config.keyframes, _LANDMARKS
@@ -74,7 +74,6 @@ class MapCache:
         self._size = np.array([camera.width, camera.height], np.float64)
         self._config = config
         self._beyond_px = float(round(config.beyond * camera.width))
-        self._matching = matching
         self._vocabulary = vocabulary
         self._index: PlaceIndex | None = None  # filled at the first search
         self._indexed: set[int] = set()
@@ -166,7 +165,6 @@ class MapCache:
         found = match_near(
             projected.uv, np.full(len(projected.rows), self._config.radius_px), projected.octave, wanted,
             seen.uv, seen.octave, offered, (self._camera.width, self._camera.height), _OCTAVE_GAP,
-            self._matching,
         )  # fmt: skip
         return self._consistent(T_c_m, projected, found, seen)
 
@@ -221,7 +219,7 @@ class MapCache:
         """P3P on matches with the landmarks in view of a cached keyframe, or a little beyond its border."""
         projected = self._project(se3.inverse(self._T_m_k[slot]), submap, -self._beyond_px)
         wanted, offered = comparable(self._descriptor[projected.rows], seen.descriptor)
-        found = match(wanted, self._angle[projected.rows], offered, seen.angle, self._matching)
+        found = match(wanted, self._angle[projected.rows], offered, seen.angle)
         if len(found.a) < _MIN_MATCHES:
             return None
         observed = np.column_stack([seen.uv[found.b], np.full(len(found.b), -1.0)])

@@ -177,7 +177,6 @@ class Relocaliser:
         around = self._map.candidates(se3.inverse(T_m_k), -self._beyond_px, submap=submap_of_keyframe(keyframe))
         matches = matching.match(
             self._map.descriptor[around.rows], self._map.angle[around.rows], seen.descriptor, seen.angle,
-            self._config.matching,
         )  # fmt: skip
         if len(matches.a) < _MIN_PNP_INLIERS:
             return None

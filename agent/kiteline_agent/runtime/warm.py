@@ -28,7 +28,7 @@ from kiteline_core.geometry.se3 import from_rt
 from kiteline_core.ground.config import GroundConfig
 from kiteline_core.ground.ground_warm import warm_ground
 from kiteline_core.ids import AgentId
-from kiteline_core.imaging.matching import MatchConfig, match, match_near
+from kiteline_core.imaging.matching import match, match_near
 from kiteline_core.places.place_index import PlaceIndex, Vocabulary, nodes
 from kiteline_core.pose.pnp import solve_pnp
 
@@ -93,7 +93,7 @@ def _warm_relocalisation(vocabulary: Vocabulary, noise: U8) -> None:
         places.add(key, descriptor)
     places.query(descriptor)
     places.remove(0)
-    match(descriptor, angle, descriptor, angle, MatchConfig())
+    match(descriptor, angle, descriptor, angle)
     points = noise[1280:1400].reshape(40, 3) / 128.0 + np.array([-1.0, -1.0, 2.0])
     observed = np.column_stack([100.0 * points[:, :2] / points[:, 2:] + 150.0, np.full(40, -1.0)])
     camera = np.array([100.0, 100.0, 150.0, 150.0, 10.0])
@@ -101,7 +101,7 @@ def _warm_relocalisation(vocabulary: Vocabulary, noise: U8) -> None:
     solve_pnp(points, np.zeros((40, 3)), observed, flat, camera, 0)
     uv = np.ascontiguousarray(observed[:, :2])
     match_near(
-        uv, np.full(40, 4.0), np.zeros(40), descriptor, uv, flat, descriptor, (320, 240), 1.2, MatchConfig()
+        uv, np.full(40, 4.0), np.zeros(40), descriptor, uv, flat, descriptor, (320, 240), 1.2
     )  # fmt: skip
 
 

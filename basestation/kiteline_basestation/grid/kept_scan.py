@@ -20,6 +20,7 @@ _LATTICE = 4  # positions along a cell's side, and of a scan's farthest end as i
 _SCALE_STEPS = 1 << 10
 _FENCE = 1.5  # interquartile ranges above the upper quartile: longer rays to the ground are cut (Segfloor eq. 5.3)
 _ACCURATE_SIGMA_M = 0.05  # m; up to this deviation of a range a view counts in full: a cell by default
+GAP_SIGMAS = 3.0  # standard deviations before an obstacle within which ground is not freed
 
 
 class Lattice(NamedTuple):
@@ -125,7 +126,7 @@ def keep(config: GridConfig, scan: ColumnScan, bf_px_m: float, unit_m: float = 1
     stop = np.where(scan.bands > 0, scan.obstacle_m, np.inf)  # nothing is known behind an obstacle, however far it is
     # Before an obstacle that is too far to be drawn, nothing is free within some deviations of its range, either.
     far_m = np.where((scan.bands > 0) & ~solid & np.isfinite(scan.obstacle_m), scan.obstacle_m, np.nan)
-    before = np.fmin(far_m - np.maximum(config.gap_sigmas * sigma_per_m2 * far_m**2, config.cell_m), np.inf)
+    before = np.fmin(far_m - np.maximum(GAP_SIGMAS * sigma_per_m2 * far_m**2, config.cell_m), np.inf)
     free = np.minimum(np.minimum(scan.free_m, free_limit_m), before)
     free = np.where(free > scan.free_from_m, free, 0.0)
     free_from = np.where(free > 0.0, scan.free_from_m, 0.0)

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from kiteline_basestation.config import GridConfig
-from kiteline_basestation.grid.kept_scan import KeptScan, Lattice, position_cells, scale_of
+from kiteline_basestation.grid.kept_scan import GAP_SIGMAS, KeptScan, Lattice, position_cells, scale_of
 from kiteline_basestation.grid.scan_kernels import BANDS, SIDE
 from kiteline_core.arrays import F64, I64, U8, Bool
 
@@ -13,6 +13,9 @@ _AT_BORDER = 0.1  # of a scan's columns, at least, in which ground is seen from 
 _HIDDEN = 1.25  # times that distance, from which on something hides the ground before
 _STEEPEST = 4.0  # tangent of the angle under which a surface is seen that goes on from column to column
 _MOST = 0.5  # of an inverse range, by which it changes from column to column of one surface, at most
+_SURE_SIGMAS = 2.0  # standard deviations beyond GAP_SIGMAS from which on a far view is well before what it sees
+_OPEN_SIGMAS = 1.0  # the same before a scan's end without an obstacle, which lies two before the last ground
+_FAIR_SIGMAS = 1.0  # fewer of them from which on it is less far before: 0.3 % are wrong with no sign near
 
 
 class Sectors(NamedTuple):
@@ -67,7 +70,7 @@ def sectors_of(config: GridConfig, scan: KeptScan, lattice: Lattice) -> Sectors:
     obstacle = _surfaces(middle, bands, scan.step)
     near_m = np.where(np.isfinite(ranges[0]), ranges[0], 0.0)
     # Cells before an obstacle are free up to some deviations of its range, and at least a cell, before it.
-    gap = np.maximum(1.0, config.gap_sigmas * scan.sigma_per_m2 * near_m**2 * unit)
+    gap = np.maximum(1.0, GAP_SIGMAS * scan.sigma_per_m2 * near_m**2 * unit)
     before = obstacle - gap[:, None]
     under = np.where(bands & 1, 0, 1).astype(np.uint8)  # the floor is seen below what stands higher, a table
     behind = start > middle  # ground that was seen over a low obstacle, which hides what lies before it
@@ -77,10 +80,10 @@ def sectors_of(config: GridConfig, scan: KeptScan, lattice: Lattice) -> Sectors:
     end = np.where((free > 0.0)[:, None], end, 0.0)
     accurate_m = scan.accurate_m(config)
     last_m = np.where(bands > 0, near_m, ranges[3])
-    margin = np.where(bands > 0, config.sure_sigmas, config.open_sigmas)
+    margin = np.where(bands > 0, _SURE_SIGMAS, _OPEN_SIGMAS)
     deviation = scan.sigma_per_m2 * last_m**2 * unit
     sure = np.maximum(end.min(1) - margin * deviation, 0.0)
-    fair = np.maximum(end.min(1) - (margin - config.fair_sigmas) * deviation, 0.0)
+    fair = np.maximum(end.min(1) - (margin - _FAIR_SIGMAS) * deviation, 0.0)
     weight = np.clip(np.rint(config.log_hit * accurate_m / np.maximum(near_m, accurate_m)), 1, 127).astype(np.int64)
     camera_band = int(np.searchsorted(config.bands_m, scan.height_m, side="right")) - 1
     accurate = np.full(scan.columns, accurate_m / config.cell_m)

@@ -231,10 +231,10 @@ class LoopDetector:
         matches.append(match)
         self._matches[key] = matches
         same_map = self._map.map_id(new) == self._map.map_id(old)
-        if not same_map and not consistency.keeps_level(self._map, match, config):
+        if not same_map and not consistency.keeps_level(self._map, match):
             self.refused += 1
             return None
-        chosen = consistency.agreeing(self._map, matches, config)
+        chosen = consistency.agreeing(self._map, matches)
         supporters = {m.new for m in chosen}
         best = max(chosen, key=lambda m: (m.inliers, m.new))
         if same_map and not consistency.within_drift(self._map, match, config):

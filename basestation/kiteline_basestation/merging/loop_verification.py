@@ -116,7 +116,7 @@ def verify_loop(
     theirs = local_landmarks(sparse_map, old, MAX_NEIGHBOURS if across else 0)
     enough = _MIN_INLIERS_ACROSS if across else config.min_inliers  # one map waits for near views: they correct best
     wanted, offered = comparable(mine.descriptor, theirs.descriptor)
-    pairs = matching.match(wanted, mine.angle, offered, theirs.angle, config.match)
+    pairs = matching.match(wanted, mine.angle, offered, theirs.angle)
     a, b = pairs.a, pairs.b
     free = any(sparse_map.is_up_to_scale(submap_of_keyframe(k)) for k in (new, old))
     if free:
@@ -287,7 +287,7 @@ def _match_neighbours(
         wanted, offered = comparable(sparse_map.keypoints.descriptor[seen], mine.descriptor)
         near = matching.match_near(
             uv, radius * np.exp2(np.clip(octave, 0.0, 4.0)), octave, wanted, mine.uv, mine.octave,
-            offered, (size.width, size.height), _OCTAVE_GAP, config.match,
+            offered, (size.width, size.height), _OCTAVE_GAP,
         )  # fmt: skip
         if len(near.a) < config.min_inliers:
             return None

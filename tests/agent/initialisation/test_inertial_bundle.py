@@ -10,7 +10,7 @@ from kiteline_agent.inertial.preintegration import BiasPrior, Samples
 from kiteline_agent.inertial.sample_buffer import SampleBuffer
 from kiteline_agent.inertial_start_config import InertialBundleConfig
 from kiteline_agent.initialisation.corner_tracks import CornerObservations
-from kiteline_agent.initialisation.inertial_bundle import InertialBundle
+from kiteline_agent.initialisation.inertial_bundle import _MAX_RMS, InertialBundle
 from kiteline_agent.initialisation.inertial_window import WarmStart, WindowSolution, finished
 from kiteline_agent.initialisation.lens_correction import TERMS, moved
 from kiteline_agent.initialisation.window_kernels import add_observations
@@ -211,7 +211,7 @@ def test_costs_with_and_without_walking_corners_can_be_compared() -> None:
     crowd, walks = walking(corners, truth, 0.3, 1)
     with_them, without = bundle(crowd, samples).solve(), bundle(crowd.part(np.flatnonzero(~walks)), samples).solve()
     observations = np.count_nonzero(corners.seen[:, walks])
-    each = CONFIG.huber * (CONFIG.max_rms - 0.5 * CONFIG.huber)
+    each = CONFIG.huber * (_MAX_RMS - 0.5 * CONFIG.huber)
     assert with_them.cost - without.cost == pytest.approx(observations * each, rel=0.2)  # some corners that stay, too
 
 

@@ -7,8 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kiteline_basestation.grid.kept_scan import keep
+from kiteline_basestation.grid.kept_scan import GAP_SIGMAS, keep
 from kiteline_basestation.grid.scan_grid import ScanGrid
+from kiteline_basestation.grid.sectors import _FAIR_SIGMAS, _OPEN_SIGMAS, _SURE_SIGMAS
 from kiteline_basestation.grid.tile_store import Place
 from kiteline_core.ground.column_scan import ColumnScan
 from tests.basestation.flat_rooms import HEIGHT_M, ROOM, box, camera, scan_of
@@ -107,8 +108,8 @@ def test_a_far_view_frees_alone_what_lies_well_before_its_obstacle_and_two_what_
     row = np.concatenate([grid.log_odds(Place(0, 0, k))[0, 1] for k in range(2)])
     columns = (np.arange(128) + 0.5) * CONFIG.cell_m
     sigma_m = CONFIG.sigma_px / bf * 5.53**2
-    end = 5.53 - CONFIG.gap_sigmas * sigma_m
-    sure, fair = (end - n * sigma_m for n in (CONFIG.sure_sigmas, CONFIG.sure_sigmas - CONFIG.fair_sigmas))
+    end = 5.53 - GAP_SIGMAS * sigma_m
+    sure, fair = (end - n * sigma_m for n in (_SURE_SIGMAS, _SURE_SIGMAS - _FAIR_SIGMAS))
     near = found.accurate_m(CONFIG)
     assert near + 0.2 < sure < end - 0.2
     assert (row[(columns > near + 0.1) & (columns < sure - 0.1)] == -CONFIG.log_free_sure).all()
@@ -124,7 +125,7 @@ def test_a_fair_view_frees_alone_where_no_sign_of_an_obstacle_is_near() -> None:
     """What one view frees wrongly lies beside something that another one saw, nearly always."""
     bf, end = 48.0, 5.0
     ground = keep(CONFIG, bare(1.0, end), bf)
-    place = end - 0.5 * CONFIG.open_sigmas * CONFIG.sigma_px / bf * end**2
+    place = end - 0.5 * _OPEN_SIGMAS * CONFIG.sigma_px / bf * end**2
     grid = ScanGrid(CONFIG)
     grid.put(0, ground, camera(0.0, 0.0, 0.0))
     assert at(grid, place, 0.0) == 0
@@ -145,10 +146,10 @@ def test_a_far_view_of_ground_that_ends_before_no_obstacle_frees_alone_nearly_up
     grid.put(0, found, camera(0.0, 0.0, 0.0))
     row = np.concatenate([grid.log_odds(Place(0, 0, k))[0, 1] for k in range(2)])
     columns = (np.arange(128) + 0.5) * CONFIG.cell_m
-    sure = end - CONFIG.open_sigmas * CONFIG.sigma_px / bf * end**2
+    sure = end - _OPEN_SIGMAS * CONFIG.sigma_px / bf * end**2
     assert (row[(columns > found.accurate_m(CONFIG) + 0.1) & (columns < sure - 0.06)] == -CONFIG.log_free_sure).all()
     assert (row[(columns > sure + 0.06) & (columns < end - 0.06)] == -CONFIG.log_free_fair).all()
-    assert sure > end - CONFIG.sure_sigmas * CONFIG.sigma_px / bf * end**2 + 0.1
+    assert sure > end - _SURE_SIGMAS * CONFIG.sigma_px / bf * end**2 + 0.1
 
 
 @given(st.floats(0.0, 1.2), st.floats(1.0, 2.2))
@@ -227,5 +228,5 @@ def test_nothing_is_free_close_before_an_obstacle_that_is_too_far_to_be_drawn() 
         found = keep(CONFIG, scan, 20.0)
         obstacle, _, _, free, clear = found.ranges()
         assert np.isinf(obstacle).all()
-        until_m = min(limit_m, at_m - CONFIG.gap_sigmas * sigma_per_m2 * at_m**2)
+        until_m = min(limit_m, at_m - GAP_SIGMAS * sigma_per_m2 * at_m**2)
         assert free == pytest.approx(until_m, abs=0.01) and clear == pytest.approx(until_m, abs=0.01)

@@ -44,6 +44,7 @@ _OFFSET_SIGNIFICANCE = 3.0  # deviations from the configured offset below which 
 _OFFSET_RATE = 0.05  # s/s; how fast the applied offset follows
 _KEPT_OFFSET_SIGMA_S = 3e-4  # s; of the time offset between two flights: another exposure
 _REFUTED = 5.0  # log likelihood of an unknown IMU over that of earlier flights, from which those are dropped
+_OFFSET_TRUSTED_S = 3e-3  # s; deviation below which the offset is applied
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +57,6 @@ class SelfCalibrationConfig:
     significance: float = 25.0  # squared deviations of 9 axes from a true rig, above which they are applied
     offset_s: float = 0.0  # camera stamp + offset = IMU time, if a calibration gives it
     offset_sigma_s: float = 0.02  # cameras without a trigger line
-    offset_trusted_s: float = 3e-3  # deviation below which the offset is applied
     kept_axes_sigma: float = 1e-3  # of axes between two flights: temperature, and what images are off by in both
     apply_axes: bool = True  # False: axes are only estimated
     apply_offset: bool = True  # False: only the configured offset is used
@@ -348,7 +348,7 @@ class SelfCalibration:
     def _follow_offset(self, dt_s: float) -> None:
         """Move the applied time offset towards the estimate, once that is significant."""
         config = self._config
-        if not config.apply_offset or self.gyro.offset_sigma_s >= config.offset_trusted_s:
+        if not config.apply_offset or self.gyro.offset_sigma_s >= _OFFSET_TRUSTED_S:
             return
         step = self.gyro.offset_s - self.offset_s
         sigma = self.gyro.offset_sigma_s * max(self.gyro.excess, 1.0) ** 0.5
