@@ -19,7 +19,6 @@ from kiteline_core.optimisation.bundle import BundleConfig, BundleProblem, bundl
 _DRAWS = 200  # of RANSAC for each model: 8 good points of 60 % come up with 97 %
 _FLAT_RATIO = 0.45  # R_H above which the homography is the model
 MIN_POINTS = 100  # with depth that a map needs
-_MIN_SHARE = 0.7  # of the model's inliers that the motion must explain
 _RIVAL_SHARE = 0.75  # share of the best motion's points with which a second motion makes both ambiguous
 _MIN_PARALLAX_RAD = 0.0175  # rad: 1 degree, median over the points; below it depth is noise
 _MIN_POINT_PARALLAX_RAD = 0.005  # rad: with less a point has no depth
@@ -51,7 +50,7 @@ def two_view(uv_a: F64, uv_b: F64, camera: F64, seed: int) -> TwoView | None:
     counts = np.array([np.count_nonzero(front) for _, front in views])
     best = int(np.argmax(counts))
     rivals = np.delete(counts, best)
-    if counts[best] < max(MIN_POINTS, _MIN_SHARE * np.count_nonzero(fitted)):
+    if counts[best] < MIN_POINTS:
         return None
     if len(rivals) and rivals.max() > _RIVAL_SHARE * counts[best]:
         return None
