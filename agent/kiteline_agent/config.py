@@ -27,7 +27,7 @@ class OdometerConfig:
     tolerance_m_s: float = 0.12  # noise above which it is not used; that of a good one is 0.05
     accel_m_s2: float = 2.0  # acceleration of the constant-velocity model: leaning by twelve degrees
     turn_rad_s2: float = 4.0  # the same about the body's axes: a small multicopter that tilts
-    unit_wait_s: float = 20.0  # s for which poses wait for that scale; then they are given in a unit of their own
+    unit_wait_s: float = 20.0  # s for which poses wait for the metre; then they are given in a unit of their own
 
 
 @dataclass(frozen=True, slots=True)

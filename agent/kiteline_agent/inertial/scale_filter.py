@@ -16,7 +16,7 @@ from kiteline_core.geometry import se3
 
 _ITERATIONS = 3
 _UNITS, _GRAVITY, _VELOCITY, _BIAS = 0, slice(1, 4), slice(4, 7), slice(7, 10)
-_START_GRAVITY_M_S2 = 0.1  # m/s^2; deviation of gravity at the start: that of a first window
+_START_GRAVITY_M_S2 = 0.1  # m/s^2; deviation of gravity at the start
 _START_VELOCITY_M_S = 0.1  # m/s; deviation of the velocity at the start
 _START_BIAS_M_S2 = 0.1  # m/s^2; deviation of the accelerometer's bias at the start
 _GRAVITY_SIGMA_M_S2 = 0.01  # m/s^2; of the length of gravity
@@ -24,7 +24,7 @@ _KNOWN_SIGMA = 0.025  # relative deviation below which the scale may be correcte
 _LEAST = 0.015  # relative; smallest correction: each begins a new submap
 _LEAST_DEVIATIONS = 1.1  # smallest correction in its own deviations
 _LEAST_S = 4.0  # s between two corrections
-_START_SCALE = 0.022  # relative deviation of the start's scale: that of a first window, as those below
+_START_SCALE = 0.022  # relative deviation of the start's scale: that of a first window
 _ACCEL_WALK = 0.02  # m/s^2 per sqrt(s): errors of scale and axes, of the map's rotations
 _SCALE_WALK = 0.006  # per sqrt(s): the map's own scale drifts while it grows
 _IMAGE_RAD = 7e-4  # rad; error of a position by images, over the depth that they see

@@ -1,4 +1,4 @@
-"""Thresholds of ground segmentation."""
+"""Options of ground segmentation."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -16,7 +16,7 @@ class GroundConfig:
     stripes: int = 2  # in which a pair is matched, one a frame: 2 ms each of a fast core at 752x480; a whole one is 3.5
     sigma_px: float = 0.25  # px; error of a disparity
     depth_sigma: float = 2.85e-3  # 1/m; error of inverse depth of a depth camera (K. Khoshelham, S. Elberink, 2012)
-    largest_height_m: float = 8.0  # m; the same at most: from higher up, disparities of half a pixel say little
+    largest_height_m: float = 8.0  # m of the camera above the ground, at most: from higher up, disparities say little
     ground_m: float = 0.06  # m above or below the curve that is still ground: half a door sill
     columns: int = 64  # of a scan over the field of view: 1.3 degrees each, 0.1 m at 5 m; 80 to 110 bytes in all
     bands_m: tuple[float, ...] = (0.1, 0.5, 1.2, 2.0)  # m above ground between which obstacles count: foot, table, head

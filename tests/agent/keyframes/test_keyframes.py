@@ -37,10 +37,18 @@ def test_a_camera_that_sees_less_needs_keyframes_after_smaller_turns() -> None:
     assert need is not None and need.rule == "new direction"
 
 
-@pytest.mark.parametrize(("first_points", "begins"), [(40, True), (10_000, False)])
-def test_a_map_begins_with_as_many_landmarks_as_is_asked(recording: Path, first_points: int, begins: bool) -> None:
+@pytest.mark.parametrize(("first_points", "min_depth_m", "begins"), [
+    (40, 0.25, True), (10_000, 0.25, False), (40, 100.0, False),
+])  # fmt: skip
+def test_a_map_begins_with_as_many_landmarks_as_is_asked_where_surfaces_are_looked_for(
+    recording: Path, first_points: int, min_depth_m: float, begins: bool
+) -> None:
     wall, config = load(str(recording), frames=3), AgentConfig()
-    config = replace(config, local_map=replace(config.local_map, first_points=first_points))
+    config = replace(
+        config,
+        local_map=replace(config.local_map, first_points=first_points),
+        stereo=replace(config.stereo, min_depth_m=min_depth_m),
+    )
     agent = FlyingAgent(wall.rig, None, config, vocabulary=False)
     for item in wall.items:
         agent.step(item)

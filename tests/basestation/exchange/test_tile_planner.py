@@ -180,6 +180,15 @@ def test_places_without_a_tile_are_not_measured() -> None:
     assert 0 < len(looked) <= 10 * 2 * len(touched) and set(looked) <= {*touched}
 
 
+@pytest.mark.parametrize("horizon_s", [0.1, 6.0])
+def test_tiles_ahead_are_sent_the_sooner_the_farther_motion_is_predicted(horizon_s: float) -> None:
+    flight = Flight(TileConfig(horizon_s=horizon_s, max_tiles=4, keyframe_bytes=1e6, most_credit_bytes=1e6))
+    for k in range(12):
+        flight.fly(1.0 * k)
+    ahead_m = [3.2 * (column + 0.5) - 11.0 for column, _, _ in flight.tiles]
+    assert (np.mean(ahead_m) > 2.0) == (horizon_s > 1.0), ahead_m
+
+
 @pytest.mark.parametrize("z", [1000.0, -1000.0])
 def test_a_drone_beyond_the_last_storey_gets_no_tiles(z: float) -> None:
     flight = Flight()

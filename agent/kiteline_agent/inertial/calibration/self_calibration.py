@@ -51,7 +51,7 @@ _OFFSET_TRUSTED_S = 3e-3  # s; deviation below which the offset is applied
 class SelfCalibrationConfig:
     """Errors of the calibration before the flight, errors of poses by images, and when an estimate is applied."""
 
-    position_rad: float = 2.3e-4  # the same over the depth that the images see: a tenth of a pixel
+    position_rad: float = 2.3e-4  # error of a position by images, over the depth that they see: a tenth of a pixel
     sensor_scale_sigma: float = 0.01  # of the scales of gyro and accelerometer; data sheets give 1 to 3 %
     misalignment_sigma: float = 0.007  # rad; by which a sensing axis leans to another; data sheets give 0.5 to 1 degree
     significance: float = 25.0  # squared deviations of 9 axes from a true rig, above which they are applied
