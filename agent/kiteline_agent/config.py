@@ -139,9 +139,9 @@ class RelocalisationConfig:
 
     cell_px: int = 16  # px: one corner a cell; four times as many as in a keyframe, so that its own are among them
     max_corners: int = 600  # 0.5 ms of descriptors
-    entered: int = 16  # keyframes that a frame's search enters into the place index, the newest first; 0.65 ms each
+    indexed_per_frame: int = 16  # keyframes a frame's search adds to the place index, the newest first; 0.65 ms each
     candidates: int = 3  # places tried in a frame; each costs about 1 ms
-    beyond: float = 0.2  # of the image width: landmarks so far beyond a keyframe's border are matched, too
+    margin: float = 0.2  # of the image width: landmarks so far beyond a keyframe's border are matched, too
     min_inliers: int = 30  # of the tracker from that pose
     dead_reckoning_m: float = 0.08  # m: standard deviation up to which dead reckoning extends the map; below good_m
 
@@ -173,7 +173,7 @@ class MapCacheConfig:
     sigma_px: float = 0.15  # px: virtual disparity error of a cached landmark, which rests on many views
     radius_px: float = 6.0  # px at octave 0: search radius around a projection, the error that P3P leaves
     candidates: int = 3  # cached keyframes tried in a lost frame
-    beyond: float = 0.2  # of the image width: landmarks so far beyond a keyframe's border are matched, too
+    margin: float = 0.2  # of the image width: landmarks so far beyond a keyframe's border are matched, too
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,7 +214,7 @@ class GovernorConfig:
     grace_s: float = 2.0  # s at the start that do not count: a map has to be begun
     up_s: float = 1.5  # s of low load before a rise
     max_gap_s: float = 0.35  # s between tracked frames; after more, tracking often fails
-    doubt: float = 0.15  # relative error of the expected cost of a frame, at least: a pair for the disparity offset
+    min_cost_error: float = 0.15  # relative error of a frame's expected cost, at least: a pair for the disparity offset
     first_frame_ms: float = 3.5  # ms: expected cost of a tracked frame at full effort at the start: 752x480 on a laptop
 
 

@@ -243,7 +243,7 @@ class Governor:
     @property
     def _safety(self) -> float:
         """Safety margin: relative excess over the expected cost."""
-        return max(self._config.doubt, _SPREAD * self._scatter)
+        return max(self._config.min_cost_error, _SPREAD * self._scatter)
 
     def _count_keyframe(self, t_ns: int) -> None:
         """Update the rate of keyframe requests after a keyframe."""

@@ -73,7 +73,7 @@ class MapCache:
         self._intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy, camera.bf])
         self._size = np.array([camera.width, camera.height], np.float64)
         self._config = config
-        self._beyond_px = float(round(config.beyond * camera.width))
+        self._margin_px = float(round(config.margin * camera.width))
         self._vocabulary = vocabulary
         self._index: PlaceIndex | None = None  # filled at the first search
         self._indexed: set[int] = set()
@@ -217,7 +217,7 @@ class MapCache:
 
     def _pose_from(self, slot: int, submap: SubmapId, seen: FrameFeatures, frame_number: int) -> F64 | None:
         """P3P on matches with the landmarks in view of a cached keyframe, or a little beyond its border."""
-        projected = self._project(se3.inverse(self._T_m_k[slot]), submap, -self._beyond_px)
+        projected = self._project(se3.inverse(self._T_m_k[slot]), submap, -self._margin_px)
         wanted, offered = comparable(self._descriptor[projected.rows], seen.descriptor)
         found = match(wanted, self._angle[projected.rows], offered, seen.angle)
         if len(found.a) < _MIN_MATCHES:

@@ -72,7 +72,7 @@ class Relocaliser:
         self._cache = cache
         self._config = config
         self._work = work
-        self._beyond_px = float(round(config.relocalisation.beyond * local_map.camera.width))
+        self._margin_px = float(round(config.relocalisation.margin * local_map.camera.width))
         self._detector = replace(
             config.detector, cell_px=config.relocalisation.cell_px, max_corners=config.relocalisation.max_corners
         )
@@ -97,7 +97,8 @@ class Relocaliser:
         for key in self._index.keys:
             if self._map.slot_of(key) < 0:
                 self._index.remove(key)
-        waiting, most = [k for k in self._waiting if self._map.slot_of(k) >= 0], self._config.relocalisation.entered
+        waiting = [k for k in self._waiting if self._map.slot_of(k) >= 0]
+        most = self._config.relocalisation.indexed_per_frame
         self._waiting = waiting[:-most]
         for keyframe in waiting[-most:]:
             self._work.places += 1
@@ -174,7 +175,7 @@ class Relocaliser:
     def _pose_from(self, keyframe: KeyframeId, seen: FrameFeatures, seed: int) -> PoseFit | None:
         """P3P on matches with the landmarks in view of a keyframe, or a little beyond its border."""
         T_m_k = self._map.T_m_k[self._map.slot_of(keyframe)]
-        around = self._map.candidates(se3.inverse(T_m_k), -self._beyond_px, submap=submap_of_keyframe(keyframe))
+        around = self._map.candidates(se3.inverse(T_m_k), -self._margin_px, submap=submap_of_keyframe(keyframe))
         matches = matching.match(
             self._map.descriptor[around.rows], self._map.angle[around.rows], seen.descriptor, seen.angle,
         )  # fmt: skip
