@@ -171,11 +171,6 @@ class GridConfig:
         0.25  # m; ranges with a larger deviation are not used: a wall would be as thick as a door is wide
     )
     bands_m: tuple[float, ...] = (0.1, 0.5, 1.2, 2.0)  # m; limits of the height bands, as the agents' scans have them
-    log_hit: int = 12  # 1/32; log-odds of one near view of an obstacle (p = 0.59); in inverse proportion to the range
-    log_free: int = 6  # 1/32; of one near view of free space (p = 0.45): half, as an edge is seen beside itself
-    log_free_sure: int = 4  # 1/32; the same of a far view well before what it sees
-    log_free_fair: int = 3  # 1/32; of a far view less far before it
-    log_free_far: int = 2  # 1/32; of a far view elsewhere (box and wall may be one surface), and before seen ground
     side_columns: int = (
         2  # of a scan at either side of its view that count as far ones: what stands there is not seen whole
     )

@@ -55,6 +55,16 @@ class _View(NamedTuple):
     heading: int
 
 
+class ViewWeights(NamedTuple):
+    """Log-odds, in 1/32, that one view adds to an obstacle's cells and takes from free ones."""
+
+    hit: int = 12  # of a near view of an obstacle (p = 0.59); in inverse proportion to the range
+    free: int = 6  # of a near view of free space (p = 0.45): half, as an edge is seen beside itself
+    free_sure: int = 4  # the same of a far view well before what it sees
+    free_fair: int = 3  # of a far view less far before it
+    free_far: int = 2  # of a far view elsewhere (box and wall may be one surface), and before seen ground
+
+
 class CellRules(NamedTuple):
     """Log-odds, in 1/32, from which a cell is occupied or free. A band is occupied, a cell is free in all bands."""
 
@@ -67,8 +77,9 @@ class CellRules(NamedTuple):
 class ScanGrid:
     """Tiles of log-odds, and the scans that are drawn in them, by name."""
 
-    def __init__(self, config: GridConfig, rules: CellRules | None = None) -> None:
+    def __init__(self, config: GridConfig, weights: ViewWeights | None = None, rules: CellRules | None = None) -> None:
         self.config = config
+        self._weights = weights or ViewWeights()
         self._rules = rules or CellRules()
         self.revision = 0  # number of changes so far
         self.touched: dict[
@@ -194,9 +205,9 @@ class ScanGrid:
         self._store.close()
         return cells, int(known)
 
-    def redrawn(self, config: GridConfig, rules: CellRules) -> "ScanGrid":
+    def redrawn(self, config: GridConfig, weights: ViewWeights, rules: CellRules) -> "ScanGrid":
         """The same scans where they lie now, all of them, drawn with other weights and thresholds."""
-        grid = ScanGrid(config, rules)
+        grid = ScanGrid(config, weights, rules)
         for placed in self._placed.values():
             grid._draw(placed, 1)
         return grid
@@ -217,7 +228,7 @@ class ScanGrid:
         self._storeys[lattice.storeys] += sign
         if not self._storeys[lattice.storeys]:
             del self._storeys[lattice.storeys]
-        sectors = sectors_of(config, scan, lattice)
+        sectors = sectors_of(config, scan, lattice, self._weights.hit)
         box = sectors.box()
         rows, columns = box[2] - box[0], box[3] - box[1]
         sectors = sectors._replace(x=sectors.x - SIDE * box[1], y=sectors.y - SIDE * box[0])
@@ -230,7 +241,7 @@ class ScanGrid:
             kernels.draw_free(
                 sectors.x, sectors.y, sectors.first_rad, sectors.step_rad, sectors.begin, sectors.start, sectors.end,
                 sectors.low, sectors.under, sectors.clear, sectors.camera_band, sectors.accurate, sectors.sure,
-                sectors.fair, (config.log_free, config.log_free_sure, config.log_free_fair, config.log_free_far), hits,
+                sectors.fair, self._weights[1:], hits,
                 sign, slots, spare, used,
                 self._store.pool, touched,
             )  # fmt: skip

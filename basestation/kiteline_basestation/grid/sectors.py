@@ -61,8 +61,8 @@ class Sectors(NamedTuple):
         )  # fmt: skip
 
 
-def sectors_of(config: GridConfig, scan: KeptScan, lattice: Lattice) -> Sectors:
-    """The sectors of a scan at a pose."""
+def sectors_of(config: GridConfig, scan: KeptScan, lattice: Lattice, hit: int) -> Sectors:
+    """The sectors of a scan at a pose. hit: log-odds of a near view of an obstacle."""
     scale = scale_of(lattice)
     unit, ranges = scale / config.cell_m, scan.ranges()
     bands = ranges[1].astype(np.uint8)
@@ -84,7 +84,7 @@ def sectors_of(config: GridConfig, scan: KeptScan, lattice: Lattice) -> Sectors:
     deviation = scan.sigma_per_m2 * last_m**2 * unit
     sure = np.maximum(end.min(1) - margin * deviation, 0.0)
     fair = np.maximum(end.min(1) - (margin - _FAIR_SIGMAS) * deviation, 0.0)
-    weight = np.clip(np.rint(config.log_hit * accurate_m / np.maximum(near_m, accurate_m)), 1, 127).astype(np.int64)
+    weight = np.clip(np.rint(hit * accurate_m / np.maximum(near_m, accurate_m)), 1, 127).astype(np.int64)
     camera_band = int(np.searchsorted(config.bands_m, scan.height_m, side="right")) - 1
     accurate = np.full(scan.columns, accurate_m / config.cell_m)
     begin = _begin(config, scan, start, free, behind)

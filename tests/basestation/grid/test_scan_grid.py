@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from kiteline_basestation.grid import scan_kernels as kernels
 from kiteline_basestation.grid.grid_view import dense, grid_files
 from kiteline_basestation.grid.kept_scan import keep
-from kiteline_basestation.grid.scan_grid import ScanGrid
+from kiteline_basestation.grid.scan_grid import ScanGrid, ViewWeights
 from kiteline_core.arrays import F64, I64, U8, U16
 from tests.basestation.flat_rooms import ROOM, box, camera, circle, scan_of
 from tests.basestation.grid_scans import BF, CONFIG, at, drawn, flight, kept
@@ -90,7 +90,7 @@ def test_a_vehicle_that_hovers_says_what_it_sees_a_few_times() -> None:
     views = len(hovering._views)
     assert len(hovering) == 300 and views <= 8
     most = max(int(np.abs(hovering.log_odds(place)).max()) for place in hovering.places)
-    assert most <= views * CONFIG.views * CONFIG.log_hit
+    assert most <= views * CONFIG.views * ViewWeights().hit
 
     # Any order, with scans of other agents and after some moved away and back, gives the same.
     other = ScanGrid(CONFIG)

@@ -8,12 +8,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kiteline_basestation.grid.kept_scan import GAP_SIGMAS, keep
-from kiteline_basestation.grid.scan_grid import ScanGrid
+from kiteline_basestation.grid.scan_grid import ScanGrid, ViewWeights
 from kiteline_basestation.grid.sectors import _FAIR_SIGMAS, _OPEN_SIGMAS, _SURE_SIGMAS
 from kiteline_basestation.grid.tile_store import Place
 from kiteline_core.ground.column_scan import ColumnScan
 from tests.basestation.flat_rooms import HEIGHT_M, ROOM, box, camera, scan_of
 from tests.basestation.grid_scans import BF, CONFIG, at, kept
+
+WEIGHTS = ViewWeights()
 
 
 def bare(free_from_m: float, free_m: float) -> ColumnScan:
@@ -49,7 +51,7 @@ def test_each_cell_of_a_scan_is_freed_once() -> None:
         counted = 0
         for place in grid.places:
             odds = grid.log_odds(place)
-            views = config.log_free, config.log_free_sure, config.log_free_fair, config.log_free_far
+            views = WEIGHTS[1:]
             assert set(np.unique(odds)) <= {0, *(-view for view in views)}
             column, row = np.arange(64) + 64 * place.column, np.arange(64) + 64 * place.row
             dx, dy = (column[None, :] + 0.5) * 0.05 - x, (row[:, None] + 0.5) * 0.05 - y
@@ -92,7 +94,7 @@ def test_cells_over_which_the_nearest_rays_to_the_ground_pass_low_are_free_by_tw
     near, first = Place(0, 0, 0), 2.0 * (1.0 - CONFIG.bands_m[0] / HEIGHT_M)
     odds = grid.log_odds(near)[:, 1]
     columns = (np.arange(64) + 0.5) * 0.05
-    assert (odds[:, (columns > first + 0.05) & (columns < 1.95)] == -CONFIG.log_free_far).all()
+    assert (odds[:, (columns > first + 0.05) & (columns < 1.95)] == -WEIGHTS.free_far).all()
     assert not odds[:, columns < first - 0.05].any()
     assert grid.cells(near)[0][1, 38] == -1
     grid.put(1, seen, camera(0.01, 0.0, 0.3))
@@ -112,9 +114,9 @@ def test_a_far_view_frees_alone_what_lies_well_before_its_obstacle_and_two_what_
     sure, fair = (end - n * sigma_m for n in (_SURE_SIGMAS, _SURE_SIGMAS - _FAIR_SIGMAS))
     near = found.accurate_m(CONFIG)
     assert near + 0.2 < sure < end - 0.2
-    assert (row[(columns > near + 0.1) & (columns < sure - 0.1)] == -CONFIG.log_free_sure).all()
-    assert (row[(columns > sure + 0.06) & (columns < fair - 0.06)] == -CONFIG.log_free_fair).all()
-    assert (row[(columns > fair + 0.06) & (columns < end - 0.06)] == -CONFIG.log_free_far).all()
+    assert (row[(columns > near + 0.1) & (columns < sure - 0.1)] == -WEIGHTS.free_sure).all()
+    assert (row[(columns > sure + 0.06) & (columns < fair - 0.06)] == -WEIGHTS.free_fair).all()
+    assert (row[(columns > fair + 0.06) & (columns < end - 0.06)] == -WEIGHTS.free_far).all()
     assert not (row[columns > end + 0.1] < 0).any()
     assert at(grid, 0.5 * (near + sure), 0.0) == 0 and at(grid, end - 0.15, 0.0) == -1
     grid.put(1, found, camera(0.02, 0.0, 0.0))
@@ -147,8 +149,8 @@ def test_a_far_view_of_ground_that_ends_before_no_obstacle_frees_alone_nearly_up
     row = np.concatenate([grid.log_odds(Place(0, 0, k))[0, 1] for k in range(2)])
     columns = (np.arange(128) + 0.5) * CONFIG.cell_m
     sure = end - _OPEN_SIGMAS * CONFIG.sigma_px / bf * end**2
-    assert (row[(columns > found.accurate_m(CONFIG) + 0.1) & (columns < sure - 0.06)] == -CONFIG.log_free_sure).all()
-    assert (row[(columns > sure + 0.06) & (columns < end - 0.06)] == -CONFIG.log_free_fair).all()
+    assert (row[(columns > found.accurate_m(CONFIG) + 0.1) & (columns < sure - 0.06)] == -WEIGHTS.free_sure).all()
+    assert (row[(columns > sure + 0.06) & (columns < end - 0.06)] == -WEIGHTS.free_fair).all()
     assert sure > end - _SURE_SIGMAS * CONFIG.sigma_px / bf * end**2 + 0.1
 
 
