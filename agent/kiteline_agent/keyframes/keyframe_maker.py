@@ -8,8 +8,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from kiteline_agent.config import LocalMapConfig
 from kiteline_agent.governor.cost_model import Work
-from kiteline_agent.imaging import alignment_kernels
+from kiteline_agent.imaging import alignment_kernels, features
 from kiteline_agent.imaging.row_alignment import RowAlignment
 from kiteline_agent.keyframes.new_landmarks import EarlierView, NewPoints, moved_to_frame, new_points
 from kiteline_agent.local_map.keyframe_landmarks import KeyframeLandmarks
@@ -22,8 +23,10 @@ from kiteline_codec.schema import KeyframeHeader, NewLandmarks, Observations
 from kiteline_core.arrays import F32, F64, I64
 from kiteline_core.geometry import se3
 from kiteline_core.ids import NO_KEYFRAME, KeyframeId, point_id
+from kiteline_core.imaging import matching
 
 _MIN_RHO = 1e-4  # 1/m; farther counts as infinitely far
+_ROWS_AGAIN_S = 0.5  # s between two searches for the rows of the right image, 20 ms each
 _DEPTH_CAMERA_SIGMA_RHO = 2.85e-3  # 1/m, of a structured-light camera, constant (K. Khoshelham, S. Elberink, 2012)
 
 
@@ -40,6 +43,7 @@ class KeyframeMaker:
         self._has_depth = has_depth
         self._channel = channel
         self._work = work
+        self._rows_searched_ns: int | None = None  # when rows were searched for
         self.new_uv: F64 = np.zeros((0, 2))  # px of the first keypoints of the last keyframe that was shared
 
     def lacks_depth(self, ctx: FrameContext) -> bool:
@@ -47,10 +51,33 @@ class KeyframeMaker:
         return self._has_depth and ctx.images.right is None and ctx.images.depth_m is None
 
     def first_points(self, ctx: FrameContext) -> NewPoints | None:
-        """New landmarks for a keyframe without a track; None if too few of them have a depth."""
+        """New landmarks for a keyframe without a track; None if too few of them have a depth.
+
+        If rows of the right image are off by pixels, hardly any is found along them: then they are searched for.
+        """
         points = self._points(ctx, np.zeros((0, 2)))
-        enough = int(np.count_nonzero(points.disparity > 0.0)) >= ctx.config.local_map.first_points
-        return points if enough else None
+        if not _enough(points, ctx.config.local_map) and self._find_rows(ctx, points):
+            points = self._points(ctx, np.zeros((0, 2)))
+        return points if _enough(points, ctx.config.local_map) else None
+
+    def _find_rows(self, ctx: FrameContext, points: NewPoints) -> bool:
+        """Search the rows of the right image by descriptors; True if it is read at others now."""
+        right, config = ctx.images.right, ctx.config
+        waits = self._rows_searched_ns is not None and ctx.t_ns - self._rows_searched_ns < _ROWS_AGAIN_S * 1e9
+        if self._rows is None or right is None or waits or len(points.uv) < config.local_map.first_points:
+            return False
+        self._rows_searched_ns = ctx.t_ns
+        pyramid = right.rectified()
+        corners = features.detect(pyramid, np.zeros((0, 2)), config.detector)
+        angle, descriptor = features.describe(pyramid, corners.uv, corners.octave)
+        pairs = matching.match(points.descriptor, points.angle, descriptor, angle, config.matching)
+        self._work.rectified_px += pyramid[0].size
+        self._work.detected_px += pyramid[0].size
+        self._work.new_landmarks += len(corners.uv)
+        if not self._rows.search(points.uv[pairs.a], corners.uv[pairs.b]):
+            return False
+        right.rows_changed()
+        return True
 
     def points_beside(self, ctx: FrameContext, track: Track) -> NewPoints:
         """New landmarks where a tracked frame has none."""
@@ -214,6 +241,10 @@ class KeyframeMaker:
         slot = self._map.add(header, T_m_k, new, ctx.number)
         self._map.rolled[slot] = ctx.shutter is None
         return seen_uv
+
+
+def _enough(points: NewPoints, config: LocalMapConfig) -> bool:
+    return int(np.count_nonzero(points.disparity > 0.0)) >= config.first_points
 
 
 def _in_order_of_rows(points: NewPoints, cell_px: float, first: int) -> I64:
