@@ -32,11 +32,7 @@ _GOOD_PX = 0.1  # px; standard deviation of level, slope along x and x y with a 
 _WORN_SLOPE_PX = 0.3  # px where x is 1; of the slope along x: the mount is twisted by 0.04 degrees
 _WORN_TURN_PX = 0.6  # px where x y is 1; of x y: it is turned about y by 0.07 degrees
 _ITERATIONS = 10  # Gauss-Newton steps; it converges in 4 from 1 px
-_MOST_ROWS = 0.05  # of the image's height, that a search finds: a mount bent by 1.5 degrees at 480 rows
-_SEARCH_PX = 2.0  # px; matches that agree on the rows: their slopes across the image, and corners of whole pixels
-_SEARCH_LEAST_PX = 1.0  # px; rows that are off by less are measured without a search
-_SEARCH_POINTS = 20  # matches that agree, and
-_SEARCH_SHARE = 0.5  # their share: without a right image of the same scene matches scatter over all rows
+_LEAST_PX = 1.0  # px; rows that are off by less are measured along them
 _SHOWN_SHARE = 0.7  # share of worn rigs whose rows are off; focal lengths do not move them
 
 
@@ -69,7 +65,7 @@ class RowAlignment:
         self._taken_px: F64 = np.zeros(TERMS)  # see take_change
         self._taken_read = False
         self._measured = False  # since take_change
-        self._rough = False  # the offset that is applied is that of a search
+        self._rough = False  # the offset that is applied is known to a pixel; see read_lower
         self.worn_evidence = 0.0  # logarithm of the likelihood of the rows with a worn rig over that with a good one
         self.roll_px: float | None = None  # px where x is 1; rms of the slope along x, the roll of the right camera
         self.known = False  # something was measured, in this flight or an earlier one
@@ -109,30 +105,25 @@ class RowAlignment:
         self._weigh()
         return count
 
-    def search(self, left_uv: F64, right_uv: F64) -> bool:
-        """Find rows that are off by more than the search along them allows; True if the right image is read there now.
+    def at(self, uv: F64) -> F64:
+        """By how much (n,) px the right image is read lower, at pixels (n,2) of it."""
+        return np.asarray(terms(self._normalised(uv)) @ self.applied_px)
 
-        left_uv, right_uv: (n,2) px of corners matched by descriptor, in images rectified as calibrated. Their rows are
-        known to a pixel; the next points measure what is left.
+    def read_lower(self, off_px: float) -> bool:
+        """Read the right image at rows that were found without a search along them; True if they are others.
+
+        They are known to a pixel; the next points measure what is left.
         """
-        if not self._config.on:
+        if not self._config.on or abs(off_px) < _LEAST_PX:
             return False
-        camera = self._rectifier.camera
-        apart = left_uv - right_uv
-        likely = (apart[:, 0] >= 0.0) & (np.abs(apart[:, 1]) <= _MOST_ROWS * camera.height)
-        off = -apart[likely, 1] - terms(self._normalised(right_uv[likely])) @ self.applied_px
-        level = float(np.median(off)) if len(off) else 0.0
-        agreeing = int(np.count_nonzero(np.abs(off - level) < _SEARCH_PX))
-        if agreeing < max(_SEARCH_POINTS, _SEARCH_SHARE * len(off)) or abs(level) < _SEARCH_LEAST_PX:
-            return False
-        self._read_at(self.applied_px + [level, 0.0, 0.0, 0.0, 0.0])
+        self._read_at(self.applied_px + [off_px, 0.0, 0.0, 0.0, 0.0])
         self._rough = True
         return True
 
     def apply(self) -> float:
         """Read the right image at its rows if the last points are significantly off. Returns their rms px, or 0.
 
-        After a search any measured change is applied.
+        After `read_lower` any measured change is applied.
         """
         estimate = self.estimate_px
         change = estimate - self.applied_px

@@ -10,9 +10,10 @@ import numpy as np
 
 from kiteline_agent.config import LocalMapConfig
 from kiteline_agent.governor.cost_model import Work
-from kiteline_agent.imaging import alignment_kernels, features
+from kiteline_agent.imaging import alignment_kernels
 from kiteline_agent.imaging.row_alignment import RowAlignment
 from kiteline_agent.keyframes.new_landmarks import EarlierView, NewPoints, moved_to_frame, new_points
+from kiteline_agent.keyframes.pair_search import Fault, PairSearch
 from kiteline_agent.local_map.keyframe_landmarks import KeyframeLandmarks
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.tracking.frame_context import FrameContext
@@ -23,10 +24,8 @@ from kiteline_codec.schema import KeyframeHeader, NewLandmarks, Observations
 from kiteline_core.arrays import F32, F64, I64
 from kiteline_core.geometry import se3
 from kiteline_core.ids import NO_KEYFRAME, KeyframeId, point_id
-from kiteline_core.imaging import matching
 
 _MIN_RHO = 1e-4  # 1/m; farther counts as infinitely far
-_ROWS_AGAIN_S = 0.5  # s between two searches for the rows of the right image, 20 ms each
 _DEPTH_CAMERA_SIGMA_RHO = 2.85e-3  # 1/m, of a structured-light camera, constant (K. Khoshelham, S. Elberink, 2012)
 
 
@@ -40,10 +39,11 @@ class KeyframeMaker:
         self._map = local_map
         self._rows = rows
         self._camera = local_map.camera
+        self._pairs = None if rows is None else PairSearch(rows, work)
         self._has_depth = has_depth
         self._channel = channel
         self._work = work
-        self._rows_searched_ns: int | None = None  # when rows were searched for
+        self.fault: Fault | None = None  # why the last frame without a track had too few new landmarks
         self.new_uv: F64 = np.zeros((0, 2))  # px of the first keypoints of the last keyframe that was shared
 
     def lacks_depth(self, ctx: FrameContext) -> bool:
@@ -54,30 +54,16 @@ class KeyframeMaker:
         """New landmarks for a keyframe without a track; None if too few of them have a depth.
 
         If rows of the right image are off by pixels, hardly any is found along them: then they are searched for.
+        `fault` says why there are too few.
         """
         points = self._points(ctx, np.zeros((0, 2)))
-        if not _enough(points, ctx.config.local_map) and self._find_rows(ctx, points):
+        if _enough(points, ctx.config.local_map):
+            return points
+        few = len(points.uv) < ctx.config.local_map.first_points
+        if not few and self._pairs is not None and self._pairs.find_rows(ctx, points):
             points = self._points(ctx, np.zeros((0, 2)))
+        self.fault = Fault.CORNERS if few else Fault.DEPTH if ctx.images.right is None else Fault.PAIR
         return points if _enough(points, ctx.config.local_map) else None
-
-    def _find_rows(self, ctx: FrameContext, points: NewPoints) -> bool:
-        """Search the rows of the right image by descriptors; True if it is read at others now."""
-        right, config = ctx.images.right, ctx.config
-        waits = self._rows_searched_ns is not None and ctx.t_ns - self._rows_searched_ns < _ROWS_AGAIN_S * 1e9
-        if self._rows is None or right is None or waits or len(points.uv) < config.local_map.first_points:
-            return False
-        self._rows_searched_ns = ctx.t_ns
-        pyramid = right.rectified()
-        corners = features.detect(pyramid, np.zeros((0, 2)), config.detector)
-        angle, descriptor = features.describe(pyramid, corners.uv, corners.octave)
-        pairs = matching.match(points.descriptor, points.angle, descriptor, angle, config.matching)
-        self._work.rectified_px += pyramid[0].size
-        self._work.detected_px += pyramid[0].size
-        self._work.new_landmarks += len(corners.uv)
-        if not self._rows.search(points.uv[pairs.a], corners.uv[pairs.b]):
-            return False
-        right.rows_changed()
-        return True
 
     def points_beside(self, ctx: FrameContext, track: Track) -> NewPoints:
         """New landmarks where a tracked frame has none."""

@@ -39,7 +39,7 @@ class RightImage:
         return self._rectifier.remaps
 
     def coarse(self) -> Pyramid:
-        """Pyramid of the rectified image; level 0 is blank if the image needs rectification or is read at other rows."""
+        """Pyramid of the rectified image; level 0 is blank if it needs rectification or is read at other rows."""
         if self._coarse is None:
             raw = self.raw()
             self._coarse = raw

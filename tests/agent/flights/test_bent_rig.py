@@ -1,5 +1,6 @@
-"""A right camera that was bent since its calibration: the flight begins with the first frame all the same."""
+"""A right camera that was bent since its calibration begins with the first frame; other pairs are named."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -8,7 +9,9 @@ import pytest
 from kiteline_agent.agent import Agent
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.exchange.no_base import NoBaseChannel
+from kiteline_agent.keyframes.pair_search import Fault
 from kiteline_agent.step import Identity, StepInput
+from kiteline_core.arrays import U8
 from kiteline_core.geometry import se3
 from kiteline_core.ids import AgentId
 from tests.agent.room_flight import RoomFlight
@@ -32,13 +35,26 @@ def test_a_rig_whose_rows_are_off_by_pixels_flies_from_the_first_frame(room_flig
     assert np.linalg.norm(aligned[:, :3, 3] - truth[:, :3, 3], axis=1).max() < 0.03
 
 
-def test_a_right_image_that_shows_something_else_opens_no_map(room_flight: RoomFlight) -> None:
-    flight = room_flight.first(1.0)
+def _upside_down(image: U8) -> U8:
+    return np.ascontiguousarray(image[::-1, ::-1])
+
+
+@pytest.mark.parametrize(("images", "fault"), [
+    (lambda left, right: (right, left), Fault.PAIR),
+    (lambda left, right: (left, _upside_down(right)), Fault.PAIR),
+    (lambda left, right: (left // 64, right // 64), Fault.CORNERS),
+])  # fmt: skip
+def test_a_pair_with_which_no_map_begins_is_named(
+    room_flight: RoomFlight, images: Callable[[U8, U8], tuple[U8, U8]], fault: Fault
+) -> None:
+    flight = room_flight.first(1.5)
     agent = Agent(flight.rig, None, AgentConfig(), Identity(AgentId(0), 0), NoBaseChannel())
-    for frame, other in zip(flight.frames, flight.frames[::-1], strict=True):
-        assert other.right is not None
-        upside_down = np.ascontiguousarray(other.right[::-1, ::-1])
-        output = agent.step(StepInput(replace(frame, right=upside_down), None), frame.t_ns)
+    said = []
+    for frame in flight.frames:
+        assert frame.right is not None
+        left, right = images(frame.left, frame.right)
+        output = agent.step(StepInput(replace(frame, left=left, right=right), None), frame.t_ns)
         assert output.estimate is not None
         assert not output.estimate.tracked
-        assert not output.events
+        said += output.events
+    assert said == [fault.value]

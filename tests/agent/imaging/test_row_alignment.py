@@ -165,38 +165,30 @@ def test_offsets_of_few_points_or_without_texture_count_for_nothing() -> None:
 
 @pytest.mark.parametrize("lens", [Lens.NONE, Lens.RADTAN])
 @pytest.mark.parametrize("pitch_rad", [0.015, -0.03])  # 6 and 13 rows
-def test_a_search_finds_rows_that_are_off_by_many_pixels(lens: Lens, pitch_rad: float) -> None:
+def test_rows_that_are_known_to_a_pixel_are_measured_from_there(lens: Lens, pitch_rad: float) -> None:
     turned = np.array([pitch_rad, 0.0, 0.0])
     rectifier, left, right = flight(lens, turned)
-    true = expected(rectifier, UV, turned)
-    disparity = rectifier.camera.bf / DEPTH_M
-    there = np.round(UV + np.column_stack([np.full(len(UV), -disparity), true]))  # corners are whole pixels
+    off_px = float(np.round(np.median(expected(rectifier, UV, turned))))
     rows = RowAlignment(rectifier, RowConfig())
-    assert rows.search(UV, there)
-    assert abs(rows.applied_px[0] - np.median(true)) <= 1.0
+    assert rows.read_lower(off_px)
     pyramids = build_pyramid(rectifier.left(left), LEVELS), build_pyramid(right, LEVELS)
-    assert rows.add(*pyramids, UV, np.zeros(len(UV), np.uint8), np.full(len(UV), disparity)) > 0
-    rows.apply()
+    disparity = np.full(len(UV), rectifier.camera.bf / DEPTH_M)
+    assert rows.add(*pyramids, UV, np.zeros(len(UV), np.uint8), disparity) > 0
+    rows.apply()  # also less than half a pixel
     assert len(rows.take_events()) == 1
     offset, found = measured(rectifier, left, right)
     assert found.mean() > 0.7
     assert np.sqrt(np.median(offset[found] ** 2)) < 0.15
-    assert not rows.search(UV, there)  # it is read there
+    assert np.abs(rows.at(UV) - expected(rectifier, UV + [disparity[0], 0.0], turned)).max() < 0.3
+    rows.add(*pyramids, UV, np.zeros(len(UV), np.uint8), disparity)
+    assert rows.apply() == 0.0
 
 
-def test_a_search_that_finds_no_rows_changes_nothing() -> None:
+def test_rows_that_are_off_by_less_than_a_pixel_need_no_search() -> None:
     rectifier, _, _ = flight(Lens.RADTAN, TURNED)
     grid = rectifier.right_grid
-    rows = RowAlignment(rectifier, RowConfig())
-    lower = UV + [-20.0, 9.0]
-    rng = np.random.default_rng(1)
-    assert not rows.search(UV, UV + [-20.0, 0.3])  # a true rig
-    assert not rows.search(UV, UV + np.column_stack([np.full(len(UV), -20.0), rng.uniform(-15.0, 15.0, len(UV))]))
-    assert not rows.search(UV, UV + [-20.0, 40.0])  # beyond any mount
-    assert not rows.search(UV, UV + [20.0, 9.0])  # nearer than a disparity of 0
-    assert not rows.search(UV[:15], lower[:15])
-    assert not rows.search(UV[:0], UV[:0])
-    assert not RowAlignment(rectifier, replace(RowConfig(), on=False)).search(UV, lower)
+    assert not RowAlignment(rectifier, RowConfig()).read_lower(0.9)
+    assert not RowAlignment(rectifier, replace(RowConfig(), on=False)).read_lower(9.0)
     assert rectifier.right_grid is grid
 
 
