@@ -14,6 +14,7 @@ from kiteline_agent.inertial.calibration.axes_report import axes_report, correct
 from kiteline_agent.inertial.calibration.disagreement import Disagreement
 from kiteline_agent.inertial.calibration.gyro_calibration import GyroCalibration
 from kiteline_agent.inertial.calibration.known_imu import KnownImuConfig, is_plausible, known_axes
+from kiteline_agent.inertial.calibration.lengths_check import LengthsCheck
 from kiteline_agent.inertial.calibration.lever_search import LeverSearch, LeverSearchConfig
 from kiteline_agent.inertial.calibration.mounting_search import Mounting, MountingSearch, MountingSearchConfig
 from kiteline_agent.inertial.calibration.pose_chain import PoseChain, SampledMotion
@@ -97,9 +98,9 @@ class SelfCalibration:
         self.gyro, self.accel = self._unknown_gyro(), self._unknown_accel()
         self._unprimed_gyro: GyroCalibration | None = None  # a second estimate, without what earlier flights found
         self._earlier = KnownImuConfig()  # what earlier flights found
-        self._turns = PoseChain(config.turn_window_s)
-        self._moves = PoseChain(config.move_window_s)
+        self._turns, self._moves = PoseChain(config.turn_window_s), PoseChain(config.move_window_s)
         self._mounting, self._lever = MountingSearch(config.mounting), LeverSearch(config.lever)
+        self._lengths = LengthsCheck(config.scale_sigma)
         self._given_axes, self._given_offset_s = np.eye(3), config.offset_s  # with which the filters began
         self._lever_m = np.zeros(3)  # origin of the body, as the calibration places it, in the IMU
         self.restarted = False  # True after an `update` that found a calibration: what was integrated before is void
@@ -209,9 +210,8 @@ class SelfCalibration:
 
     def clear(self) -> None:
         """Begin new windows after an image loss."""
-        self._turns.clear()
-        self._moves.clear()
-        self._mounting.clear()
+        for windows in (self._turns, self._moves, self._mounting):
+            windows.clear()
         self._before = None
 
     def begin_map(self) -> None:
@@ -294,6 +294,8 @@ class SelfCalibration:
         if may and self.accel.significance() > config.significance:
             self._corrects_accel = True
             self._events.append(correction_event("accelerometer", self.accel.matrix))
+        if self._metric:
+            self._events += self._lengths.note(*self.accel.scale)
 
     def _search_mounting(self, buffer: SampleBuffer) -> None:
         """Begin anew with another mounting and time offset where these explain turns that the present ones do not."""
