@@ -24,7 +24,6 @@ class LengthsCheck:
         if abs(off) < max(_OFF, _SIGNIFICANCE * deviation):
             return []
         self._said = True
-        return [
-            (f"images: lengths are {100.0 * abs(off):.0f} % too {'long' if off > 0.0 else 'short'} by the accelerations "
-            f"(deviation {100.0 * deviation:.1f} %): check the baseline, the focal length and the unit of depths")
-        ]
+        word = "long" if off > 0.0 else "short"
+        said = f"lengths are {100.0 * abs(off):.0f} % too {word} by the accelerations (deviation {100.0 * deviation:.1f} %)"
+        return [f"images: {said}: check the baseline, the focal length and the unit of depths"]
