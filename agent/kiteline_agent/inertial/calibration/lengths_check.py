@@ -25,5 +25,6 @@ class LengthsCheck:
             return []
         self._said = True
         word = "long" if off > 0.0 else "short"
-        said = f"lengths are {100.0 * abs(off):.0f} % too {word} by the accelerations (deviation {100.0 * deviation:.1f} %)"
+        off, deviation = 100.0 * abs(off), 100.0 * deviation
+        said = f"lengths are {off:.0f} % too {word} by the accelerations (deviation {deviation:.1f} %)"
         return [f"images: {said}: check the baseline, the focal length and the unit of depths"]
