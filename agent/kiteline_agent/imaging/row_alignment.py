@@ -59,8 +59,7 @@ class RowAlignment:
     def __init__(self, rectifier: Rectifier, config: RowConfig) -> None:
         self._rectifier = rectifier
         self._config = config
-        self._information = np.diag(np.full(TERMS, _PRIOR_PX**-2.0))
-        self._vector = np.zeros(TERMS)
+        self._forget()
         self._at = np.zeros((1, TERMS))  # terms at the last keyframe's points
         self._taken_px: F64 = np.zeros(TERMS)  # see take_change
         self._taken_read = False
@@ -71,6 +70,9 @@ class RowAlignment:
         self.known = False  # something was measured, in this flight or an earlier one
         self._events: list[str] = []
         self.applied_px: F64 = np.zeros(TERMS)  # the offset, as factors of `terms` at pixels of the right image
+
+    def _forget(self) -> None:
+        self._information, self._vector = np.diag(np.full(TERMS, _PRIOR_PX**-2.0)), np.zeros(TERMS)
 
     def add(
         self, left: tuple[U8, ...], right: tuple[U8, ...], uv: F64,
@@ -112,10 +114,12 @@ class RowAlignment:
     def read_lower(self, off_px: float) -> bool:
         """Read the right image at rows that were found without a search along them; True if they are others.
 
-        They are known to a pixel; the next points measure what is left.
+        They are known to a pixel; the next points measure what is left. What was measured before is forgotten: the
+        camera has been moved since.
         """
         if not self._config.on or abs(off_px) < _LEAST_PX:
             return False
+        self._forget()
         self._read_at(self.applied_px + [off_px, 0.0, 0.0, 0.0, 0.0])
         self._rough = True
         return True

@@ -8,7 +8,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from kiteline_agent.config import LocalMapConfig
 from kiteline_agent.governor.cost_model import Work
 from kiteline_agent.imaging import alignment_kernels
 from kiteline_agent.imaging.row_alignment import RowAlignment
@@ -26,6 +25,7 @@ from kiteline_core.geometry import se3
 from kiteline_core.ids import NO_KEYFRAME, KeyframeId, point_id
 
 _MIN_RHO = 1e-4  # 1/m; farther counts as infinitely far
+_HARDLY = 0.25  # share of the corners with a disparity where rows are off; else there are three quarters and more
 _DEPTH_CAMERA_SIGMA_RHO = 2.85e-3  # 1/m, of a structured-light camera, constant (K. Khoshelham, S. Elberink, 2012)
 
 
@@ -51,27 +51,28 @@ class KeyframeMaker:
         return self._has_depth and ctx.images.right is None and ctx.images.depth_m is None
 
     def first_points(self, ctx: FrameContext) -> NewPoints | None:
-        """New landmarks for a keyframe without a track; None if too few of them have a depth.
-
-        If rows of the right image are off by pixels, hardly any is found along them: then they are searched for.
-        `fault` says why there are too few.
-        """
+        """New landmarks for a keyframe without a track; None if too few of them have a depth: `fault` says why."""
         points = self._points(ctx, np.zeros((0, 2)))
-        if _enough(points, ctx.config.local_map):
+        least = ctx.config.local_map.first_points
+        if _with_depth(points) >= least:
             return points
-        few = len(points.uv) < ctx.config.local_map.first_points
-        if not few and self._pairs is not None and self._pairs.find_rows(ctx, points):
-            points = self._points(ctx, np.zeros((0, 2)))
+        few = len(points.uv) < least
         self.fault = Fault.CORNERS if few else Fault.DEPTH if ctx.images.right is None else Fault.PAIR
-        return points if _enough(points, ctx.config.local_map) else None
+        return None
 
     def points_beside(self, ctx: FrameContext, track: Track) -> NewPoints:
         """New landmarks where a tracked frame has none."""
         return self._points(ctx, self._inliers(track)[1][:, :2])
 
     def _points(self, ctx: FrameContext, taken: F64) -> NewPoints:
-        """New landmarks away from pixels `taken` (n,2), at the frame's stamp."""
+        """New landmarks away from pixels `taken` (n,2), at the frame's stamp.
+
+        If rows of the right image are off by pixels, hardly any is found along them: then they are searched for.
+        """
         points = self._points_of_image(ctx, taken)
+        hardly = len(points.uv) >= ctx.config.local_map.first_points and _with_depth(points) < _HARDLY * len(points.uv)
+        if hardly and self._pairs is not None and self._pairs.find_rows(ctx, points):
+            points = self._points_of_image(ctx, taken)
         return points if ctx.shutter is None else moved_to_frame(points, self._camera, ctx.shutter)
 
     def _points_of_image(self, ctx: FrameContext, taken: F64) -> NewPoints:
@@ -229,8 +230,8 @@ class KeyframeMaker:
         return seen_uv
 
 
-def _enough(points: NewPoints, config: LocalMapConfig) -> bool:
-    return int(np.count_nonzero(points.disparity > 0.0)) >= config.first_points
+def _with_depth(points: NewPoints) -> int:
+    return int(np.count_nonzero(points.disparity > 0.0))
 
 
 def _in_order_of_rows(points: NewPoints, cell_px: float, first: int) -> I64:

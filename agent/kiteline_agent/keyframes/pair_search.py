@@ -12,7 +12,7 @@ from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_core.arrays import F64
 from kiteline_core.imaging import matching
 
-_AGAIN_S = 0.5  # s between two searches, 20 ms each
+_AGAIN_S, _MOST_AGAIN_S = 0.5, 30.0  # s between two searches, 20 ms each: twice as long after each that finds nothing
 _LEAST = 20  # matches that agree, and
 _SHARE = 0.5  # their share of all: of two images that show one scene most are right, else they scatter over all rows
 _AGREE_PX = 2.0  # px; slopes of the rows across the image, and corners of whole pixels
@@ -36,14 +36,14 @@ class PairSearch:
     def __init__(self, rows: RowAlignment, work: Work) -> None:
         self._rows = rows
         self._work = work
-        self._t_ns: int | None = None  # of the last search
+        self._next_ns: int | None = None  # when the next search may be
+        self._again_s = _AGAIN_S
 
     def find_rows(self, ctx: FrameContext, points: NewPoints) -> bool:
         """Search by the corners of the left image; True if the right one is read at other rows from now on."""
         right, config = ctx.images.right, ctx.config
-        if right is None or (self._t_ns is not None and ctx.t_ns - self._t_ns < _AGAIN_S * 1e9):
+        if right is None or (self._next_ns is not None and ctx.t_ns < self._next_ns):
             return False
-        self._t_ns = ctx.t_ns
         pyramid = right.rectified()
         corners = features.detect(pyramid, np.zeros((0, 2)), config.detector)
         angle, descriptor = features.describe(pyramid, corners.uv, corners.octave)
@@ -53,10 +53,12 @@ class PairSearch:
         self._work.new_landmarks += len(corners.uv)
         left_uv, right_uv = points.uv[pairs.a], corners.uv[pairs.b]
         off_px = rows_of(left_uv, right_uv, self._rows.at(right_uv), _MOST_ROWS * pyramid[0].shape[0])
-        if off_px is None or not self._rows.read_lower(off_px):
-            return False
-        right.rows_changed()
-        return True
+        found = off_px is not None and self._rows.read_lower(off_px)
+        self._again_s = _AGAIN_S if found else min(2.0 * self._again_s, _MOST_AGAIN_S)
+        self._next_ns = ctx.t_ns + round(self._again_s * 1e9)
+        if found:
+            right.rows_changed()
+        return found
 
 
 def rows_of(left_uv: F64, right_uv: F64, expected_px: F64, most_px: float) -> float | None:

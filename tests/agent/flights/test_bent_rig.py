@@ -35,6 +35,24 @@ def test_a_rig_whose_rows_are_off_by_pixels_flies_from_the_first_frame(room_flig
     assert np.linalg.norm(aligned[:, :3, 3] - truth[:, :3, 3], axis=1).max() < 0.03
 
 
+def test_a_right_camera_that_is_bent_in_flight_is_read_at_its_new_rows(room_flight: RoomFlight) -> None:
+    flight, rows, bent_at = room_flight.first(3.0), 4, 20
+    agent = Agent(flight.rig, None, AgentConfig(), Identity(AgentId(0), 0), NoBaseChannel())
+    poses, said = [], list[int]()
+    for number, frame in enumerate(flight.frames):
+        assert frame.right is not None
+        right = frame.right if number < bent_at else np.roll(frame.right, rows, axis=0)
+        output = agent.step(StepInput(replace(frame, right=right), None), frame.t_ns)
+        assert output.estimate is not None
+        poses.append(output.estimate.T_o_b)
+        said += [number for event in output.events if event.startswith("rows of the right image are +4")]
+    assert len(said) == 1
+    assert bent_at < said[0] < bent_at + 20, "at the next keyframe, before the map has left the view"
+    camera, truth = np.array(poses) @ flight.rig.T_b_c, flight.truth @ flight.rig.T_b_c
+    aligned = truth[0] @ se3.inverse(camera[0]) @ camera
+    assert np.linalg.norm(aligned[:, :3, 3] - truth[:, :3, 3], axis=1).max() < 0.05
+
+
 def _upside_down(image: U8) -> U8:
     return np.ascontiguousarray(image[::-1, ::-1])
 
