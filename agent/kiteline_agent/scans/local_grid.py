@@ -207,9 +207,7 @@ class LocalGrid:
         own_at = np.array([*(p[:2] - canvas.corner), np.arctan2(ahead[1], ahead[0])])
         cell_m, tile_at = config.cell_m, np.zeros(3)
         if tiles and T_w_f is not None:
-            height_m = None if self._ground_m is None else float(p[2]) - self._ground_m
-            told = height_m is None or height_m <= bands_m[-1]  # of what is higher, tiles tell nothing
-            cell_m, corner = self._place_window(T_w_f, tiles, _mask(bands_m, height_m, config.body_m) if told else 0)
+            cell_m, corner = self._place_window(T_w_f, tiles, self._bands_at(float(p[2]), bands_m))
             tile_at = np.array([*(T_w_f[:2, 3] - corner), np.arctan2(T_w_f[1, 0], T_w_f[0, 0])])
             window = self._window
         out = np.empty(SECTORS)
@@ -220,6 +218,17 @@ class LocalGrid:
             config.near_m, config.reach_m, _RAYS, out,
         )  # fmt: skip
         return Surroundings(out, config.reach_m)
+
+    def _bands_at(self, z_m: float, bands_m: tuple[float, ...]) -> int:
+        """Mask of the height bands of tiles that a vehicle at z_m is in.
+
+        None above the bands, and none where own scans lost the ground: what lies below would be told as ahead. All of a
+        vehicle without scans, which never knows its height.
+        """
+        if self._ground_m is None:
+            return 0 if self._scans else _mask(bands_m, None, self._config.body_m)
+        height_m = z_m - self._ground_m
+        return _mask(bands_m, height_m, self._config.body_m) if height_m <= bands_m[-1] else 0
 
     def _move_on(self, x_m: float, y_m: float, z_m: float) -> None:
         """Draw scans again about a place if the canvas does not fit it any more, as many as a frame has time for."""

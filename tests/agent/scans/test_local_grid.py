@@ -173,6 +173,16 @@ def test_tiles_tell_nothing_of_what_lies_above_their_bands() -> None:
     assert np.isnan(found.distance_m[SECTORS // 2]) and np.isfinite(found.distance_m[0])
 
 
+def test_tiles_tell_nothing_while_own_scans_do_not_know_the_ground() -> None:
+    """A low box would be told to a vehicle that flies above it."""
+    grid, T = LocalGrid(LocalGridConfig()), vehicle(0.0, 0.0, 0.0)
+    low = {(c, r): GridTile(c, r, 0, CELL_M, np.ones((64, 64), np.int8)) for c in range(-5, 5) for r in range(-5, 5)}
+    assert around(low, T)[SECTORS // 2] < 0.5, "without scans all bands are told"
+    grid.add(replace(scan_at(0.0, 0.0, 0.0), height_m=None), EXACT)
+    found = grid.around(TURN @ T, T, low, BANDS_M)
+    assert np.isnan(found.distance_m[SECTORS // 2]) and np.isfinite(found.distance_m[0])
+
+
 def test_a_vertical_that_is_known_late_levels_earlier_scans() -> None:
     """A flight that begins in motion: tilted axes would let a level flight climb out of what it saw."""
     grid, tilt = LocalGrid(LocalGridConfig()), se3.so3_exp(np.array([0.15, 0.0, 0.1]))
