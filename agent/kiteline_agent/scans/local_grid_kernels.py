@@ -6,7 +6,7 @@ from kiteline_core.jit import njit
 
 HIT, MISS = 2, -1  # what a seen surface and a clear ray add to a cell
 LONE_HIT = 1  # what one adds that a single column saw: a matched block is wider, so many are errors of matching
-_LONE = 0.15  # of a range by which those of the columns beside it differ, at least: a wall seen at 9 degrees
+_LONE = 0.1  # of a range by which those of the columns beside it differ, at least: a wall seen at 14 degrees
 MOST, LEAST = 8, -6
 _THICK_M = 0.3  # m of a smeared surface, at most: it may be a solid that was seen from other sides
 OCCUPIED, FREE = 2, -1  # from which, and up to which a cell is so; unknown between
