@@ -119,7 +119,7 @@ def _search_row(left, right, most_px, disparity, errors, sums, best, least, lowe
 def _matched_columns(disparity, x, rotation, camera):  # type: ignore[no-untyped-def]
     """First and last image column that both cameras saw; none if the first is not below the last.
 
-    x: (3,w) see `_along_rows`.
+    x: (3,w) what its column adds to a pixel's ray in the levelled frame.
     """
     h, w = disparity.shape
     known, pixels = np.zeros(w, np.int32), np.zeros(w, np.int32)
@@ -157,10 +157,7 @@ def level_points(disparity, rotation, camera, bf, offset, far_px, slopes, x_out,
         while at < n - 1 and slopes[at + 1] <= low + (i + 0.5) / scale:
             at += 1
         table[i] = at
-    x_image, x_level = (
-        np.empty(w),
-        np.empty((3, w)),
-    )  # of columns: the part of a pixel's ray that its row does not change
+    x_image, x_level = np.empty(w), np.empty((3, w))  # what its column adds to a pixel's ray: in the camera; levelled
     for u in range(w):
         x_image[u] = (u - cx) / fx
         for i in range(3):
