@@ -29,6 +29,7 @@ _USUAL_SQUARE = 0.45  # mean squared error above which a pair counts less before
 _KNOWN_PX = 0.1  # px; by which each number of an offset changes between two flights: mounts and temperature
 _PRIOR_PX = 0.9  # px; standard deviation of a constant offset of a worn rig: both centres moved
 _PRIOR_SLOPE_RAD = 1.1e-3  # rad; the same of the other terms: a right camera that is turned by 0.06 degrees
+_BENT, _BENT_LOG_ODDS = 8.0, -4.0  # times these of a mount that was bent by a degree; one worn rig in fifty is
 _LEAST_CHANGE_PX = 0.04  # px, rms over the image; of a later change that is applied
 _ROWS_SURE = 0.99  # probability of a worn rig by rows alone, above which it is applied in any motion
 _INFLATION = 2.0  # factor on variances: templates and lens errors are common to neighbouring points
@@ -68,6 +69,7 @@ class DisparityAlignment:
         self._refuted = False  # earlier flights were of another rig; the map still has their offset
         self._good = np.eye(TERMS) / GOOD_PX**2
         self._prior = np.diag(np.array([_PRIOR_PX, *[_PRIOR_SLOPE_RAD * camera.fx] * (TERMS - 1)]) ** -2.0)
+        self._bent = self._prior / _BENT**2
         x, y = np.meshgrid(np.linspace(0.0, camera.width, 7), np.linspace(0.0, camera.height, 5))
         self._grid = terms(np.stack([(x.ravel() - camera.cx) / camera.fx, (y.ravel() - camera.cy) / camera.fy], 1))
         self._frames = 0  # since the last one that could make a pair
@@ -253,6 +255,8 @@ class DisparityAlignment:
         self._solve_good(own * h, own * b)
         own = self._own_share(_FORWARD_KEYFRAMES)
         h, b = own * h, own * b
+        if self._is_bent():
+            self._prior = self._bent
         log_odds = self._prior_log_odds
         if self._earlier_h.any() and self._moves_sideways():
             worn, usual = _log_evidence(h, b, self._prior), _log_evidence(h, b, good)
@@ -288,10 +292,21 @@ class DisparityAlignment:
         if _probability(self._log_odds + rows) < _SURE:
             return False
         share = self._own_share(_FORWARD_KEYFRAMES) * self._believed_share()
-        h = share * (self._evicted_sure_h + np.einsum("s,sij->ij", self._share, self._pair_h)) + self._earlier_h
-        b = share * (self._evicted_sure_b + self._share @ self._pair_b) + self._earlier_b
+        h, b = self._sure()
+        h, b = share * h + self._earlier_h, share * b + self._earlier_b
         odds = self._prior_log_odds + _log_evidence(h, b, self._prior) - _log_evidence(h, b, self._good)
         return _probability(odds + rows) >= _SURE
+
+    def _sure(self) -> tuple[F64, F64]:
+        """Information (5,5) of all pairs and its side (5,), less of those whose landmarks fit badly."""
+        h = self._evicted_sure_h + np.einsum("s,sij->ij", self._share, self._pair_h)
+        return h, self._evicted_sure_b + self._share @ self._pair_b
+
+    def _is_bent(self) -> bool:
+        """True if an offset beyond wear is likelier: the mount was bent by up to a degree or two."""
+        h, b = self._sure()
+        gain = _log_evidence(h, b, self._bent) - _log_evidence(h, b, self._prior)
+        return self._moves_sideways() and gain + _BENT_LOG_ODDS > 0.0
 
     def _own_share(self, most: int) -> float:
         """Share of the pairs' information, if in forward motion no more than so many keyframes tell on their own."""

@@ -91,7 +91,7 @@ class DisparityStripes:
         self._raw = np.empty((camera.height, camera.width + _PAD_PX), np.int16)
         self._most_px = config.disparities
         doubted = int(_DOUBTED * camera.width * camera.height)
-        self._errors, self._search = np.empty(camera.width, np.float32), np.empty((4, camera.width), np.int32)
+        self._errors, self._search = np.empty((2, camera.width), np.float32), np.empty((4, camera.width), np.int16)
         self._doubted, self._better = np.empty(doubted, np.int32), np.empty(doubted, np.float32)
 
     def begin(self, left: U8, right: U8) -> None:

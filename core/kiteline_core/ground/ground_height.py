@@ -21,6 +21,7 @@ _MOST_CLIMB_M = 0.15  # m that the ground may climb from one scan to another, at
 _AGREEING_M = 0.1  # m between two cameras that saw the same ground, at least, until it is believed
 _GROUND_WIDTH_M = 3.0  # m that ground is wide before it is believed: tables are narrower
 _KNOWN_FOR_M = 8.0  # m of flight without a view of the ground after which its height is unknown
+_OTHER_VERTICAL = 0.06  # rad from one scan to the next: it was not known before, and heights were 0.2 m off at 3 m
 
 
 class Seen(NamedTuple):
@@ -62,6 +63,7 @@ class GroundHeight(Generic[Tag]):
 
     def __init__(self) -> None:
         self._foot: F64 | None = None  # (3,) in o, of the ground that was seen last
+        self._up: F64 | None = None  # (3,) in o, the vertical of the newest scan
         self._refuted = 0
         self._lower = 0  # newest scans that saw ground below the foot, and none as high
         self._held: deque[_Place[Tag]] = deque(maxlen=_HELD)
@@ -86,6 +88,9 @@ class GroundHeight(Generic[Tag]):
         """Take in a scan that was made with the height of `expected`."""
         scan, T = seen.scan, seen.T_o_c
         up = T[:3, :3] @ scan.up_c
+        before, self._up = self._up, up
+        if before is not None and float(before @ up) < np.cos(_OTHER_VERTICAL):
+            return Verdict([], self._begin_anew())
         camera = T[:3, 3].copy()
         low = camera - seen.lowest_m * up
         if np.isfinite(seen.lowest_m):
@@ -126,6 +131,14 @@ class GroundHeight(Generic[Tag]):
         withdrawn = self._withdraw(up)
         self._believed.extend(same)
         return Verdict([other.tag for other in same], withdrawn)
+
+    def _begin_anew(self) -> list[Tag]:
+        """Forget all that was seen. Returns the tags of scans that were believed."""
+        tags = [place.tag for place in self._believed]
+        self._foot, self._refuted, self._lower = None, 0, 0
+        for seen in (self._held, self._believed, self._low):
+            seen.clear()
+        return tags
 
     def _withdraw(self, up: F64) -> list[Tag]:
         """Forget scans whose ground lies above what was seen. Returns their tags."""

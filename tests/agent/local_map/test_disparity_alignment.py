@@ -38,6 +38,21 @@ def test_the_offset_of_a_worn_rig_is_found_and_corrects_the_map(seed: int) -> No
     assert flight.alignment.take_events() and not flight.alignment.take_events()
 
 
+BENT = np.array([6.0, 0.4, 0.1, 5.5, 0.3])  # a right camera that is turned by 0.8 degrees
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_an_offset_beyond_any_wear_is_found_as_well(seed: int) -> None:
+    flight, worn = Flight(BENT, seed, SIDEWAYS), Flight(1.5 * WORN, seed, SIDEWAYS)
+    wear = np.trace(flight.alignment.cov)
+    flight.fly(80), worn.fly(80)
+    grid = terms(normalised(np.array([[x, y] for x in (60.0, 376.0, 690.0) for y in (60.0, 240.0, 420.0)])))
+    left = np.sqrt(np.mean((grid @ (BENT - flight.map.disparity_offset)) ** 2))
+    assert left < 0.06 * np.sqrt(np.mean((grid @ BENT) ** 2))
+    assert np.trace(np.linalg.inv(flight.alignment._prior)) == pytest.approx(64.0 * wear)
+    assert np.trace(np.linalg.inv(worn.alignment._prior)) == pytest.approx(wear)  # wear keeps its own prior
+
+
 def test_frames_that_are_skipped_do_not_make_pairs_rarer() -> None:
     flight = Flight(WORN, 0, SIDEWAYS)
     for k, frame in enumerate(flight.frames(80)):

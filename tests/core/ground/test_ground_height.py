@@ -1,5 +1,7 @@
 """The height of the ground over a flight: boxes and tables that look like a floor, ramps, and what is withdrawn."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -82,6 +84,19 @@ def test_a_box_top_is_not_believed_with_a_floor_that_is_a_little_lower_elsewhere
     beside = [seen(x, 1.6, None, -0.1) for x in (0.1, 0.2)]
     floor = [seen(x, 1.6, 0.0, None) for x in (2.0, 2.3)]
     assert [tag for v in fly(ground, box, *beside, *floor) for tag in v.believed] == [3, 4]
+
+
+def test_scans_of_another_vertical_are_withdrawn_and_the_height_is_sought_again() -> None:
+    """A flight that begins in motion knows its vertical after a second; before, a level camera seems to look down."""
+    ground: GroundHeight[int] = GroundHeight()
+    tilted = np.array([0.0, -np.cos(0.1), np.sin(0.1)])
+    views = (seen(0.5 * k, 1.2, 0.0, 0.1) for k in range(3))
+    wrong = [view._replace(scan=replace(view.scan, up_c=tilted)) for view in views]
+    assert sorted(tag for v in fly(ground, *wrong) for tag in v.believed) == [0, 1, 2]
+    first, second, third = fly(ground, *(seen(1.5 + 0.5 * k, 1.2, 0.0, 0.1) for k in range(3)), first=3)
+    assert sorted(first.withdrawn) == [0, 1, 2] and not first.believed
+    assert not second.believed and third.believed == [4, 5]
+    assert expected(ground, 3.0, 1.2) == pytest.approx(1.2)
 
 
 def test_a_single_wrong_point_below_the_floor_changes_nothing() -> None:

@@ -15,6 +15,7 @@ from kiteline_agent.inertial.calibration.axes_report import axes_report, correct
 from kiteline_agent.inertial.calibration.disagreement import Disagreement
 from kiteline_agent.inertial.calibration.gyro_calibration import GyroCalibration
 from kiteline_agent.inertial.calibration.known_imu import KnownImuConfig, is_plausible, known_axes
+from kiteline_agent.inertial.calibration.lengths_check import LengthsCheck
 from kiteline_agent.inertial.calibration.lever_search import LeverSearch
 from kiteline_agent.inertial.calibration.mounting_search import Mounting, MountingSearch
 from kiteline_agent.inertial.calibration.pose_chain import PoseChain, SampledMotion
@@ -99,6 +100,7 @@ class SelfCalibration:
         self._turns = PoseChain(_TURN_WINDOW_S)
         self._moves = PoseChain(_MOVE_WINDOW_S)
         self._mounting, self._lever = MountingSearch(), LeverSearch()
+        self._lengths = LengthsCheck(_SCALE_SIGMA)
         self._given_axes, self._given_offset_s = np.eye(3), config.offset_s  # with which the filters began
         self._lever_m = np.zeros(3)  # origin of the body, as the calibration places it, in the IMU
         self.restarted = False  # True after an `update` that found a calibration: what was integrated before is void
@@ -208,9 +210,8 @@ class SelfCalibration:
 
     def clear(self) -> None:
         """Begin new windows after an image loss."""
-        self._turns.clear()
-        self._moves.clear()
-        self._mounting.clear()
+        for windows in (self._turns, self._moves, self._mounting):
+            windows.clear()
         self._before = None
 
     def begin_map(self) -> None:
@@ -293,6 +294,8 @@ class SelfCalibration:
         if may and self.accel.significance() > config.significance:
             self._corrects_accel = True
             self._events.append(correction_event("accelerometer", self.accel.matrix))
+        if self._metric:
+            self._events += self._lengths.note(*self.accel.scale)
 
     def _search_mounting(self, buffer: SampleBuffer) -> None:
         """Begin anew with another mounting and time offset where these explain turns that the present ones do not."""
