@@ -234,10 +234,12 @@ class MapMerger:
     def undo(self, merge: MapMerge) -> MergeResult:
         """Separate a merged map again: move it back, and unfuse its landmarks from those of the other map."""
         sparse_map, table = self._map, self._map.keypoints
+        at, split = self.merges.index(merge), frozenset(merge.moved)
         self.merges.remove(merge)
+        for later in self.merges[at:]:  # they no longer hold what is apart from now on
+            later.moved = {submap: S_w_m for submap, S_w_m in later.moved.items() if submap not in split}
         self.undone += 1
         self._corrections.cancel_pending(merge.into)
-        split = frozenset(merge.moved)
         self._edges = [
             e for e in self._edges if (submap_of_keyframe(e.new) in split) == (submap_of_keyframe(e.old) in split)
         ]

@@ -19,7 +19,7 @@ from tests.agent.room_flight import RoomFlight
 
 @pytest.mark.parametrize("degrees", [0.6, -1.2])  # 2.4 and 4.8 rows at half the usual size
 def test_a_rig_whose_rows_are_off_by_pixels_flies_from_the_first_frame(room_flight: RoomFlight, degrees: float) -> None:
-    flight = room_flight.first(1.0)
+    flight = room_flight.first(3.0)
     T_c_r = flight.rig.T_c_r
     assert T_c_r is not None
     bent = se3.from_rt(se3.so3_exp(np.radians([degrees, 0.0, 0.0])), np.zeros(3))
@@ -32,7 +32,7 @@ def test_a_rig_whose_rows_are_off_by_pixels_flies_from_the_first_frame(room_flig
     camera = np.array([pose.T_o_b for pose in poses if pose is not None]) @ rig.T_b_c
     truth = flight.truth @ rig.T_b_c
     aligned = truth[0] @ se3.inverse(camera[0]) @ camera
-    assert np.linalg.norm(aligned[:, :3, 3] - truth[:, :3, 3], axis=1).max() < 0.03
+    assert np.linalg.norm(aligned[:, :3, 3] - truth[:, :3, 3], axis=1).max() < 0.08
 
 
 def test_a_right_camera_that_is_bent_in_flight_is_read_at_its_new_rows(room_flight: RoomFlight) -> None:

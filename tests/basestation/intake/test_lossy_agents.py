@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from kiteline_basestation.management import Command, submap_name
@@ -47,6 +47,7 @@ def _order(mapper: Mapper, draw: Random, number: int) -> Command:
 
 @settings(max_examples=12, deadline=None)
 @given(seed=st.integers(0, 1 << 20), lost=st.sampled_from([0.0, 0.05, 0.2]))
+@example(seed=721, lost=0.05)
 def test_the_base_goes_on(flights: Callable[[], list[Any]], words: Any, seed: int, lost: float) -> None:
     draw, mapper, jobs = Random(seed), Mapper(WITHOUT_GRID, words), LockstepJobs()
     waiting: list[tuple[AgentId, list[Record]]] = []
