@@ -1,4 +1,4 @@
-"""Shortcuts through numba's compiler: kernels that compute the same, in two thirds of the time.
+"""Shortcuts through numba's compiler: kernels that compute the same, compiled in half of the time.
 
 They reach into numba, so a version that they were not tried with compiles without them. Their tests compare results.
 """

@@ -109,6 +109,37 @@ def test_views_of_a_kernels_arguments_are_not_counted() -> None:
     assert counted[1] < counted[0]
 
 
+def _sum_of_rows(levels: Any, rows: Any) -> float:
+    total = 0.0
+    for i in range(rows.shape[0]):
+        line = levels[rows[i] % 2][rows[i]]
+        for value in line[1:]:
+            total += value
+    return total
+
+
+def _sum_of_some(levels: Any, rows: Any) -> float:
+    total = 0.0
+    for i in range(rows.shape[0]):
+        some = levels[0][rows[i]]
+        total += some[some > 3.0].sum()
+    return total
+
+
+@pytest.mark.parametrize(("function", "counts"), [(_sum_of_rows, False), (_sum_of_some, True)])
+def test_only_a_kernel_that_makes_an_array_counts(function: Any, counts: bool) -> None:
+    if not numba.__version__.startswith(kernel_compiler.TRIED):
+        pytest.skip("compiles as numba does")
+    levels, rows = (np.arange(40.0).reshape(10, 4), np.ones((10, 4))), np.array([3, 4, 9, 1, 0, 2])
+    compiled: Any = numba.njit(nogil=True, no_cfunc_wrapper=True, pipeline_class=KernelCompiler)(function)
+    held = [sys.getrefcount(one) for one in (*levels, rows)]
+    assert compiled(levels, rows) == function(levels, rows)
+    assert [sys.getrefcount(one) for one in (*levels, rows)] == held
+    (code,) = compiled.inspect_llvm().values()
+    own = code.partition("define ")[2].partition("\n}")[0]  # without the wrapper that Python calls
+    assert ("NRT_" in own) == counts
+
+
 def _mixed_elements(bits: Any, codes: Any, columns: Any, pair: Any, out: Any) -> float:
     row, k, total = codes[1], np.uint8(2), 0.0
     for i in range(bits.shape[0]):
