@@ -26,9 +26,10 @@ from kiteline_agent.mapping.loss_stage import FrameOutcome, LossStage
 from kiteline_agent.mapping.pose_report import PoseReport
 from kiteline_agent.mapping.right_camera import RightCamera
 from kiteline_agent.mapping.submap_stage import SubmapStage
+from kiteline_agent.motion.extrapolation import LEAST_PREDICTION_PERCENT, MAX_PREDICTION_S
 from kiteline_agent.relocalisation.map_cache import MapCache
 from kiteline_agent.relocalisation.relocaliser import Relocaliser
-from kiteline_agent.scans.local_grid import LocalGrid, Surroundings
+from kiteline_agent.scans.local_grid import LOST_S, LocalGrid, Surroundings
 from kiteline_agent.scans.scan_stage import ScanStage
 from kiteline_agent.step import Estimate, Identity, PredictedPose, StepInput, StepOutput
 from kiteline_agent.tracking.frame_context import FrameContext
@@ -50,6 +51,7 @@ from kiteline_core.places.place_index import Vocabulary
 # Forward, right, down of a vehicle that flies where its camera looks.
 _T_C_F = np.array([[0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 _STILL_PX = 0.3  # by which a rolling shutter moves pixels of a vehicle that stands still, at most
+_OBSTACLE_TOLD_S = 1.0  # s between two lines of the log about the nearest obstacle
 
 
 class Agent:
@@ -73,7 +75,7 @@ class Agent:
         self._has_depth = rig.right is not None or rig.has_depth
         self.work = Work()  # operations of the last step
         self.map = LocalMap(camera, config.local_map)
-        self.map_cache = MapCache(camera, config.map_cache, config.matching, config.ransac, vocabulary)
+        self.map_cache = MapCache(camera, config.map_cache, vocabulary)
         self._governor = Governor(config.governor)
         self._effort = FULL
         self._camera = CameraState(rig, imu, config, identity, self.map)
@@ -111,7 +113,7 @@ class Agent:
                 self._camera, self._rectifier, self.map, maker, self._governor, channel, config.scan, config.ground,
                 self.work, config.detector.covered_parts,
             )  # fmt: skip
-        self._local_grid = LocalGrid(config.local_grid)
+        self._local_grid = LocalGrid(config.local_grid, config.ground.slab_m)
         self._loss = LossStage(
             self._camera, self._keyframes, self._submaps, self._relocaliser, self._governor,
             monocular=not self._has_depth,
@@ -144,7 +146,7 @@ class Agent:
             if tracked:
                 estimate, more = self._process_next(step_input.frame)
                 events += more
-            elif self._full_config.governor.cpu_percent >= self._full_config.prediction.least_cpu_percent:
+            elif self._full_config.governor.cpu_percent >= LEAST_PREDICTION_PERCENT:
                 predicted = self.predict(step_input.frame.t_ns)
         elif step_input.predict_ns is not None:
             predicted = self.predict(step_input.predict_ns)
@@ -153,9 +155,7 @@ class Agent:
     def predict(self, t_ns: int) -> PredictedPose | None:
         """The pose at a time after the last processed frame; None before there is a map, and too long after it."""
         waits = self._inertial_start is not None and len(self._inertial_start.waiting) > 0
-        return (
-            None if waits else self._report.predict(t_ns, joined(self._skipped_imu), self._full_config.prediction.max_s)
-        )
+        return None if waits else self._report.predict(t_ns, joined(self._skipped_imu), MAX_PREDICTION_S)
 
     def _process_next(self, newest: Frame) -> tuple[Estimate | None, list[str]]:
         """Process the newest frame, or what waits before it. Returns the newest frame's estimate, and events."""
@@ -311,7 +311,7 @@ class Agent:
         if scanned is None or error is None:
             return []
         self._local_grid.add(scanned, error)
-        if ctx.t_ns - self._obstacle_event_ns < self._full_config.scan.told_s * 1e9:
+        if ctx.t_ns - self._obstacle_event_ns < _OBSTACLE_TOLD_S * 1e9:
             return []
         self._obstacle_event_ns = ctx.t_ns
         around = self._local_grid.around(T_o_c @ _T_C_F, None, {}, self._full_config.ground.bands_m)
@@ -320,7 +320,7 @@ class Agent:
     def _forget_scans(self, ctx: FrameContext, outcome: FrameOutcome) -> None:
         """Forget the obstacles of scans once the motion of the vehicle has been unknown for too long."""
         lost_ns = 0 if outcome.bridged or self._placed_ns is None else ctx.t_ns - self._placed_ns
-        if lost_ns > self._full_config.local_grid.lost_s * 1e9:
+        if lost_ns > LOST_S * 1e9:
             self._local_grid.forget()
             if self._scans is not None:
                 self._scans.forget()

@@ -13,25 +13,6 @@ from kiteline_agent.known_rig import KnownRigConfig
 from kiteline_agent.scan_config import LocalGridConfig as LocalGridConfig
 from kiteline_agent.scan_config import ScanConfig as ScanConfig
 from kiteline_core.ground.config import GroundConfig
-from kiteline_core.imaging.matching import MatchConfig
-from kiteline_core.optimisation.bundle import BundleConfig
-from kiteline_core.pose.pnp import RansacConfig
-
-
-@dataclass(frozen=True, slots=True)
-class TwoViewConfig:
-    """What two views must show to begin a map."""
-
-    draws: int = 200  # RANSAC draws of each model: 8 good points of 60 % come up with 97 %
-    sigma_px: float = 1.0  # one standard deviation of a matched pixel
-    flat_ratio: float = 0.45  # R_H above which the homography is the model
-    min_points: int = 100  # points with depth that a map needs
-    min_share: float = 0.7  # of the model's inliers that the motion must explain
-    rival_share: float = 0.75  # share of the best motion's points with which a second motion makes both ambiguous
-    min_parallax_rad: float = 0.0175  # rad: 1 degree, median over the points; below it depth is noise
-    min_point_parallax_rad: float = 0.005  # rad: with less a point has no depth
-    reprojection_px: float = 2.0  # px: largest reprojection error of a point
-    bundle: BundleConfig = field(default_factory=BundleConfig)
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,11 +24,10 @@ class OdometerConfig:
     max_gap_s: float = 0.25  # a longer gap makes an interval unknown: wheels are read at 10 Hz at least
     floor_m_s: float = 0.02  # velocity error that no device states: its axes, its place, its stamps
     floor_rad_s: float = 0.005  # the same of a rotation rate
-    aligned: float = 0.9  # least cosine between both displacements for their lengths to be compared
     tolerance_m_s: float = 0.12  # noise above which it is not used; that of a good one is 0.05
     accel_m_s2: float = 2.0  # acceleration of the constant-velocity model: leaning by twelve degrees
     turn_rad_s2: float = 4.0  # the same about the body's axes: a small multicopter that tilts
-    unit_wait_s: float = 20.0  # s for which poses wait for that scale; then they are given in a unit of their own
+    unit_wait_s: float = 20.0  # s for which poses wait for the metre; then they are given in a unit of their own
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,15 +56,10 @@ class AlignConfig:
 
     MAY_BE_ZERO: ClassVar = ("fine_from",)
 
-    coarse_points: int = 80  # landmarks of the coarse pass, which corrects the prediction
     points: int = 240  # landmarks of the fine pass; more cost time and gain little
     cell_px: int = 32  # px: candidates are spread over cells of this size
-    iterations: int = 8  # Gauss-Newton steps a level
     fine_from: int = 1  # template level at which the fine pass begins; 0: cheaper, and converges from less far
-    fine_step_px: float = 3.0  # px of the fine level: error that the coarse pass leaves
-    min_ncc: float = 0.80  # correlation of template and patch
     sigma_px: float = 0.30  # px at octave 0: standard deviation of an aligned coordinate
-    max_scale: float = 2.5  # change of distance since the template was cut, as a factor
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,15 +106,9 @@ class TwoViewStartConfig:
     """How a monocular camera begins a map."""
 
     median_depth_m: float = 4.0  # m: convention that sets the scale of the first landmarks; that of a room
-    corners: int = 400  # corners followed from the first frame; half of them are lost or have no parallax
     cell_px: int = 22  # px: one corner a cell
-    window_px: int = 15  # px: window of the optical flow; the smallest that keeps hold of corners
     min_flow: float = 0.02  # of the focal length, median: with less flow two views have no parallax
-    min_share: float = 0.4  # of the first corners; with fewer left a new first frame is taken
-    max_s: float = 1.98  # s after which a new first frame is taken: the view has changed too much
     scale_every: int = 10  # frames between two tests of the metric scale: each may correct it needlessly
-    scale_sigma: float = 0.02  # relative deviation below which the metric scale is used
-    two_view: TwoViewConfig = field(default_factory=TwoViewConfig)
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,11 +116,9 @@ class DepthFromMotionConfig:
     """How landmarks without depth (seeds) get one from motion."""
 
     per_frame: int = 150  # seeds searched in a frame; each costs about 10 us
-    nearer: float = 2.0  # times the inverse depth of the nearest twentieth of the landmarks: end of the search
     off_line_px: float = 1.5  # px at octave 0 between the aligned pixel and the epipolar line
     gate: float = 3.0  # standard deviations between measured and held inverse depth
     sigma_px: float = 0.5  # px: standard deviation of an aligned pixel, with the pose's own error
-    known: float = 0.12  # deviation over inverse depth below which a seed becomes a landmark
     min_hits: int = 3  # frames that agree
     max_misses: int = 6  # frames without a match: it moved, or was an occlusion edge
 
@@ -162,13 +129,8 @@ class DisparityAlignmentConfig:
 
     on: bool = True  # False: only the base estimates it
     every: int = 4  # frames between two pairs, at most: each costs 0.3 ms
-    every_s: float = 0.18  # s between two pairs, at most: slow cameras, and frames that the governor skips
     points: int = 120  # most of them that are used
     sigma_px: float = 0.3  # px at octave 0; of aligned coordinates and disparities
-    growth: float = 1.2  # of the parallax between two pairs of the same keyframe
-    good_px: float = 0.1  # px; standard deviation of all terms of a good calibration
-    worn_share: float = 0.2  # probability of a worn rig before the flight
-    sure: float = 0.95  # the same, above which the offset is applied
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,11 +139,10 @@ class RelocalisationConfig:
 
     cell_px: int = 16  # px: one corner a cell; four times as many as in a keyframe, so that its own are among them
     max_corners: int = 600  # 0.5 ms of descriptors
-    entered: int = 16  # keyframes that a frame's search enters into the place index, the newest first; 0.65 ms each
+    indexed_per_frame: int = 16  # keyframes a frame's search adds to the place index, the newest first; 0.65 ms each
     candidates: int = 3  # places tried in a frame; each costs about 1 ms
-    beyond: float = 0.2  # of the image width: landmarks so far beyond a keyframe's border are matched, too
+    margin: float = 0.2  # of the image width: landmarks so far beyond a keyframe's border are matched, too
     min_inliers: int = 30  # of the tracker from that pose
-    min_share: float = 0.4  # of the landmarks the tracker searched for; a place that only looks similar has fewer
     dead_reckoning_m: float = 0.08  # m: standard deviation up to which dead reckoning extends the map; below good_m
 
 
@@ -209,12 +170,10 @@ class MapCacheConfig:
     """Cached keyframes sent by the base, and how they are matched."""
 
     keyframes: int = 32  # slots; the base sends fewer, but those of an earlier base may still be there
-    landmarks: int = 128  # of a cached keyframe
     sigma_px: float = 0.15  # px: virtual disparity error of a cached landmark, which rests on many views
     radius_px: float = 6.0  # px at octave 0: search radius around a projection, the error that P3P leaves
-    min_share: float = 0.15  # of the landmarks that should be in view; not every one is a corner again
     candidates: int = 3  # cached keyframes tried in a lost frame
-    beyond: float = 0.2  # of the image width: landmarks so far beyond a keyframe's border are matched, too
+    margin: float = 0.2  # of the image width: landmarks so far beyond a keyframe's border are matched, too
 
 
 @dataclass(frozen=True, slots=True)
@@ -243,8 +202,6 @@ class PredictionConfig:
     MAY_BE_ZERO: ClassVar = ("rate_hz",)
 
     rate_hz: float = 30.0  # 1/s: poses to a flight controller, predicted to the time of sending; 0: frames only
-    least_cpu_percent: float = 10.0  # of a core: with less, predictions of skipped frames would take half of the budget
-    max_s: float = 1.0  # s after the last processed frame: later no pose is predicted
 
 
 @dataclass(frozen=True, slots=True)
@@ -252,20 +209,13 @@ class GovernorConfig:
     """How CPU time is kept within a budget."""
 
     cpu_percent: float = 0.0  # percent of one core, over any window; 0: no budget
-    window_s: float = 1.0  # s: window in which the budget has to hold
-    margin: float = 0.97  # share of the budget that is planned; the rest is for what was not expected
     fill: float = 0.9  # share that frames and keyframes may take between two rows; what is left is for early keyframes
     carried_fill: float = 0.95  # the same with an IMU: a keyframe may wait for room, since frames are bridged meanwhile
-    comfort: float = 0.86  # share below which the load at the next better effort must stay before effort rises
     grace_s: float = 2.0  # s at the start that do not count: a map has to be begun
-    down_s: float = 0.25  # s between two falls: the expected costs need time to follow the first one
     up_s: float = 1.5  # s of low load before a rise
     max_gap_s: float = 0.35  # s between tracked frames; after more, tracking often fails
-    carried_gap_s: float = 1.0  # s: the same with an IMU, whose prediction counts as tracking for as long
-    blind_s: float = 1.0  # s without a tracked frame, after which one is tracked whatever it costs
-    doubt: float = 0.15  # relative error of the expected cost of a frame, at least: a pair for the disparity offset
+    min_cost_error: float = 0.15  # relative error of a frame's expected cost, at least: a pair for the disparity offset
     first_frame_ms: float = 3.5  # ms: expected cost of a tracked frame at full effort at the start: 752x480 on a laptop
-    settling_s: float = 1.0  # s at the start in which effort follows the load without hysteresis
 
 
 @dataclass(frozen=True, slots=True)
@@ -277,7 +227,6 @@ class LogConfig:
     every: int = 1  # frames; of so many, the images of one are logged, 0: none. Only a log with all can be replayed
     compressed: bool = True  # PNG of half an image's size for some 2.7 ms of a fast core, else stored for 0.25 ms
     apart: bool = True  # live flights encode in another process: 0.2 ms of the agent's CPU time for a pair, not 5
-    waiting: int = 12  # images that wait to be encoded, 9 MB; then live flights store images, others wait
 
 
 @dataclass(frozen=True, slots=True)
@@ -306,8 +255,6 @@ class AgentConfig:
     relocalisation: RelocalisationConfig = field(default_factory=RelocalisationConfig)
     map_cache: MapCacheConfig = field(default_factory=MapCacheConfig)
     smoothing: SmoothingConfig = field(default_factory=SmoothingConfig)
-    matching: MatchConfig = field(default_factory=MatchConfig)
-    ransac: RansacConfig = field(default_factory=RansacConfig)
     scan: ScanConfig = field(default_factory=ScanConfig)
     local_grid: LocalGridConfig = field(default_factory=LocalGridConfig)
     ground: GroundConfig = field(default_factory=GroundConfig)

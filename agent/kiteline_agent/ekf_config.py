@@ -12,7 +12,6 @@ class EkfConfig:
     sigma_px: float = 1.0  # deviation of a tracked pixel: templates err by a tenth, but alike over frames
     walk_px: float = 0.4  # px per sqrt(px of parallax): templates err by 0.6 % of the parallax, alike over frames
     gate: float = 10.6  # squared deviations of a pixel beyond which a match is wrong: 0.5 % of right ones
-    residual_gate: float = 2.0  # chi-square over its degrees of freedom above which its rays do not meet
     scale_sigma: float = 0.01  # relative deviation of the odometry's scale, constant over a flight
     path_noise: float = 0.02  # m per sqrt(m) of way: the odometry's white error, along each axis
     turn_noise: float = 0.005  # rad per sqrt(m) of way: the same of the heading

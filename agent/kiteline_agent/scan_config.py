@@ -22,11 +22,6 @@ class ScanConfig:
         0.2  # m; motion since the last scan: it sees a wall at 3 m from another angle, by 4 degrees; 0: any
     )
     turned_rad: float = 0.17  # rad; rotation since the last scan: a tenth of the field of view is new; 0: any
-    again_s: float = 0.5  # s; a camera that stays where it is scans again for the local grid: people walk in
-    part_s: float = (
-        0.05  # s between frames in which a stripe is matched: two at 10 Hz, so that every keyframe can be scanned
-    )
-    told_s: float = 1.0  # s; time between two lines of the log about the nearest obstacle
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,16 +30,10 @@ class LocalGridConfig:
 
     cell_m: float = 0.05  # m; the grid has 512 x 512 cells
     reach_m: float = 10.0  # m; farther obstacles are not told
-    near_m: float = 2.0  # m; nearer obstacles are told even if something before them is unknown
     sigma_m: float = 0.07  # m; deviation of a range up to which own scans count: 4 m with 0.11 m of baseline
     scans: int = 48  # newest ones that are kept: 10 m of flight, or more than a turn
     slab_m: float = 0.1  # m that the camera climbs until scans are drawn anew
-    seen_m: float = 0.2  # m above and below the camera that a scan's line of sight covers: `ground.slab_m`
     body_m: float = 0.25  # m above and below the vehicle where an obstacle stands in its way: a small drone
-    doubt_px: float = 0.3  # px; deviation of disparities from which tiles of the base do not count: 6 cm at 3 m
     repeats: int = 4  # newest scans of one view that are kept: as many as turn a cell that was free
-    gap_m: float = 1.0  # m along a ray that may be unknown before an obstacle is told: a turn between two scans
-    level_rad: float = 0.03  # rad; error of the vertical from which scans are levelled again: 0.1 m of height at 3 m
-    lost_s: float = 0.3  # s without a pose after which scans are forgotten: 0.15 m at a change of speed by 3 m/s^2
     vehicle_m: float = 0.15  # m about its middle where the vehicle is itself
     tiles: int = 512  # of the base's grid that are kept, 2 MiB: the farthest go

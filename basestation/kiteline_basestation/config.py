@@ -4,9 +4,7 @@ from dataclasses import dataclass, field
 from typing import ClassVar
 
 from kiteline_core.ground.config import GroundConfig
-from kiteline_core.imaging.matching import MatchConfig
 from kiteline_core.optimisation.bundle import BundleConfig
-from kiteline_core.pose.pnp import RansacConfig
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +30,6 @@ class BundleWindowConfig:
 
     max_free: int = 10  # keyframes whose poses are free: more cost time and change little
     max_fixed: int = 15  # keyframes held fixed: those that observe most of the same landmarks
-    min_shared: int = 12  # landmarks that two covisible keyframes share
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +40,6 @@ class OdometryFactorConfig:
     worn_px: float = (
         0.5  # px per sqrt(s) between them, for both: of a worn rig, whose disparity offset is counted apart
     )
-    run: int = 20  # keyframes; consecutive rotations whose common error is estimated together
     sigma_px: float = 0.15  # px; of each of 12 synthetic points if the keyframe has no observations
 
 
@@ -53,7 +49,6 @@ class LandmarkMatchingConfig:
 
     radius_px: float = 8.0  # px at octave 0; search radius: drift within a room; doubles with each octave
     max_hamming: int = 60  # of 256 bits; unrelated ORB descriptors differ by 128 +- 20
-    ratio: float = 0.8  # best over second-best distance: below it, a match is distinct
     disparity_px: float = 3.0  # px at octave 0; between the predicted and the measured disparity
 
 
@@ -63,9 +58,7 @@ class TriangulationConfig:
 
     epipolar_px: float = 1.5  # px at octave 0; between a keypoint and its epipolar line
     max_hamming: int = 50  # of 256 bits; stricter than landmark matching, as a line is longer than a circle
-    ratio: float = 0.75  # best over second-best distance
     max_cosine: float = 0.9998  # parallax of at least 1.1 degrees: below it depth is noise
-    reprojection_px: float = 2.0  # px at octave 0; in every view
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,56 +69,34 @@ class LoopConfig:
     enabled: bool = True  # False: no loops are closed and no maps merged
     candidates: int = 8  # most similar keyframes of other maps that are verified: a room's map has as many views
     min_likeness: float = 0.002  # similarity of places, 0..1: unrelated images 0.01, one from 0.5 m beside no more
-    match: MatchConfig = field(default_factory=MatchConfig)
-    ransac: RansacConfig = field(default_factory=RansacConfig)
-    sigma_disparity_px: float = 0.4  # px; standard deviation of the disparities behind the landmarks' depths
-    max_neighbours: int = 8  # covisible keyframes whose landmarks are matched too
     radius_px: float = 10.0  # px at octave 0; search radius around predicted projections, halved in the second round
     min_inliers: int = 20  # landmarks that are enough to judge a keyframe, a plane or a merge by
-    min_inliers_local: int = 13  # between two maps, landmarks that agree before guided matching: by chance up to 10
     min_inliers_all: int = 35  # landmarks that agree, with those of the neighbours, to merge maps
     min_inliers_loop: int = 40  # landmarks that agree, with those of the neighbours, to close a loop in one map
     min_matched_share: float = 0.25  # of the landmarks expected in view: less is an object that stands in two places
-    scale_sigma: float = 0.02  # standard error of the scale's logarithm: the bundle corrects a few percent
     columns: int = 6  # cells across the image: a poster that hangs twice fills few of them
     rows: int = 4  # cells down the image
     predecessors: int = 4  # keyframes beside matched ones that are verified too: their views still overlap
-    against: int = 3  # agreeing keyframes needed more for each one that contradicts
-    agree_m: float = 0.10  # m; between two corrections that agree
-    agree_depth: float = 0.04  # added share of the median depth
-    agree_path: float = 0.02  # added share of the path between the two keyframes
-    agree_rad: float = 0.05  # rad; between two corrections that agree
-    agree_scale: float = 0.05  # difference of the logarithms of two scales that agree
     drift_m: float = 0.3  # m; correction of a loop that drift explains
     drift_path: float = 0.02  # added share of the path between the two keyframes
-    drift_votes: int = 12  # keyframes in a row, none against them, that refute this expectation in one submap
+    drift_matches: int = 12  # matches that agree, none against them, after which drift may be larger in one submap
     most_drift: float = 5.0  # times the expected drift; beyond, no number of them does: two storeys that look alike
-    tilt_rad: float = 0.05  # rad; by which gravity of two maps may differ that are merged: cameras on worn mounts
-    monocular_drift_path: float = 0.05  # share of the path instead of drift_path if the scale drifts too
 
 
 @dataclass(frozen=True, slots=True)
 class GraphConfig:
     """Corrections of whole maps: pose graphs and full bundles."""
 
-    sigma_m: float = 0.005  # m; standard deviation of an edge between neighbours
-    sigma_rad: float = 0.003  # rad; of an edge between neighbours
     huber: float = 3.0  # standard deviations; loop edges with larger residuals weigh less
     stop: float = 1e-4  # relative decrease of the error below which the solver stops
-    first_full: int = 3  # keyframes of a map at its first full bundle: a worn rig is seen in it
     full_share: float = 0.03  # of the worker's time for scheduled full bundles: one of 100 keyframes every 3 s
     max_full: int = 800  # keyframes of a full bundle, which takes 0.4 s; of a larger map, those around the loop
-    robust_trials: int = 6  # trial steps of a full bundle before the outlier test
-    final_trials: int = 6  # trial steps of a full bundle after the outlier test
 
 
 @dataclass(frozen=True, slots=True)
 class DisparityCalibrationConfig:
     """Calibration of each agent's disparity offset by bundles of a whole map."""
 
-    tail: float = 6.0  # standard deviations, inflated: beyond two of the prior's own it yields to the data
-    determined: float = 0.7  # share of the prior's deviation; a term yields that data alone determine better
-    worn: float = 15.0  # factor on both deviations for a rig that has changed since its calibration: one or two pixels
     contradicts: float = (
         6.0  # squared distance of the data from a good calibration, inflated; of true rigs it is below 1
     )
@@ -133,17 +104,12 @@ class DisparityCalibrationConfig:
     inflation: float = (
         3.0  # factor on the estimated standard deviations: lens distortion biases depths from motion, too
     )
-    calibrated_px: float = 0.03  # px; standard deviation of the offset below which it counts as known
 
 
 @dataclass(frozen=True, slots=True)
 class InertialScaleConfig:
     """Scale of a monocular map in metres by the agents' inertial steps."""
 
-    iterations: int = 5  # of Gauss-Newton
-    gravity_m_s2: float = 9.81  # differs by 0.3 % over the earth, which the accelerometer bias absorbs
-    floor_m: float = 3e-5  # m; of a step by the IMU: the code's quanta
-    image_rad: float = 5e-4  # error of a step by images, over the distance of what they see
     huber: float = 2.5  # deviations; steps by images with larger errors weigh less
     drift: float = 0.015  # of the scale by images per root of a view: 1 rad, or a motion as far as what is seen
     most_drift: float = 3.0  # deviations of that from one knot to the next; 1.7 at most in whole maps, 5 in torn ones
@@ -170,7 +136,6 @@ class MapCachePlannerConfig:
     MAY_BE_ZERO: ClassVar = ("max_keyframes",)
 
     max_keyframes: int = 24  # keyframes in an agent's cache, 0: none; they cover two views of a room and the way there
-    period_s: float = 1.0  # s between two plans
     horizon_s: float = 2.0  # s that the motion is predicted: what a thin link takes to carry two keyframes
     local_keyframes: int = 48  # newest keyframes of its own that an agent keeps in its local map
     max_distance_ratio: float = (
@@ -186,31 +151,13 @@ class TileConfig:
     MAY_BE_ZERO: ClassVar = ("max_tiles",)
 
     max_tiles: int = 96  # tiles that an agent holds, 0: none; 4 kB each on board; a disc of 15 m radius has 70
-    period_s: float = 1.0  # s between two plans
     horizon_s: float = 3.0  # s that the motion is predicted: what lies ahead is of use before the agent is there
     reach_m: float = 14.0  # m; tiles whose centres are nearer are sent: distances are told up to 10 m
     keyframe_bytes: float = 100.0  # bytes that each of the agent's keyframes earns: two thirds of a scan upwards
     most_credit_bytes: float = 3000.0  # bytes at once: after a loop closure, or when an agent comes to a known place
-    overhead_bytes: int = 14  # of a tile in a packet: its key, version and a share of headers
     min_changes: int = (
         96  # cells that differ before a tile is sent again: its newest edges are in the agent's own scans
     )
-    near_m: float = 4.0  # m; added to distances: among near tiles changes decide
-
-
-@dataclass(frozen=True, slots=True)
-class GroundHeightConfig:
-    """Estimation of the ground height."""
-
-    camera_above_m: float = 0.1  # m; ground points are at least this far below every camera that observes them
-    patch_m: float = 2.0  # m; side of a patch; three by three patches share their points
-    height_bin_m: float = 0.05  # m; the points of a floor, with stereo noise, fill two or three bins
-    slope: float = 0.25  # m/m; steepest ground: a ramp, or a map whose z is 10 degrees off the vertical
-    peak_share: float = 0.25  # of the highest peak; the lowest peak with this share is the ground, below it is noise
-    min_peak_points: float = 4.0  # points of a peak
-    bands_m: tuple[float, ...] = (0.3, 0.2, 0.12, 0.1)  # m; half-widths around the plane, from a bin's error to noise
-    min_plane_points: float = 12.0  # points that a patch needs for a fit of its plane
-    slope_prior_m: float = 0.3  # m; points with less horizontal spread than this leave the slope near zero
 
 
 @dataclass(frozen=True, slots=True)
@@ -223,30 +170,9 @@ class GridConfig:
     max_sigma_m: float = (
         0.25  # m; ranges with a larger deviation are not used: a wall would be as thick as a door is wide
     )
-    fence: float = (
-        1.5  # interquartile ranges above the upper quartile: longer rays to the ground are cut (Segfloor eq. 5.3)
-    )
     bands_m: tuple[float, ...] = (0.1, 0.5, 1.2, 2.0)  # m; limits of the height bands, as the agents' scans have them
-    accurate_sigma_m: float = 0.05  # m; up to this deviation of a range a view counts in full: a cell by default
-    gap_sigmas: float = 3.0  # standard deviations before an obstacle within which ground is not freed
-    log_hit: int = 12  # 1/32; log-odds of one near view of an obstacle (p = 0.59); in inverse proportion to the range
-    log_free: int = 6  # 1/32; of one near view of free space (p = 0.45): half, as an edge is seen beside itself
-    log_free_sure: int = 4  # 1/32; the same of a far view well before what it sees
-    log_free_fair: int = 3  # 1/32; of a far view less far before it
-    log_free_far: int = 2  # 1/32; of a far view elsewhere (box and wall may be one surface), and before seen ground
-    sure_sigmas: float = (
-        2.0  # standard deviations beyond gap_sigmas from which on a far view is well before what it sees
-    )
-    open_sigmas: float = 1.0  # the same before a scan's end without an obstacle, which lies two before the last ground
-    fair_sigmas: float = 1.0  # fewer of them from which on it is less far before: 0.3 % are wrong with no sign near
     side_columns: int = (
         2  # of a scan at either side of its view that count as far ones: what stands there is not seen whole
-    )
-    occupied_from: int = 9  # 1/32; log-odds from which a band is occupied: one near view, two far ones
-    free_from: int = 4  # 1/32; a cell is free if all bands lie at or below minus this: one sure view, two far ones
-    free_clear: int = 3  # 1/32; the same with no sign of an obstacle within two cells: one fair view
-    free_beside: int = (
-        10  # 1/32; the same beside an occupied cell: a near view and a sure one, as one may lie a cell off
     )
     hole_neighbours: int = (
         5  # of 8 that are free, none occupied: a cell that no view spoke against is free too (a gap between two rays)
@@ -257,30 +183,13 @@ class GridConfig:
     )  # m; height in w of the middle storey: the camera that begins w flies 0.4 to 2 m above ground
     storey_m: float = 2.5  # m; between two storeys: less than those of houses
     storey_overlap_m: float = 0.4  # m; beyond its half a storey also holds what lies so near: ramps, drift of heights
-    max_position_m: float = 100_000.0  # m; scans farther from the origin are not drawn: only a faulty map has them
-    max_reach_m: float = 100.0  # m; scans that reach farther are not drawn: only a faulty scale makes them
-    view_m: float = 0.5  # m; scans of an agent whose cameras lie in a square of this side ...
-    view_rad: float = 0.39  # rad; ... and head the same way within this, a quarter of the field of view, are one view
     views: int = 8  # scans of one view that are drawn, the newest: log-odds of 16 bits hold some thousand near views
     drawn_per_step: int = 16  # scans that one step draws, half a ms each: a loop's corrections wait for later steps
     scanless_keyframes: int = 8  # of a stereo agent without a scan, after which its landmarks are drawn: they tell less
-    sparse_lag: int = (
-        5  # keyframes after which the landmarks of one without a scan are drawn again: they are refined by then
-    )
-    sparse_window: int = 4  # keyframes before and after it whose landmarks tell where its ground lies
     made_per_step: int = 2  # scans that one step makes from landmarks, 3 ms each
-    sparse_columns: int = 36  # of a scan from landmarks: more would leave gaps between rays
-    sparse_floor_points: int = 20  # nearest landmarks on the ground, whose median is the camera's height
-    sparse_depth_m: float = 0.3  # m; landmarks so far behind the nearest obstacle of a column belong to it
-    free_below_m: float = (
-        0.7  # m; a ray to a landmark frees cells only where it is lower: it passes over boxes and chairs
-    )
-    noise_per_m: float = 0.01  # m/m; height noise of landmarks per distance
-    ground_keyframes: int = 20  # newest keyframes among which one must know the height of the ground: 20 s
     band_files: bool = False  # True: a file for each height band, too
     binary_files: bool = False  # True: a file in which one view occupies a cell for good, too (Segfloor)
     resident_tiles: int = 512  # tiles that stay inflated, 24 kB each: what a dozen drones draw on at a time
-    ground: GroundHeightConfig = field(default_factory=GroundHeightConfig)
 
 
 @dataclass(frozen=True, slots=True)

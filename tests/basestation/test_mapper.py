@@ -212,6 +212,19 @@ def test_published_values_match_the_map(make_flight: MakeFlight) -> None:
         assert np.array_equal(mapper.map.keypoints.refined[new_landmarks], record.inv_depth)
 
 
+def test_corrections_smaller_than_is_asked_are_not_sent(make_flight: MakeFlight) -> None:
+    flight, none = make_flight(keyframes=12, turns=0.6), 1e9
+
+    def sent(kind: type[Record], **publish: float) -> int:
+        mapper = Mapper(replace(BaseConfig(), publish=replace(BaseConfig().publish, **publish)))  # type: ignore[arg-type]
+        return sum(isinstance(record, kind) for record in feed_groups(mapper, flight, flight.records))
+
+    assert sent(RefinedLandmarks, depth_px=none) < sent(RefinedLandmarks)
+    fewest = sent(KeyframePose, pose_m=none, pose_rad=none)
+    assert fewest < sent(KeyframePose, pose_m=none, pose_rad=1e-9)
+    assert fewest < sent(KeyframePose, pose_m=1e-9, pose_rad=none)
+
+
 def test_a_superseded_or_unknown_job_changes_nothing(make_flight: MakeFlight) -> None:
     flight = make_flight(keyframes=6, turns=0.1)
     mapper = Mapper()

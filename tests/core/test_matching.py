@@ -3,7 +3,6 @@
 import numpy as np
 
 from kiteline_core.imaging import matching
-from kiteline_core.imaging.matching import MatchConfig
 
 
 def bits(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -19,7 +18,7 @@ def noisy(rng: np.random.Generator, descriptor: np.ndarray, flips: int) -> np.nd
     return np.packbits(out, axis=1)
 
 
-def reference(a: np.ndarray, b: np.ndarray, allowed: np.ndarray, config: MatchConfig) -> set[tuple[int, int]]:
+def reference(a: np.ndarray, b: np.ndarray, allowed: np.ndarray) -> set[tuple[int, int]]:
     """One match each: in order of a, a nearer one takes it over."""
     owner: dict[int, tuple[int, int]] = {}
     distance = np.where(allowed, bits(a, b), 1 << 20)
@@ -27,7 +26,8 @@ def reference(a: np.ndarray, b: np.ndarray, allowed: np.ndarray, config: MatchCo
         order = np.argsort(row, kind="stable")
         first, second = int(row[order[0]]), int(row[order[1]])
         j = int(order[0])
-        if first <= config.max_hamming and first <= config.ratio * second and first < owner.get(j, (1 << 20, 0))[0]:
+        distinct = first <= matching._MAX_HAMMING and first <= matching._RATIO * second
+        if distinct and first < owner.get(j, (1 << 20, 0))[0]:
             owner[j] = (first, i)
     return {(i, j) for j, (_, i) in owner.items()}
 
@@ -37,9 +37,8 @@ def test_brute_force_is_the_reference() -> None:
     b = rng.integers(0, 256, (90, 32), np.uint8)
     a = np.concatenate([noisy(rng, b[:50], 30), noisy(rng, b[:10], 40), rng.integers(0, 256, (30, 32), np.uint8)])
     angle = np.zeros(90, np.uint8)
-    config = MatchConfig()
-    found = matching.match(a, angle, b, angle, config)
-    assert set(zip(found.a.tolist(), found.b.tolist())) == reference(a, b, np.ones((90, 90), bool), config)
+    found = matching.match(a, angle, b, angle)
+    assert set(zip(found.a.tolist(), found.b.tolist())) == reference(a, b, np.ones((90, 90), bool))
     assert len(found.a) >= 48
     assert np.array_equal(found.distance, bits(a, b)[found.a, found.b])
     assert len(np.unique(found.b)) == len(found.b)
@@ -51,14 +50,14 @@ def test_matches_that_turn_unlike_the_others_leave() -> None:
     angle = rng.integers(0, 256, 60).astype(np.uint8)
     turned = (angle.astype(int) + 40 + rng.integers(-4, 5, 60)).astype(np.uint8)
     turned[:6] = (angle[:6].astype(int) + 150 + np.arange(6) * 11) & 255
-    found = matching.match(a, angle, a, turned, MatchConfig())
+    found = matching.match(a, angle, a, turned)
     assert set(range(6, 60)) <= set(found.a.tolist())
     assert len(found.a) <= 56
 
 
 def test_guided_search_sees_exactly_its_circle() -> None:
     rng = np.random.default_rng(2)
-    n, config = 120, MatchConfig()
+    n = 120
     uv2 = rng.uniform((0, 0), (320, 200), (n, 2))
     b = rng.integers(0, 256, (n, 32), np.uint8)
     a = noisy(rng, b, 20)
@@ -66,15 +65,15 @@ def test_guided_search_sees_exactly_its_circle() -> None:
     uv = uv2 + rng.normal(0, 6, uv2.shape)
     radius = rng.uniform(4, 45, n)
     octave = octave2 + rng.normal(0, 0.6, n)
-    found = matching.match_near(uv, radius, octave, a, uv2, octave2, b, (320, 200), 1.0, config)
+    found = matching.match_near(uv, radius, octave, a, uv2, octave2, b, (320, 200), 1.0)
     near = np.linalg.norm(uv[:, None] - uv2[None], axis=2) <= radius[:, None]
     near &= np.abs(octave[:, None] - octave2[None]) <= 1.0
-    assert set(zip(found.a.tolist(), found.b.tolist())) == reference(a, b, near, config)
+    assert set(zip(found.a.tolist(), found.b.tolist())) == reference(a, b, near)
     assert 60 < len(found.a) < 120
 
 
 def test_nothing_matches_nothing() -> None:
     none, one = np.zeros((0, 32), np.uint8), np.zeros((1, 32), np.uint8)
     angle = np.zeros(1, np.uint8)
-    assert len(matching.match(none, angle[:0], one, angle, MatchConfig()).a) == 0
-    assert len(matching.match(one, angle, none, angle[:0], MatchConfig()).a) == 0
+    assert len(matching.match(none, angle[:0], one, angle).a) == 0
+    assert len(matching.match(one, angle, none, angle[:0]).a) == 0

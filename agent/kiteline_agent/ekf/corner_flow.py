@@ -11,7 +11,7 @@ import numpy as np
 from kiteline_agent.config import AlignConfig
 from kiteline_agent.ekf_config import EkfConfig
 from kiteline_agent.imaging import alignment_kernels, features
-from kiteline_agent.imaging.alignment_kernels import TEMPLATE, TEMPLATE_LEVELS
+from kiteline_agent.imaging.alignment_kernels import ALIGN_ITERATIONS, MIN_NCC, TEMPLATE, TEMPLATE_LEVELS
 from kiteline_agent.imaging.features import DetectorConfig, Pyramid
 from kiteline_agent.tracking.frame_images import NO_GRID
 from kiteline_core.arrays import F64, I64, U8, Bool
@@ -58,10 +58,9 @@ class CornerFlow:
         """
         n = len(self.ids)
         found, ncc, uv = np.zeros(n, np.bool_), np.zeros(n), self.uv.copy()
-        config = self._align
         alignment_kernels.align(
             left, NO_GRID, self._templates, np.arange(n), self.octave, self._warps(T_o_c, depth_m), uv, 0, 0,
-            config.iterations, _SLIDE_PX, config.min_ncc, found, ncc,
+            ALIGN_ITERATIONS, _SLIDE_PX, MIN_NCC, found, ncc,
         )  # fmt: skip
         self.uv = uv
         self._keep(found)

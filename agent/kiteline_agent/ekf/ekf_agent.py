@@ -15,7 +15,7 @@ from kiteline_agent.governor.governor import Governor
 from kiteline_agent.imaging.features import build_pyramid
 from kiteline_agent.inertial.gravity_alignment import AHEAD
 from kiteline_agent.known_rig import KnownRigConfig
-from kiteline_agent.motion.extrapolation import MotionSource
+from kiteline_agent.motion.extrapolation import LEAST_PREDICTION_PERCENT, MAX_PREDICTION_S, MotionSource
 from kiteline_agent.scans.local_grid import Surroundings
 from kiteline_agent.step import Estimate, Identity, PredictedPose, StepInput, StepOutput
 from kiteline_codec.channel import RecordChannel
@@ -71,7 +71,7 @@ class EkfAgent:
             if decision.track:
                 estimate, more = self._process(step_input.frame)
                 events += more
-            elif self._config.governor.cpu_percent >= self._config.prediction.least_cpu_percent:
+            elif self._config.governor.cpu_percent >= LEAST_PREDICTION_PERCENT:
                 predicted = self.predict(step_input.frame.t_ns)
         elif step_input.predict_ns is not None:
             predicted = self.predict(step_input.predict_ns)
@@ -81,7 +81,7 @@ class EkfAgent:
         """The pose at a time after the last frame; None too long after it."""
         last = self._last
         dt_s = 0.0 if last is None else (t_ns - last.t_ns) * 1e-9
-        if last is None or not 0.0 < dt_s <= self._config.prediction.max_s:
+        if last is None or not 0.0 < dt_s <= MAX_PREDICTION_S:
             return None
         T_o_b, twist = last.T_o_b @ self._motion.extrapolated(dt_s), self._motion.twist
         return PredictedPose(

@@ -36,6 +36,7 @@ _ENDED_TRACKS = 6  # tracks lost before they were landmarks that correct the vie
 _ENTRIES = 6  # landmarks that enter at one frame at most
 _IN_VIEW = 45  # landmarks in view from which no more enter: the state is kept for what is seen next
 _MISSES = 4  # rejected matches in excess of the good ones after which a landmark is dropped
+_RESIDUAL_GATE = 2.0  # chi-square over its degrees of freedom above which its rays do not meet
 
 
 @dataclass(frozen=True, slots=True)
@@ -196,7 +197,7 @@ class EkfSlam:
         """True if the rays of a track intersect well enough to give its distance."""
         state = self.state
         rays = linearised(state, track, state.T_o_c, state.view_T_o_c)
-        if rays is None or not rays_meet(state, rays, self._config.residual_gate):
+        if rays is None or not rays_meet(state, rays, _RESIDUAL_GATE):
             return False
         return distance_share(state, rays) <= _DEPTH_SHARE
 
@@ -213,7 +214,7 @@ class EkfSlam:
             views = views[np.unique(np.linspace(0, len(views) - 1, _ENDED_RAYS).round().astype(np.int64))]
             track = RayTrack(views, tracks.xy[row, views], self._sigma * float(tracks.coarse[row]))
             rays = linearised(self.state, track, self.state.T_o_c, self.state.view_T_o_c)
-            if rays is not None and rays_meet(self.state, rays, self._config.residual_gate):
+            if rays is not None and rays_meet(self.state, rays, _RESIDUAL_GATE):
                 out.append(track)
         return out
 

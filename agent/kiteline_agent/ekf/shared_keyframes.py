@@ -84,7 +84,7 @@ class SharedKeyframes:
         self._map = LocalMap(camera, replace(config.local_map, landmarks=1))
         self._map.activate(self.submap)
         self._reference = ReferenceKeyframe(self._map)
-        cache = MapCache(camera, config.map_cache, config.matching, config.ransac, None)
+        cache = MapCache(camera, config.map_cache, None)
         self._corrections = Corrections(self._map, cache, config.smoothing, None, config.local_grid.tiles)
         self._landmark_of: dict[int, int] = {}  # id at the base of the landmark of a track
         self._anchored = 0  # tracks with such an id in the first frame after the newest keyframe

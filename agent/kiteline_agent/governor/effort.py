@@ -48,17 +48,18 @@ def governed(config: AgentConfig, effort: Effort) -> AgentConfig:
     points = max(round(align.points * effort.points), 2 * config.pose.min_inliers)
     return replace(
         config,
-        pyramid=replace(config.pyramid, first=effort.first),
+        pyramid=replace(config.pyramid, first=max(config.pyramid.first, effort.first)),
         align=replace(
             align,
             points=points,
-            coarse_points=max(round(align.coarse_points * effort.points), 2 * config.pose.min_inliers),
             cell_px=round(align.cell_px / effort.points**0.5),
             fine_from=min(align.fine_from, effort.fine_from),
         ),
         stereo=replace(config.stereo, points=round(config.stereo.points * effort.stereo)),
         detector=replace(
-            config.detector, max_corners=round(config.detector.max_corners * effort.corners), first=effort.first
+            config.detector,
+            max_corners=round(config.detector.max_corners * effort.corners),
+            first=max(config.detector.first, effort.first),
         ),
         keyframe=replace(
             keyframe,

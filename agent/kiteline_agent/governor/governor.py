@@ -15,6 +15,14 @@ from kiteline_agent.config import GovernorConfig
 from kiteline_agent.governor.effort import ALONE, CARRIED, FULL, Effort
 from kiteline_agent.governor.start_pacing import StartPacing
 
+_WINDOW_S = 1.0  # s in which the budget has to hold
+_MARGIN = 0.97  # share of the budget that is planned; the rest is for what was not expected
+_COMFORT = 0.86  # share below which the load at the next better effort must stay before effort rises
+_DOWN_S = 0.25  # s between two falls: the expected costs need time to follow the first one
+_CARRIED_GAP_S = 1.0  # s between tracked frames with an IMU, whose prediction counts as tracking for as long
+_BLIND_S = 1.0  # s without a tracked frame, after which one is tracked whatever it costs
+_SETTLING_S = 1.0  # s at the start in which effort follows the load without hysteresis
+
 
 class Extra(Enum):
     """Extra work that makes a frame expensive."""
@@ -52,7 +60,7 @@ class Governor:
         self._config = config
         self.level = 0
         self._ladder: tuple[Effort, ...] = ALONE
-        self._budget_ns = config.cpu_percent / 100.0 * config.window_s * 1e9  # per window
+        self._budget_ns = config.cpu_percent / 100.0 * _WINDOW_S * 1e9  # per window
         self._spent: deque[tuple[int, int]] = deque()  # (t_ns, CPU ns) of the frames of the last window
         self._window_ns = 0
         self._due = 1.0  # accumulates the share of tracked frames; at 1 a frame is due
@@ -103,12 +111,12 @@ class Governor:
         self._advance(t_ns)
         before, load = self.level, self._load(self.level)
         events: list[str] = []
-        self._gap_s = self._config.carried_gap_s if carried else self._config.max_gap_s
+        self._gap_s = _CARRIED_GAP_S if carried else self._config.max_gap_s
         self._choose_row(t_ns, CARRIED if carried else ALONE)
         track = (self._is_due(lost=lost) or self._early(t_ns)) and self._affordable(t_ns, lost=lost)
         if not track and not lost and self._gap_exceeds(t_ns, self._gap_s):  # the last reserve, before tracking is lost
             track = self._window_ns + (1.0 + 0.5 * self._safety) * self._frame_ns <= self._budget_ns
-            if not track and self._gap_exceeds(t_ns, self._config.blind_s):
+            if not track and self._gap_exceeds(t_ns, _BLIND_S):
                 track = True
                 events.append("governor: over budget, or the track would be lost")
         if self.level != before:
@@ -166,7 +174,7 @@ class Governor:
             if self._last_extra is not None:
                 return False
             need_ns = self._frame_ns + self._expected_ns(Extra.SCAN)
-            if self._window_ns + need_ns > self._config.comfort * self._budget_ns:
+            if self._window_ns + need_ns > _COMFORT * self._budget_ns:
                 return False
         self.note(Extra.SCAN)
         return True
@@ -207,7 +215,7 @@ class Governor:
 
     def _advance(self, t_ns: int) -> None:
         """Advance the window to t_ns."""
-        window_ns = round(self._config.window_s * 1e9)
+        window_ns = round(_WINDOW_S * 1e9)
         while self._spent and self._spent[0][0] <= t_ns - window_ns:
             self._window_ns -= self._spent.popleft()[1]
         if self._last_t_ns is None:
@@ -235,7 +243,7 @@ class Governor:
     @property
     def _safety(self) -> float:
         """Safety margin: relative excess over the expected cost."""
-        return max(self._config.doubt, _SPREAD * self._scatter)
+        return max(self._config.min_cost_error, _SPREAD * self._scatter)
 
     def _count_keyframe(self, t_ns: int) -> None:
         """Update the rate of keyframe requests after a keyframe."""
@@ -252,7 +260,7 @@ class Governor:
         if self._waiting is Extra.KEYFRAME and not self._gap_exceeds(t_ns, self._gap_s):
             return self._room_for(Extra.KEYFRAME, 1.0 + self._safety)  # the keyframe has priority over more frames
         cost_ns = self._frame_ns * (1.0 + self._safety)
-        return self._window_ns + cost_ns <= self._config.margin * self._budget_ns
+        return self._window_ns + cost_ns <= _MARGIN * self._budget_ns
 
     def _gap_exceeds(self, t_ns: int, gap_s: float) -> bool:
         """True at the frame that is next to gap_s after the last tracked one, and at all later ones."""
@@ -270,7 +278,7 @@ class Governor:
             return True
         if self._last_extra not in (None, extra):
             return False  # it is done in the next frame, alone
-        idle_ns = self._idle_ns * self._config.window_s * 1e9 / self._period_ns
+        idle_ns = self._idle_ns * _WINDOW_S * 1e9 / self._period_ns
         little = self._window_ns <= idle_ns + _LEAST * self._budget_ns
         return little and idle_ns + factor * need_ns > self._budget_ns
 
@@ -305,7 +313,7 @@ class Governor:
 
     def _frames(self, level: int) -> float:
         """Share of the budget for the tracked frames of a row, without keyframes."""
-        frames = self._config.window_s * 1e9 / self._period_ns / self._every(level)
+        frames = _WINDOW_S * 1e9 / self._period_ns / self._every(level)
         return frames * self._row_frame_ns(level) / self._budget_ns
 
     def _row_frame_ns(self, level: int) -> float:
@@ -321,11 +329,11 @@ class Governor:
         """
         if not self._frame_ns:
             return 0.0
-        config, row, now = self._config, self._ladder[level], self._row
-        waits = self._gap_s >= config.window_s
-        keyframes = self._keyframes_s * config.window_s * now.keyframes / row.keyframes
+        row, now = self._ladder[level], self._row
+        waits = self._gap_s >= _WINDOW_S
+        keyframes = self._keyframes_s * _WINDOW_S * now.keyframes / row.keyframes
         keyframe_ns = self._extra_ns[Extra.KEYFRAME] * row.keyframe_cost / now.keyframe_cost
-        idle_ns = self._idle_ns * (1.0 - 1.0 / self._every(level)) * config.window_s * 1e9 / self._period_ns
+        idle_ns = self._idle_ns * (1.0 - 1.0 / self._every(level)) * _WINDOW_S * 1e9 / self._period_ns
         load = self._frames(level) + (max(keyframes, 0.0 if waits else 1.0) * keyframe_ns + idle_ns) / self._budget_ns
         frame_ns = self._row_frame_ns(level)
         alone = (idle_ns + _ALONE * (frame_ns + keyframe_ns)) / self._budget_ns
@@ -342,15 +350,15 @@ class Governor:
             self._change_row(ladder, 0)
             self._set_level(t_ns, self._best_affordable(0))
             return
-        if t_ns - self._first_t_ns < config.settling_s * 1e9:  # no stable load yet
+        if t_ns - self._first_t_ns < _SETTLING_S * 1e9:  # no stable load yet
             self._set_level(t_ns, self._best_affordable(0))
             return
-        if self._load(self.level) > 1.0 and t_ns - self._level_since_ns >= config.down_s * 1e9:
+        if self._load(self.level) > 1.0 and t_ns - self._level_since_ns >= _DOWN_S * 1e9:
             level = self._best_affordable(self.level)
             if level != self.level:
                 self._set_level(t_ns, level)
                 return
-        if self.level == 0 or self._load(self.level - 1) > config.comfort:
+        if self.level == 0 or self._load(self.level - 1) > _COMFORT:
             self._calm_since_ns = t_ns
         elif self._waiting is None and t_ns - self._calm_since_ns >= config.up_s * 1e9:
             self._set_level(t_ns, self.level - 1)

@@ -22,6 +22,9 @@ LANES = PATCH * STRIDE
 GREY = 16  # steps per grey level of integer patches
 CURVED = (PATCH_RADIUS + 1) / (6.0 * PATCH_RADIUS)  # mean of c^2 / 2 over a patch, over the square of its radius
 TEMPLATE_LEVELS = 3  # octave of the corner, and two coarser ones for convergence
+ALIGN_ITERATIONS = 8  # Gauss-Newton steps of an alignment on a level
+FINE_STEP_PX = 3.0  # px of a level: error that a coarse pass leaves
+MIN_NCC = 0.80  # correlation of template and patch, at least
 
 
 @helper

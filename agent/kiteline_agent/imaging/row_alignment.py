@@ -32,6 +32,7 @@ _GOOD_PX = 0.1  # px; standard deviation of level, slope along x and x y with a 
 _WORN_SLOPE_PX = 0.3  # px where x is 1; of the slope along x: the mount is twisted by 0.04 degrees
 _WORN_TURN_PX = 0.6  # px where x y is 1; of x y: it is turned about y by 0.07 degrees
 _ITERATIONS = 10  # Gauss-Newton steps; it converges in 4 from 1 px
+_LEAST_PX = 1.0  # px; rows that are off by less are measured along them
 _SHOWN_SHARE = 0.7  # share of worn rigs whose rows are off; focal lengths do not move them
 
 
@@ -58,17 +59,20 @@ class RowAlignment:
     def __init__(self, rectifier: Rectifier, config: RowConfig) -> None:
         self._rectifier = rectifier
         self._config = config
-        self._information = np.diag(np.full(TERMS, _PRIOR_PX**-2.0))
-        self._vector = np.zeros(TERMS)
+        self._forget()
         self._at = np.zeros((1, TERMS))  # terms at the last keyframe's points
         self._taken_px: F64 = np.zeros(TERMS)  # see take_change
         self._taken_read = False
         self._measured = False  # since take_change
+        self._rough = False  # the offset that is applied is known to a pixel; see read_lower
         self.worn_evidence = 0.0  # logarithm of the likelihood of the rows with a worn rig over that with a good one
         self.roll_px: float | None = None  # px where x is 1; rms of the slope along x, the roll of the right camera
         self.known = False  # something was measured, in this flight or an earlier one
         self._events: list[str] = []
         self.applied_px: F64 = np.zeros(TERMS)  # the offset, as factors of `terms` at pixels of the right image
+
+    def _forget(self) -> None:
+        self._information, self._vector = np.diag(np.full(TERMS, _PRIOR_PX**-2.0)), np.zeros(TERMS)
 
     def add(
         self, left: tuple[U8, ...], right: tuple[U8, ...], uv: F64,
@@ -103,15 +107,36 @@ class RowAlignment:
         self._weigh()
         return count
 
+    def at(self, uv: F64) -> F64:
+        """By how much (n,) px the right image is read lower, at pixels (n,2) of it."""
+        return np.asarray(terms(self._normalised(uv)) @ self.applied_px)
+
+    def read_lower(self, off_px: float) -> bool:
+        """Read the right image at rows that were found without a search along them; True if they are others.
+
+        They are known to a pixel; the next points measure what is left. What was measured before is forgotten: the
+        camera has been moved since.
+        """
+        if not self._config.on or abs(off_px) < _LEAST_PX:
+            return False
+        self._forget()
+        self._read_at(self.applied_px + [off_px, 0.0, 0.0, 0.0, 0.0])
+        self._rough = True
+        return True
+
     def apply(self) -> float:
-        """Read the right image at its rows if the last points are significantly off. Returns their rms px, or 0."""
+        """Read the right image at its rows if the last points are significantly off. Returns their rms px, or 0.
+
+        After `read_lower` any measured change is applied.
+        """
         estimate = self.estimate_px
         change = estimate - self.applied_px
         at = self._at
         rms = float(np.sqrt(np.mean((at @ change) ** 2)))
         sigma = float(np.sqrt(np.mean(np.einsum("ni,in->n", at, np.linalg.solve(self._information, at.T)))))
-        if rms < _MIN_CHANGE_PX or rms < _MIN_SIGNIFICANCE * sigma:
+        if not self._rough and (rms < _MIN_CHANGE_PX or rms < _MIN_SIGNIFICANCE * sigma):
             return 0.0
+        self._rough = False
         self._read_at(estimate)
         self._events.append(f"rows of the right image are {estimate[0]:+.2f} px off in the middle")
         return rms

@@ -21,6 +21,7 @@ from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.order_statistics import median
 
 _BY_DEFINITION = 1e-4  # m and rad: deviation of a pose that defines its map
+_VELOCITY_CHI2 = 7.81  # 95 % with 3 degrees of freedom: an odometer's velocity beyond it is down-weighted
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +98,6 @@ class FixedLagSmoother:
         self._intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy, camera.bf])
         self._n = 0
         self._rot, self._state, self._tilt = np.zeros((n, 3, 3)), np.zeros((n, 12)), np.zeros(2)
-        self._samples: list[Samples] = []
         self._newest: tuple[Samples, Preintegrated] | None = None  # preintegrated last
         self._imu_dt, self._imu_turn, self._imu_vp = np.zeros(n), np.zeros((n, 3, 3)), np.zeros((n, 6))
         self._imu_jac, self._imu_bias = np.zeros((n, 9, 6)), np.zeros((n, 6))
@@ -138,7 +138,6 @@ class FixedLagSmoother:
     ) -> None:
         """Start with one state. gravity: (3,) in m, of which only the direction is used. cov: (17,17), if known."""
         self._n = 1
-        self._samples = []
         self._rot[0] = T_m_b[:3, :3]
         self._state[0] = np.concatenate([T_m_b[:3, 3], velocity, bias])
         self._tilt[:] = tilt_of(gravity)
@@ -200,13 +199,11 @@ class FixedLagSmoother:
         self._imu_length[k - 1, 3:6], self._imu_length[k - 1, 6:] = change, 0.5 * motion.dt_s * change
         self._imu_length[k - 1] *= self._config.length_inflation * length_error
         self._put_interval(k - 1, motion)
-        self._samples.append(samples)
         self._rot[k] = se3.orthonormalise(T_m_b)[:3, :3]
         self._state[k] = np.concatenate([T_m_b[:3, 3], velocity, bias])
         self._put_points(k, points)
         self._put_velocity(k, odometry, motion)
         self._n = k + 1
-        self._relinearise_biases()
         c = self._config
         cost = kernels.smooth(
             self._n, c.iterations, min(c.fresh, self._n), self._rot, self._state, self._tilt, self._gravity,
@@ -224,8 +221,7 @@ class FixedLagSmoother:
     def replace_last(self, samples: Samples) -> None:
         """Replace the samples of the interval before the newest state."""
         k = self._n - 2
-        if k >= 0 and self._samples:
-            self._samples[-1] = samples
+        if k >= 0:
             bias = self._imu_bias[k].copy()
             self._put_interval(k, preintegrate(samples, bias, self._calibration, self._config.imu_inflation))
 
@@ -339,18 +335,8 @@ class FixedLagSmoother:
         if not square < c.velocity_gate:
             return
         self._vel[k] = value
-        weight = min(1.0, float(np.sqrt(c.velocity_chi2 / max(square, 1e-9))))
+        weight = min(1.0, float(np.sqrt(_VELOCITY_CHI2 / max(square, 1e-9))))
         self._vel_info[k] = weight * np.linalg.inv(rotation.T @ odometry.inflated @ rotation)
-
-    def _relinearise_biases(self) -> None:
-        """Integrate intervals again whose bias changed too much for the first-order correction."""
-        c = self._config
-        for k in range(self._n - 1):
-            change = np.abs(self._state[k, 6:] - self._imu_bias[k])
-            if change[:3].max() > c.relinearise_gyro_rad_s or change[3:].max() > c.relinearise_accel_m_s2:
-                self._put_interval(
-                    k, preintegrate(self._samples[k], self._state[k, 6:], self._calibration, c.imu_inflation)
-                )
 
     def _drop_oldest(self) -> bool:
         """Marginalise the oldest state into the prior and shift the others."""
@@ -371,7 +357,6 @@ class FixedLagSmoother:
             arrays += [self._xyz, self._ray, self._observed, self._sigma, self._use]
         for array in arrays:
             array[: n - 1] = array[1:n].copy()
-        self._samples.pop(0)
         self._n = n - 1
         return bool(ok)
 

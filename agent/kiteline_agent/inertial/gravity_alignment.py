@@ -18,6 +18,8 @@ from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import SubmapId
 
+_MIN_TILT_RAD = 0.035  # rad; tilt above which the map is gravity-aligned: two degrees
+_PATIENCE_S = 2.0  # s; longest time that a flight controller waits for gravity-aligned poses
 _LEAST_M_S2 = 0.1  # of a specific force that points anywhere
 _ATTITUDE_TILT = np.array([0, 1, 2, 15, 16])  # in the covariance of a state
 AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # R_m_c of a level camera that looks along x
@@ -54,14 +56,9 @@ def up_of(state: InertialState) -> tuple[F64, float]:
 class GravityAligner:
     """Estimates the tilt of the odometry frame and of the first submap. Call `update` once a frame."""
 
-    def __init__(
-        self, camera: RectifiedCamera, inertial: InertialTracker | None, min_tilt_rad: float, patience_s: float
-    ):
-        """min_tilt_rad: least tilt that is corrected. patience_s: after which the odometry frame is final."""
+    def __init__(self, camera: RectifiedCamera, inertial: InertialTracker | None) -> None:
         self._camera = camera
         self._inertial = inertial
-        self._min_tilt_rad = min_tilt_rad
-        self._patience_ns = round(1e9 * patience_s)
         self._began_ns: int | None = None
         self._R_l_o: F64 | None = None if inertial is not None else np.eye(3)
         self._renewed = False
@@ -104,12 +101,12 @@ class GravityAligner:
             self._began_ns = t_ns
         R_l_m = self._inertial.gravity_rotation()
         if R_l_m is None:
-            if t_ns - self._began_ns > self._patience_ns and not self._renewed:
+            if t_ns - self._began_ns > _PATIENCE_S * 1e9 and not self._renewed:
                 self._R_l_o = np.eye(3)
             return None
         self._R_l_o = level_rotation(R_o_m @ R_l_m[2])
         self.tilt_rad = float(np.linalg.norm(se3.so3_log(R_l_m)))
-        if not first or self._renewed or self.tilt_rad < self._min_tilt_rad:
+        if not first or self._renewed or self.tilt_rad < _MIN_TILT_RAD:
             return None
         # Rotate about the vehicle, so that its position in the world does not jump.
         here = T_m_b[:3, 3]

@@ -16,6 +16,14 @@ from kiteline_core.frame import ImuCalibration
 
 _MIN_FRAMES = 5
 _REST_SAMPLES = 20
+_REST_WINDOW_S = 0.3  # s that the vehicle must stand still to start from rest
+_REST_MOVED_M = 0.005  # m; most motion by the images during that rest
+_LEVEL_WINDOW_S = 0.19  # s after which gravity is known to a degree: five frames at 20 Hz
+_LEVEL_ERROR = 0.03  # relative error of gravity's length then: its direction is as accurate
+_MOTION_WINDOW_S = 0.7  # s; window of the initialisation in motion
+_WINDOW_S = 2.97  # s of poses kept before the initialisation, for gravity at rest and in slow flight
+_MAX_RESIDUAL_M = 0.02  # m; of the initialisation: above it the poses do not fit the IMU
+_MAX_GRAVITY_ERROR = 0.12  # relative; of gravity's length that is found without imposing it
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +80,7 @@ class ImuInitialiser:
             self._poses = []
         self._poses.append(pose)
         self._poses = [self._completed(p) for p in self._poses]
-        recent = sum((pose.t_ns - p.t_ns) * 1e-9 <= self._config.window_s for p in self._poses)
+        recent = sum((pose.t_ns - p.t_ns) * 1e-9 <= _WINDOW_S for p in self._poses)
         del self._poses[: -max(recent, self._config.motion_frames)]
 
     def _completed(self, pose: TimedPose) -> TimedPose:
@@ -95,34 +103,34 @@ class ImuInitialiser:
     def gravity(self, bias: F64) -> F64 | None:
         """Gravity (3,) m/s^2 in m, a few frames after the start; None before. bias: (6,)."""
         config = self._config
-        if len(self._poses) < _MIN_FRAMES or self._span_s() < config.level_window_s:
+        if len(self._poses) < _MIN_FRAMES or self._span_s() < _LEVEL_WINDOW_S:
             return None
         poses, motions = self._window(len(self._poses), bias)
         if len(motions) < len(poses) - 1:
             return None
         found = initial_alignment.align(poses, self._p_b_c, motions, bias, config.gravity_m_s2, with_scale=False)
-        fits = found is not None and found.residual_m < config.max_residual_m
-        return found.gravity if found is not None and fits and found.gravity_error < config.level_error else None
+        fits = found is not None and found.residual_m < _MAX_RESIDUAL_M
+        return found.gravity if found is not None and fits and found.gravity_error < _LEVEL_ERROR else None
 
     def start(self, smoother: FixedLagSmoother, bias: F64) -> Literal["rest", "motion"] | None:
         """Start the smoother at the last pose if the window allows it; returns how. bias: (6,) last known."""
         if len(self._poses) < _MIN_FRAMES:
             return None
         span_s = self._span_s()
-        if span_s >= self._config.rest_window_s and self._start_at_rest(smoother, bias):
+        if span_s >= _REST_WINDOW_S and self._start_at_rest(smoother, bias):
             self.clear()
             return "rest"
-        if span_s >= self._config.motion_window_s and self._start_in_motion(smoother, bias):
+        if span_s >= _MOTION_WINDOW_S and self._start_in_motion(smoother, bias):
             self.clear()
             return "motion"
         return None
 
     def _start_at_rest(self, smoother: FixedLagSmoother, bias: F64) -> bool:
         config, last = self._config, self._poses[-1]
-        recent = [p for p in self._poses if (last.t_ns - p.t_ns) * 1e-9 <= config.rest_window_s + 0.1]
+        recent = [p for p in self._poses if (last.t_ns - p.t_ns) * 1e-9 <= _REST_WINDOW_S + 0.1]
         moved = max(float(np.linalg.norm(p.T_m_b[:3, 3] - last.T_m_b[:3, 3])) for p in recent)
         samples = self._buffer.within(recent[0].t_ns, last.t_ns)
-        if len(samples) < _REST_SAMPLES or moved > config.rest_moved_m:
+        if len(samples) < _REST_SAMPLES or moved > _REST_MOVED_M:
             return False
         mean, spread = samples.mean(axis=0), samples.std(axis=0)
         if spread[:3].max() >= config.rest_gyro_rad_s or spread[3:].max() >= config.rest_accel_m_s2:
@@ -138,11 +146,11 @@ class ImuInitialiser:
 
     def _start_in_motion(self, smoother: FixedLagSmoother, bias: F64) -> bool:
         config, last = self._config, self._poses[-1]
-        recent = sum((last.t_ns - p.t_ns) * 1e-9 <= config.motion_window_s + 0.3 for p in self._poses)
+        recent = sum((last.t_ns - p.t_ns) * 1e-9 <= _MOTION_WINDOW_S + 0.3 for p in self._poses)
         poses, motions = self._window(max(recent, config.motion_frames), bias)
         bias = np.concatenate([initial_alignment.gyro_bias(poses, motions), bias[3:]])
         found = initial_alignment.align(poses, self._p_b_c, motions, bias, config.gravity_m_s2, with_scale=False)
-        if found is None or found.residual_m > config.max_residual_m or found.gravity_error > config.max_gravity_error:
+        if found is None or found.residual_m > _MAX_RESIDUAL_M or found.gravity_error > _MAX_GRAVITY_ERROR:
             return False
         bias[3:] = found.accel_bias
         velocity = found.velocities[-1] if last.awaited is None else self.velocity()

@@ -7,6 +7,7 @@ from kiteline_core.frame import ImuBatch
 _GRAVITY_S = 3.0  # over which accelerations are averaged: longer than a fall or a jolt of a small vehicle
 _LEAST, _MOST = 0.5, 4.0  # times gravity: no flight averages less or more, other units and missing gravity do
 _EXPECTED = "expected what an accelerometer measures, in m/s^2 and with gravity: not in g, not linear acceleration"
+SILENT_S = 3.0  # s without a sample, after which an event is logged
 
 
 class ImuWatch:

@@ -14,7 +14,6 @@ class FixedLagConfig:
     iterations: int = 3  # Gauss-Newton steps; the prediction is close
     points: int = 320  # most points of a frame
     chi2: float = 9.21  # 99 % of a chi-square with 2 degrees of freedom; Huber's knee is at half of it
-    velocity_chi2: float = 7.81  # 95 % with 3 degrees of freedom: an odometer's velocity beyond it is down-weighted
     velocity_gate: float = 16.27  # 99.9 %: beyond it a velocity is rejected: wheels slip
     visual_inflation: float = 16.0  # of variance: errors of templates and points are correlated over frames
     imu_inflation: float = 3.0  # of noise densities: vibration, uncalibrated scale and axes, a bent map
@@ -23,8 +22,6 @@ class FixedLagConfig:
     velocity_floor_m_s: float = 5e-4  # the same of velocity: interpolated ends of the interval
     position_floor_m: float = 2e-5  # the same of position
     tilt_walk_rad: float = 2e-4  # per sqrt(s): the map itself bends while it grows
-    relinearise_gyro_rad_s: float = 0.01  # change of bias above which an interval is integrated again
-    relinearise_accel_m_s2: float = 0.2  # the same of the accelerometer
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,60 +37,14 @@ class StartDeviations:
 
 
 @dataclass(frozen=True, slots=True)
-class ScaleFilterConfig:
-    """How the scale of a monocular map is watched after its start."""
-
-    interval_s: float = 0.39  # between two compared poses, and of inertial steps: velocity changes more than images err
-    start_scale: float = 0.022  # relative deviation of the start's scale: that of a first window, as those below
-    start_gravity_m_s2: float = 0.1  # deviation of gravity at the start
-    start_velocity_m_s: float = 0.1  # deviation of the velocity at the start
-    start_bias_m_s2: float = 0.1  # deviation of the accelerometer's bias at the start
-    accel_walk: float = 0.02  # m/s^2 per sqrt(s): errors of scale and axes, of the map's rotations
-    scale_walk: float = 0.006  # per sqrt(s): the map's own scale drifts while it grows
-    image_rad: float = 7e-4  # error of a position by images, over the depth that they see
-    imu_inflation: float = 3.0  # of the calibration's noise densities, beside the factor that the start found
-    gravity_sigma_m_s2: float = 0.01  # of the length of gravity
-    chi2: float = 16.27  # 99.9 % with 3 degrees of freedom: beyond it an interval is left out, the images jumped
-    known_sigma: float = 0.025  # deviation below which the scale may be corrected
-    least: float = 0.015  # smallest correction: each begins a new submap
-    least_deviations: float = 1.1  # the same in deviations
-    least_s: float = 4.0  # time between two corrections
-
-
-@dataclass(frozen=True, slots=True)
-class LossMotionConfig:
-    """How the motion over a loss follows from the velocity after it."""
-
-    after_s: float = 0.19  # time in the new submap after which the velocity is known: four frames at 20 Hz
-    most_s: float = 1.0  # later it tells as little of the loss as the IMU of the time since
-    accel_m_s2: float = 0.3  # error of a worn accelerometer under vibration, meanwhile
-    image_m: float = 0.004  # error of the motion by images, meanwhile
-
-
-@dataclass(frozen=True, slots=True)
 class InertialConfig:
     """How the inertial state is initialised, and how long dead reckoning is trusted."""
 
     smoother: FixedLagConfig = field(default_factory=FixedLagConfig)
     calibration: SelfCalibrationConfig = field(default_factory=SelfCalibrationConfig)
-    scale_filter: ScaleFilterConfig = field(default_factory=ScaleFilterConfig)
-    loss_motion: LossMotionConfig = field(default_factory=LossMotionConfig)
-    disparity_px: float = 0.1  # px; by which good calibrations are off: an error of lengths that grows with the depth
     gravity_m_s2: float = 9.81  # differs by 0.3 % over the earth, which the accelerometer bias absorbs
-    silent_s: float = 3.0  # time without a sample after which an event is logged
     max_gap_s: float = 0.2  # a longer gap in the samples makes an interval unknown: a bus was blocked
-    rest_window_s: float = 0.3  # time that the vehicle must stand still to start from rest
     rest_gyro_rad_s: float = 0.02  # standard deviation of the gyro below which the vehicle stands still
     rest_accel_m_s2: float = 0.15  # the same of the accelerometer: motors may idle
-    rest_moved_m: float = 0.005  # most motion by the images meanwhile
-    level_window_s: float = 0.19  # after which gravity is known to a degree: five frames at 20 Hz
-    level_error: float = 0.03  # relative error of gravity's length then: its direction is as accurate
-    level_patience_s: float = 2.0  # longest time that a flight controller waits for gravity-aligned poses
-    motion_window_s: float = 0.7  # window of the initialisation in motion
     motion_frames: int = 7  # least frames of that window: with five, noise could pass for acceleration
-    window_s: float = 2.97  # s of poses kept before the initialisation, for gravity at rest and in slow flight
-    max_residual_m: float = 0.02  # of the initialisation; above it the poses do not fit the IMU
-    max_gravity_error: float = 0.12  # relative, of the length that is found without imposing it
-    trusted_dead_reckoning_s: float = 1.0  # dead reckoning by the IMU counts as tracking for this long
-    min_tilt_rad: float = 0.035  # tilt above which the map is gravity-aligned: two degrees
     max_dead_reckoning_s: float = 20.0  # longest dead reckoning: a small IMU is useless after it

@@ -11,10 +11,10 @@ from kiteline_agent.inertial.imu_initialisation import ImuInitialiser, InertialS
 from kiteline_agent.inertial.inertial_config import InertialConfig, StartDeviations
 from kiteline_agent.inertial.preintegration import BiasPrior, Preintegrated, Samples, preintegrate
 from kiteline_agent.inertial.sample_buffer import SampleBuffer, without_held
-from kiteline_agent.inertial.scale_filter import ScaleFilter, camera_scaled
+from kiteline_agent.inertial.scale_filter import INTERVAL_S, ScaleFilter, camera_scaled
 from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuBatch, ImuCalibration
-from kiteline_core.geometry import se3
+from kiteline_core.geometry import disparity_offset, se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 
 _PRIOR_SIGMA = np.repeat([0.005, 0.1], 3)  # rad/s, m/s^2: of biases of earlier tracking, after a loss
@@ -60,7 +60,7 @@ class InertialTracker:
             config, calibration, self._p_b_c, self._buffer, self.self_calibration.correct
         )
         self._reported_s = config.calibration.offset_s
-        self._scale = ScaleFilter(config.scale_filter, calibration, config.gravity_m_s2, self._p_b_c)
+        self._scale = ScaleFilter(calibration, config.gravity_m_s2, self._p_b_c)
         self._scale_from: tuple[int, F64] | None = None  # stamp and pose by images at which its interval begins
         self._cached: tuple[tuple[int, int, int | None], Samples | None] | None = (
             None  # interval that was asked for last
@@ -200,7 +200,7 @@ class InertialTracker:
         if self._smoother.running:
             awaits = self._awaited(samples) is not None
             held = without_held(samples) if samples and awaits else samples
-            length_error = self._config.disparity_px * depth_m / self._bf if self._images_have_scale else 0.0
+            length_error = disparity_offset.GOOD_PX * depth_m / self._bf if self._images_have_scale else 0.0
             state = self._advance(held, points, velocity, length_error)
         self._watch_scale(t_ns, T_m_b_visual, depth_m, state)
         if state is None:
@@ -371,7 +371,7 @@ class InertialTracker:
         if self._scale_from is None:
             self._scale.resume(state.velocity)
             self._scale_from = (t_ns, T_m_b)
-        elif (t_ns - self._scale_from[0]) * 1e-9 >= self._config.scale_filter.interval_s:
+        elif (t_ns - self._scale_from[0]) * 1e-9 >= INTERVAL_S:
             samples = self.samples_between(self._scale_from[0], t_ns)
             if samples is not None and depth_m > 0.0:
                 self._scale.add(self._scale_from[1], T_m_b, samples, state.bias[:3], depth_m)

@@ -9,7 +9,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from kiteline_agent.inertial.inertial_config import ScaleFilterConfig
 from kiteline_agent.inertial.preintegration import Samples, preintegrate
 from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuCalibration
@@ -17,20 +16,34 @@ from kiteline_core.geometry import se3
 
 _ITERATIONS = 3
 _UNITS, _GRAVITY, _VELOCITY, _BIAS = 0, slice(1, 4), slice(4, 7), slice(7, 10)
+_START_GRAVITY_M_S2 = 0.1  # m/s^2; deviation of gravity at the start
+_START_VELOCITY_M_S = 0.1  # m/s; deviation of the velocity at the start
+_START_BIAS_M_S2 = 0.1  # m/s^2; deviation of the accelerometer's bias at the start
+_GRAVITY_SIGMA_M_S2 = 0.01  # m/s^2; of the length of gravity
+_KNOWN_SIGMA = 0.025  # relative deviation below which the scale may be corrected
+_LEAST = 0.015  # relative; smallest correction: each begins a new submap
+_LEAST_DEVIATIONS = 1.1  # smallest correction in its own deviations
+_LEAST_S = 4.0  # s between two corrections
+_START_SCALE = 0.022  # relative deviation of the start's scale: that of a first window
+_ACCEL_WALK = 0.02  # m/s^2 per sqrt(s): errors of scale and axes, of the map's rotations
+_SCALE_WALK = 0.006  # per sqrt(s): the map's own scale drifts while it grows
+_IMAGE_RAD = 7e-4  # rad; error of a position by images, over the depth that they see
+_IMU_INFLATION = 3.0  # of the calibration's noise densities, beside the factor that the start found
+_CHI2 = 16.27  # 99.9 % with 3 degrees of freedom: beyond it an interval is left out, the images jumped
+INTERVAL_S = 0.39  # s between two compared poses, and of inertial steps: velocity changes more than images err
 
 
 class ScaleFilter:
     """Metres per unit of the map. Call `start`, then `add` with each interval."""
 
-    def __init__(self, config: ScaleFilterConfig, calibration: ImuCalibration, gravity_m_s2: float, p_b_c: F64) -> None:
+    def __init__(self, calibration: ImuCalibration, gravity_m_s2: float, p_b_c: F64) -> None:
         """p_b_c: (3,) m, camera in the body."""
-        self._config = config
         self._calibration = calibration
         self._length = gravity_m_s2
         self._p_b_c = p_b_c
         self._x = np.zeros(10)
         self._cov = np.eye(10)
-        self._inflation = config.imu_inflation
+        self._inflation = _IMU_INFLATION
         self.running = False
         self.age_s = 0.0  # since the start or the last correction of its own
 
@@ -42,11 +55,10 @@ class ScaleFilter:
 
     def correction(self) -> float | None:
         """Factor by which the map is to be scaled; None if it is right as far as is known."""
-        c = self._config
         scale, sigma = self.scale
-        if not self.running or self.age_s < c.least_s or sigma > c.known_sigma * scale:
+        if not self.running or self.age_s < _LEAST_S or sigma > _KNOWN_SIGMA * scale:
             return None
-        return scale if abs(np.log(scale)) > max(c.least, c.least_deviations * sigma / scale) else None
+        return scale if abs(np.log(scale)) > max(_LEAST, _LEAST_DEVIATIONS * sigma / scale) else None
 
     def stop(self) -> None:
         """Forget all."""
@@ -54,10 +66,9 @@ class ScaleFilter:
 
     def start(self, velocity: F64, gravity: F64, bias: F64, accel_noise: float) -> None:
         """Start with unit scale. velocity, gravity: (3,) in m. bias: (6,). accel_noise: factor on the white noise."""
-        c = self._config
-        self._inflation = c.imu_inflation * max(accel_noise, 1.0)
+        self._inflation = _IMU_INFLATION * max(accel_noise, 1.0)
         self._x = np.concatenate([[1.0], gravity, velocity, bias[3:]])
-        sigma = np.repeat([c.start_scale, c.start_gravity_m_s2, c.start_velocity_m_s, c.start_bias_m_s2], [1, 3, 3, 3])
+        sigma = np.repeat([_START_SCALE, _START_GRAVITY_M_S2, _START_VELOCITY_M_S, _START_BIAS_M_S2], [1, 3, 3, 3])
         self._cov = np.diag(sigma**2)
         self.running, self.age_s = True, 0.0
 
@@ -65,11 +76,11 @@ class ScaleFilter:
         """Continue after frames without images, at this velocity (3,) m/s in m."""
         self._x[_VELOCITY] = velocity
         self._cov[_VELOCITY], self._cov[:, _VELOCITY] = 0.0, 0.0
-        self._cov[_VELOCITY, _VELOCITY] = self._config.start_velocity_m_s**2 * np.eye(3)
+        self._cov[_VELOCITY, _VELOCITY] = _START_VELOCITY_M_S**2 * np.eye(3)
 
     def add(self, T_m_b0: F64, T_m_b1: F64, samples: Samples, gyro_bias: F64, depth_m: float) -> None:
         """Process an interval between two poses (4,4) by images, `depth_m` from what they see."""
-        c, x = self._config, self._x
+        x = self._x
         samples = replace(samples, density=None)  # which is vibration, and averages out, and fast motion
         bias = np.concatenate([gyro_bias, x[_BIAS]])
         motion = preintegrate(samples, bias, self._calibration, self._inflation)
@@ -87,11 +98,11 @@ class ScaleFilter:
         rotate = np.kron(np.eye(2), r)
         both = np.r_[4:7, 10:13]
         cov[np.ix_(both, both)] += rotate @ motion.cov[3:, 3:] @ rotate.T
-        cov[_UNITS, _UNITS] += c.scale_walk**2 * dt
-        cov[_BIAS, _BIAS] += (c.accel_walk**2 + self._calibration.accel_walk**2) * dt * np.eye(3)
+        cov[_UNITS, _UNITS] += _SCALE_WALK**2 * dt
+        cov[_BIAS, _BIAS] += (_ACCEL_WALK**2 + self._calibration.accel_walk**2) * dt * np.eye(3)
         # update by the displacement that the images give, and by the length of gravity
         seen = (T_m_b1[:3, 3] + T_m_b1[:3, :3] @ self._p_b_c) - (T_m_b0[:3, 3] + r @ self._p_b_c)
-        noise = np.diag(np.append(np.full(3, 2.0 * (c.image_rad * depth_m) ** 2), c.gravity_sigma_m_s2**2))
+        noise = np.diag(np.append(np.full(3, 2.0 * (_IMAGE_RAD * depth_m) ** 2), _GRAVITY_SIGMA_M_S2**2))
         self.age_s += dt
         now = before
         for _ in range(_ITERATIONS):  # at the updated displacement: noise of the prediction would bias the scale
@@ -103,7 +114,7 @@ class ScaleFilter:
             off = np.append(seen, self._length) - expected - h @ (before - now)
             s = h @ cov @ h.T + noise
             gain = np.linalg.solve(s, h @ cov).T
-            if float(off[:3] @ np.linalg.solve(s[:3, :3], off[:3])) > c.chi2:
+            if float(off[:3] @ np.linalg.solve(s[:3, :3], off[:3])) > _CHI2:
                 gain[:] = 0.0  # the images jumped
             now = before + gain @ off
         self._x = now[:10]

@@ -11,6 +11,11 @@ _WARNING = (
     "imu: images and IMU contradict each other, so that no scale is known: check the camera's place in the IMU's axes "
     "(T_BS), the time offset, the intrinsics and the units (rad/s, m/s^2)"
 )
+_BOTH_LENS_CHI2 = 12.0  # with _BOTH_GYRO_NOISE: a focal length that is off by a tenth has 13, 20 ms of delay 2
+_BOTH_GYRO_NOISE = 1.7  # with _BOTH_LENS_CHI2: a focal length that is off by a tenth has 1.9, worn rigs 1.2
+_ACCEL_BIAS = 5.0  # deviations of the accelerometer's bias: that of missing gravity is 40
+_LENS_CHI2 = 26.0  # squared deviations of the eight errors of a lens: 99.9 % of calibrations have less
+_GYRO_NOISE = 5.0  # times that of single samples, as rotations by images show it: 20 ms of delay have 2.8
 
 
 def contradicts(
@@ -24,10 +29,10 @@ def contradicts(
     lens = float(solution.state.lens @ lens_info @ solution.state.lens)
     off = (solution.bias[3:] - prior.bias[3:]) / prior.sigma[3:]
     return bool(
-        lens > config.lens_chi2
-        or gyro_noise > config.gyro_noise
-        or (lens > config.both_lens_chi2 and gyro_noise > config.both_gyro_noise)
-        or np.abs(off).max() > config.accel_bias
+        lens > _LENS_CHI2
+        or gyro_noise > _GYRO_NOISE
+        or (lens > _BOTH_LENS_CHI2 and gyro_noise > _BOTH_GYRO_NOISE)
+        or np.abs(off).max() > _ACCEL_BIAS
     )
 
 
@@ -36,7 +41,7 @@ def exceeds_lens_errors(
 ) -> bool:
     """True if a window that contradicts does so by more than its lens: a lens may be off beside a true IMU."""
     off = (solution.bias[3:] - prior.bias[3:]) / prior.sigma[3:]
-    return bool(gyro_noise > config.both_gyro_noise or np.abs(off).max() > config.accel_bias)
+    return bool(gyro_noise > _BOTH_GYRO_NOISE or np.abs(off).max() > _ACCEL_BIAS)
 
 
 class ContradictionWatch:

@@ -13,6 +13,13 @@ from kiteline_core.geometry.cameras import RectifiedCamera
 
 _LEVELS, _NEAR_LEVELS = 3, 1  # of the flow above the finest one; where a corner is known to be near
 _BORDER_PX = 8.0  # a window of the flow and its gradients lie inside
+_REPLENISH = 0.85  # share of the corners below which a keyframe adds new ones
+_WINDOW_PX = 15  # px; window of the optical flow: the smallest that keeps hold of corners
+_BACKWARD_PX = 0.5  # px between a corner and its image followed back
+_DRIFT_PX = 2.0  # px between flow over frames and flow from the last keyframe
+KEYFRAME_S = 0.24  # s between two keyframes: short enough for flow, long enough for parallax
+_THINNED_S = 0.6  # s; longest time between two keyframes after one was left out
+CORNERS = 200  # followed at once; a bundle of 100 long tracks is as accurate as one of 300
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +68,7 @@ class CornerTracks:
 
     def is_due(self, t_ns: int) -> bool:
         """True if a frame is to become a keyframe."""
-        return not self.keyframes or (t_ns - self.keyframes[-1].t_ns) * 1e-9 >= self._config.keyframe_s
+        return not self.keyframes or (t_ns - self.keyframes[-1].t_ns) * 1e-9 >= KEYFRAME_S
 
     def follow(self, left: Pyramid) -> None:
         """Follow the corners into the frame after the one before; the next keyframe looks for them where they are."""
@@ -80,7 +87,7 @@ class CornerTracks:
             before, near = self.keyframes[-1].left[0], self._last is left[0]
             if near:
                 uv, good = self._followed(before, left[0], self._uv, self._last_uv, _NEAR_LEVELS)
-                good &= np.linalg.norm(uv - self._last_uv, axis=1) < self._config.drift_px
+                good &= np.linalg.norm(uv - self._last_uv, axis=1) < _DRIFT_PX
             else:
                 guess = None if turn is None else self._turned(turn)
                 uv, good = self._followed(before, left[0], self._uv, guess, _LEVELS)
@@ -94,7 +101,7 @@ class CornerTracks:
         kept, config = [k for k in self.keyframes if k.t_ns >= t_ns], self._config
         while len(kept) > config.keyframes:
             apart_s = [(after.t_ns - before.t_ns) * 1e-9 for before, after in zip(kept, kept[2:], strict=False)]
-            close = [k for k, s in enumerate(apart_s, 1) if s < config.thinned_s]
+            close = [k for k, s in enumerate(apart_s, 1) if s < _THINNED_S]
             del kept[close[0] if close else 0]
         self.keyframes = kept
 
@@ -122,7 +129,7 @@ class CornerTracks:
 
     def _followed(self, before: U8, after: U8, uv: F64, guess: F64 | None, levels: int) -> tuple[F64, Bool]:
         """Pixels (n,2) of corners in the next image, and which of them are found, forward and backward."""
-        size = {"winSize": (self._config.window_px, self._config.window_px), "maxLevel": levels}
+        size = {"winSize": (_WINDOW_PX, _WINDOW_PX), "maxLevel": levels}
         flags = 0 if guess is None else cv2.OPTFLOW_USE_INITIAL_FLOW
         start = uv.astype(np.float32)
         there = None if guess is None else guess.astype(np.float32)
@@ -130,7 +137,7 @@ class CornerTracks:
         back, ok_back, _ = cv2.calcOpticalFlowPyrLK(after, before, found, start.copy(), flags=flags, **size)  # type: ignore[call-overload]
         limit = np.array([after.shape[1], after.shape[0]]) - _BORDER_PX
         inside = (found >= _BORDER_PX).all(axis=1) & (found < limit).all(axis=1)
-        same = np.linalg.norm(back - start, axis=1) < self._config.backward_px
+        same = np.linalg.norm(back - start, axis=1) < _BACKWARD_PX
         return found.astype(np.float64), (ok.ravel() == 1) & (ok_back.ravel() == 1) & inside & same
 
     def _turned(self, turn: F64) -> F64:
@@ -141,10 +148,9 @@ class CornerTracks:
 
     def _replenish(self, left: Pyramid) -> None:
         """Find new corners where none is followed."""
-        config = self._config
-        if len(self._uv) >= config.replenish * config.corners:
+        if len(self._uv) >= _REPLENISH * CORNERS:
             return
-        found = features.detect(left, self._uv, self._detector).uv[: config.corners - len(self._uv)]
+        found = features.detect(left, self._uv, self._detector).uv[: CORNERS - len(self._uv)]
         self._uv = np.concatenate([self._uv, found])
         self._ids = np.concatenate([self._ids, self._next_id + np.arange(len(found))])
         self._next_id += len(found)

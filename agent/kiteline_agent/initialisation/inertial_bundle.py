@@ -36,6 +36,10 @@ _PLACE_ITERATIONS = 4  # of landmarks alone
 _MOST_TANGENT, _MOST_RHO = 1e3, 1e6  # of a landmark that diverges, as people's do: it is left out, not computed with
 _MOST_GROWTH = 0.5  # of all lengths in one step
 _ROUNDS = 2  # in which corners are left out, each followed by another solution
+_FIRST_DEPTH_M = 3.0  # m at which all landmarks start; only the sign matters
+_STRUCTURE_ITERATIONS, _ITERATIONS = 25, 20  # steps of the first stage, of which nothing is known, and of the last
+_STRUCTURE_SETTLED, _SETTLED = 1e-3, 0.1  # fall of the cost, relative and not: a deviation of the scale is worth 0.5
+_MAX_RMS = 3.0  # deviations, and times the median, beyond which a corner moves and is left out; most have 0.6
 
 
 @dataclass(slots=True)
@@ -100,8 +104,8 @@ class InertialBundle:
             self._terms.integrate(state)
             every = np.arange(6, STATE * self._keyframes + SHARED + TERMS)
             if warm is None:  # what moves is left out before the lens may bend to it
-                state, _ = yield from self._consistent(state, every[:-TERMS], self._config.iterations, inertial=True)
-            state, system = yield from self._consistent(state, every, self._config.iterations, inertial=True)
+                state, _ = yield from self._consistent(state, every[:-TERMS], _ITERATIONS, inertial=True)
+            state, system = yield from self._consistent(state, every, _ITERATIONS, inertial=True)
             return self._solution(state, system, every)
         except np.linalg.LinAlgError:
             return None
@@ -153,11 +157,11 @@ class InertialBundle:
         for motion in self._terms.motions:
             rotation.append(rotation[-1] @ motion.turn)
         R = np.array(rotation)
-        rho = np.full(self._landmarks, 1.0 / self._config.first_depth_m)
+        rho = np.full(self._landmarks, 1.0 / _FIRST_DEPTH_M)
         state = self._anchored(replace(state, R=R, p=self._t_bc - R @ self._t_bc, rho=rho))
         unknown = (STATE * np.arange(1, n)[:, None] + np.arange(6)).ravel()
         unknown = np.concatenate([unknown, STATE * n + np.arange(3)])
-        found, _ = yield from self._consistent(state, unknown, self._config.structure_iterations, inertial=False)
+        found, _ = yield from self._consistent(state, unknown, _STRUCTURE_ITERATIONS, inertial=False)
         return found
 
     def _warm_state(self, warm: WarmStart) -> WindowState:
@@ -173,7 +177,7 @@ class InertialBundle:
         state = self._anchored(state)
         depth = np.einsum("pi,pi->p", warm.xyz - state.origin, self._axes[:, :, 2])
         known = np.isfinite(depth) & (depth > 0.1)
-        usual = float(np.median(depth[known])) if known.any() else self._config.first_depth_m
+        usual = float(np.median(depth[known])) if known.any() else _FIRST_DEPTH_M
         return replace(state, rho=1.0 / np.where(known, depth, usual))
 
     def _align(self, state: WindowState) -> WindowState | None:
@@ -219,7 +223,7 @@ class InertialBundle:
         rms = np.sqrt(square.sum(axis=0) / np.maximum(self._obs.seen.sum(axis=0), 1))
         if not self._used.any():
             return False
-        fits = rms < self._config.max_rms * max(1.0, float(np.median(rms[self._used])))
+        fits = rms < _MAX_RMS * max(1.0, float(np.median(rms[self._used])))
         changed = bool((self._used & ~fits).any())
         self._used &= fits
         return changed
@@ -242,8 +246,7 @@ class InertialBundle:
                 if damping > _MAX_DAMPING:
                     break
                 continue
-            config = self._config
-            enough = config.settled if inertial else config.structure_settled * system.cost
+            enough = _SETTLED if inertial else _STRUCTURE_SETTLED * system.cost
             settled = system.cost - cost < enough
             state, damping = moved, max(0.1 * damping, 1e-9)
             if self._terms.biases_moved(state):
@@ -309,7 +312,7 @@ class InertialBundle:
         self._error = norm
         weight = np.where(norm < k, 1.0, k / np.maximum(norm, 1e-9)) * used
         # so that costs with different corners can be compared, those left out cost what they would just before
-        left_out = k * (self._config.max_rms - 0.5 * k) * float(np.count_nonzero(self._obs.seen & ~self._used))
+        left_out = k * (_MAX_RMS - 0.5 * k) * float(np.count_nonzero(self._obs.seen & ~self._used))
         return float(np.where(norm < k, 0.5 * norm**2, k * (norm - 0.5 * k)).sum()) + left_out, weight
 
     def _cost(self, state: WindowState, *, inertial: bool) -> float:

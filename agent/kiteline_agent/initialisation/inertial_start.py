@@ -8,6 +8,7 @@ import numpy as np
 
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.governor.cost_model import Work
+from kiteline_agent.inertial.imu_watch import SILENT_S
 from kiteline_agent.inertial.preintegration import BiasPrior, Samples, preintegrate
 from kiteline_agent.inertial.sample_buffer import SampleBuffer
 from kiteline_agent.initialisation import corner_tracks, lens_correction
@@ -40,6 +41,19 @@ _SAME_SCALE = 0.5  # deviations of the scale: solutions that differ by less left
 _MIN_COMMON = 3  # keyframes of two windows whose distances are compared
 _BEHIND_SHARE = 0.25  # of the time by which tracking is behind: then fewer windows are solved
 _MIN_DEPTH_M = 0.1  # m of a landmark in the newest camera
+_MIN_SPAN_S = 2.4  # s before which a window tells no scale
+_MAX_SPAN_S = 24.0  # s; longest window: older keyframes are dropped
+_REST_S = 4.0  # s of a rest before the flight that a window holds: enough for the biases
+_ATTEMPT_S = 0.45  # s between two solutions: each costs as much as some frames
+_ATTEMPT_SHARE = 0.09  # of the window's length between two solutions: long windows cost more
+_LANDMARKS_EACH = 70  # in each keyframe: in fast turns no track is long
+_AGREEMENT = 0.04  # relative difference of the scale to that of the solution before, on its keyframes
+_LEAST_ACCEL_NOISE = 0.5  # times the noise of single samples: vibration averages out to half of it
+_STATE_INFLATION = 2.0  # of the deviations of the state with which tracking begins
+_DEPTH_SIGMA = 0.25  # relative deviation above which a landmark has no depth yet
+_STRUCTURE_PX = 1.2  # px; median error of corners with the gyro's rotations: 0.3 if these are right, else 2
+_SCALE_SIGMA = 0.02  # relative deviation of the scale below which it is metric
+_LANDMARKS = 220  # of the window, with the longest tracks: errors of few add up to a wrong turn and motion
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,12 +105,10 @@ class InertialStart:
         self._may_go_on = may_go_on
         self._attempt: InParts[InertialMap | None] | None = None  # that has begun
         start = config.inertial_start
-        detector = replace(
-            config.detector, cell_px=start.corner_tracks.cell_px, max_corners=start.corner_tracks.corners
-        )
+        detector = replace(config.detector, cell_px=start.corner_tracks.cell_px, max_corners=corner_tracks.CORNERS)
         self._tracks = CornerTracks(camera, detector, start.corner_tracks)
-        self.waiting = WaitingFrames(start.corner_tracks.keyframe_s)
-        self._buffer = SampleBuffer(start.max_span_s + 1.0, config.inertial.max_gap_s)
+        self.waiting = WaitingFrames(corner_tracks.KEYFRAME_S)
+        self._buffer = SampleBuffer(_MAX_SPAN_S + 1.0, config.inertial.max_gap_s)
         self._before: SolvedWindow | None = None
         self._noise: WindowNoise | None = None  # as the windows so far show it
         self._vibration: Vibration | None = None  # of the newest window
@@ -109,11 +121,11 @@ class InertialStart:
         self._last_samples_ns: int | None = None  # stamp of the last frame with samples
 
     def add_samples(self, ctx: FrameContext) -> bool:
-        """Buffer the IMU samples of a frame. False if none has come for `silent_s`."""
+        """Buffer the IMU samples of a frame. False if none has come for SILENT_S."""
         self._buffer.push(ctx.imu)
         if self._last_samples_ns is None or (ctx.imu is not None and len(ctx.imu.t_ns)):
             self._last_samples_ns = ctx.t_ns
-        return (ctx.t_ns - self._last_samples_ns) * 1e-9 <= self._config.inertial.silent_s
+        return (ctx.t_ns - self._last_samples_ns) * 1e-9 <= SILENT_S
 
     def clear(self) -> None:
         """A map is tracked: begin anew after it."""
@@ -184,17 +196,17 @@ class InertialStart:
     def _bound_window(self, t_ns: int) -> None:
         """Forget keyframes that the newest window no longer holds."""
         config = self._config.inertial_start
-        self._tracks.drop_before(t_ns - round(config.max_span_s * 1e9))
+        self._tracks.drop_before(t_ns - round(_MAX_SPAN_S * 1e9))
         if self._tracks.flow_px() < _STILL_FLOW * config.min_flow * self._camera.fx:
-            self._tracks.drop_before(t_ns - round(config.rest_s * 1e9))
+            self._tracks.drop_before(t_ns - round(_REST_S * 1e9))
 
     def _begin(self, ctx: FrameContext, prior: BiasPrior | None, offset_s: float) -> InParts[InertialMap | None] | None:
         """An attempt with the window that ends with this keyframe; None while none is due."""
         config, keyframes = self._config.inertial_start, list(self._tracks.keyframes)
         span_s = (ctx.t_ns - keyframes[0].t_ns) * 1e-9
-        wait_s = max(config.attempt_s, config.attempt_share * span_s, _BEHIND_SHARE * self.waiting.span_s)
+        wait_s = max(_ATTEMPT_S, _ATTEMPT_SHARE * span_s, _BEHIND_SHARE * self.waiting.span_s)
         waited = self._tried_ns is None or (ctx.t_ns - self._tried_ns) * 1e-9 >= wait_s
-        if span_s < config.min_span_s or not waited or self._tracks.flow_px() < config.min_flow * self._camera.fx:
+        if span_s < _MIN_SPAN_S or not waited or self._tracks.flow_px() < config.min_flow * self._camera.fx:
             return None
         self._tried_ns = ctx.t_ns
         intervals = self._intervals(keyframes, round(offset_s * 1e9))
@@ -206,27 +218,26 @@ class InertialStart:
         self, ctx: FrameContext, keyframes: list[TrackedKeyframe], intervals: list[Samples], prior: BiasPrior
     ) -> InParts[InertialMap | None]:
         """Solve the window; align its landmarks again and solve it once more when the scale seems to be known."""
-        config = self._config.inertial_start
         all_corners = self._tracks.observations()
         if len(all_corners.ids) < self._config.local_map.first_points:
             return None
-        columns = corner_tracks.covering(all_corners, config.landmarks, config.landmarks_each)
+        columns = corner_tracks.covering(all_corners, _LANDMARKS, _LANDMARKS_EACH)
         observations = all_corners.part(columns)
         before, stamps = self._before, tuple(k.t_ns for k in keyframes)
         self._measure_vibration(intervals)
         assert self._noise is not None
         warm = None if before is None else before.warm_start(stamps, observations.ids)
         found = None if warm is None else (yield from self._solve(observations, intervals, prior, warm))
-        if found is None or not self._fits(found.solution):
+        if found is None or not found.solution.fits:
             warm, found = None, (yield from self._solve(observations, intervals, prior, None))
         if found is None:
             self._before = None
-            wrong_turns = self._structure_px > config.contradiction.structure_px
+            wrong_turns = self._structure_px > _STRUCTURE_PX
             self._note_contradiction(ctx.t_ns, contradicts=True if wrong_turns else None)
             return None
         solution, modelled = found.solution, self._noise
         noise, sigma = self._seen_noise(solution)
-        if sigma < _NEARLY * config.scale_sigma:
+        if sigma < _NEARLY * _SCALE_SIGMA:
             self._work.alignments += int(np.count_nonzero(observations.seen))
             aligned = realigned(
                 keyframes, observations, solution.state, found.xyz, found.first, self._camera, self._config.align
@@ -240,9 +251,9 @@ class InertialStart:
             solution = (yield from self._counted(again.solving(warmer), intervals)) or solution
             noise, sigma = self._seen_noise(solution)
         self._before = SolvedWindow(stamps, observations.ids, found.xyz, solution)
-        (wrong, by_imu), fits = self._contradicts(solution, noise), solution.converged and self._fits(solution)
+        (wrong, by_imu), fits = self._contradicts(solution, noise), solution.converged and solution.fits
         self._note_contradiction(ctx.t_ns, contradicts=wrong if wrong or fits else None, by_imu=by_imu)
-        known = fits and sigma < config.scale_sigma and not wrong
+        known = fits and sigma < _SCALE_SIGMA and not wrong
         agrees = before is not None and self._agrees(before, self._before)
         self._noise = modelled
         if known and agrees and warm is not None:
@@ -257,7 +268,7 @@ class InertialStart:
         if points is None or len(points.sigma_rho) < self._config.local_map.first_points:
             self._tried_ns = None  # the next keyframe may see more of the landmarks
             return None
-        cov = config.state_inflation**2 * solution.cov
+        cov = _STATE_INFLATION**2 * solution.cov
         duration_s = (stamps[-1] - stamps[0]) * 1e-9
         self._lens_info = np.asarray(np.linalg.inv(solution.lens_cov), np.float64)
         lens = solution.state.lens
@@ -307,9 +318,8 @@ class InertialStart:
         """The IMU's noise as a solution shows it, and the deviation of its scale if that is larger."""
         before = self._noise
         assert before is not None
-        config = self._config.inertial_start
-        least = config.least_accel_noise * self._measured_noise().accel
-        now = solution.evidence.updated(before, config.noise_prior, least)
+        least = _LEAST_ACCEL_NOISE * self._measured_noise().accel
+        now = solution.evidence.updated(before, least)
         return now, solution.scale_sigma * max(now.accel / before.accel, now.walk / before.walk)
 
     def _measure_vibration(self, intervals: list[Samples]) -> None:
@@ -334,11 +344,6 @@ class InertialStart:
             float(np.clip(accel / calibration.accel_noise, 1.0, MOST)),
         )
 
-    def _fits(self, solution: WindowSolution) -> bool:
-        """True if the errors of images and IMU are as expected: the solver has converged."""
-        config = self._config.inertial_start
-        return solution.reprojection_px < config.max_reprojection_px and solution.imu_chi2 < config.max_imu_chi2
-
     def _contradicts(self, solution: WindowSolution, noise: WindowNoise) -> tuple[bool, bool]:
         """Whether a window contradicts, and whether it does so by more than its lens."""
         gyro_noise, limits = noise.gyro / self._measured_noise().gyro, self._config.inertial_start.contradiction
@@ -355,12 +360,11 @@ class InertialStart:
         if len(common) < _MIN_COMMON:
             return False
         a, b = (w.solution.state.p[[w.t_ns.index(t) for t in common]] for w in (before, now))
-        return lengths_apart(a, b) < self._config.inertial_start.agreement
+        return lengths_apart(a, b) < _AGREEMENT
 
     def _points(self, ctx: FrameContext, corners: CornerObservations, solution: WindowSolution) -> MetricPoints | None:
         """The corners of the newest keyframe whose depth is known."""
-        config = self._config.inertial_start
-        seen = corners.seen[-1] & (solution.depth_m > _MIN_DEPTH_M) & (solution.depth_sigma < config.depth_sigma)
+        seen = corners.seen[-1] & (solution.depth_m > _MIN_DEPTH_M) & (solution.depth_sigma < _DEPTH_SIGMA)
         fits = bool(seen.any()) and np.isfinite(solution.depth_sigma[seen]).all()
         if not fits:
             return None

@@ -13,6 +13,9 @@ from kiteline_core.arrays import F64, I64
 T = TypeVar("T")
 InParts = Generator[None, None, T]  # a computation that pauses where an agent with little CPU time goes on later
 
+_MAX_REPROJECTION_PX = 0.9  # px; rms of a solution's inliers
+_MAX_IMU_CHI2 = 1.5  # mean squared error of its inertial factors, in deviations
+
 
 @dataclass(frozen=True, slots=True)
 class WindowState:
@@ -68,6 +71,11 @@ class WindowSolution:
     evidence: NoiseEvidence
     depth_m: F64
     depth_sigma: F64
+
+    @property
+    def fits(self) -> bool:
+        """True if the errors of images and IMU are as expected: the solver has converged."""
+        return self.reprojection_px < _MAX_REPROJECTION_PX and self.imu_chi2 < _MAX_IMU_CHI2
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,7 +7,7 @@ import numpy as np
 
 from kiteline_agent.config import AlignConfig
 from kiteline_agent.imaging import alignment_kernels
-from kiteline_agent.imaging.alignment_kernels import TEMPLATE, TEMPLATE_LEVELS
+from kiteline_agent.imaging.alignment_kernels import ALIGN_ITERATIONS, MIN_NCC, TEMPLATE, TEMPLATE_LEVELS
 from kiteline_agent.initialisation import lens_correction
 from kiteline_agent.initialisation.corner_tracks import CornerObservations, TrackedKeyframe
 from kiteline_agent.initialisation.inertial_window import WindowState
@@ -52,7 +52,7 @@ def realigned(
         found, ncc = np.zeros(len(rows), np.bool_), np.zeros(len(rows))
         alignment_kernels.align(
             keyframe.left, NO_GRID, templates, rows, octave[rows], np.ascontiguousarray(warp[rows]), place, 1, 0,
-            config.iterations, _MAX_STEP_PX, config.min_ncc, found, ncc,
+            ALIGN_ITERATIONS, _MAX_STEP_PX, MIN_NCC, found, ncc,
         )  # fmt: skip
         good = found & (np.linalg.norm(place - uv[0][rows], axis=1) < _MAX_OFF_PX)
         xy[k, rows[good]], seen[k, rows[good]] = (place[good] - c) / f, True

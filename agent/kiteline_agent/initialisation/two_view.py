@@ -10,12 +10,20 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from kiteline_agent.config import TwoViewConfig
 from kiteline_agent.initialisation import two_view_models
 from kiteline_core.arrays import F64, Bool
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.triangulation import nearest_point, parallax, project, rays
-from kiteline_core.optimisation.bundle import BundleProblem, bundle
+from kiteline_core.optimisation.bundle import BundleConfig, BundleProblem, bundle
+
+_DRAWS = 200  # of RANSAC for each model: 8 good points of 60 % come up with 97 %
+_FLAT_RATIO = 0.45  # R_H above which the homography is the model
+MIN_POINTS = 100  # with depth that a map needs
+_RIVAL_SHARE = 0.75  # share of the best motion's points with which a second motion makes both ambiguous
+_MIN_PARALLAX_RAD = 0.0175  # rad: 1 degree, median over the points; below it depth is noise
+_MIN_POINT_PARALLAX_RAD = 0.005  # rad: with less a point has no depth
+_REPROJECTION_PX = 2.0  # px: largest reprojection error of a point
+_SIGMA_PX = 1.0  # px; one standard deviation of a matched pixel
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,30 +39,30 @@ class TwoView:
     ratio: float
 
 
-def two_view(uv_a: F64, uv_b: F64, camera: F64, config: TwoViewConfig, seed: int) -> TwoView | None:
+def two_view(uv_a: F64, uv_b: F64, camera: F64, seed: int) -> TwoView | None:
     """Motion and points from pixels (n,2) that two views share; None if they are ambiguous. camera: fx fy cx cy."""
-    if len(uv_a) < max(config.min_points, 8):
+    if len(uv_a) < max(MIN_POINTS, 8):
         return None
-    flat, ratio, model, fitted = _choose_model(uv_a, uv_b, config, seed)
+    flat, ratio, model, fitted = _choose_model(uv_a, uv_b, seed)
     matrix = np.array([[camera[0], 0.0, camera[2]], [0.0, camera[1], camera[3]], [0.0, 0.0, 1.0]])
     motions = _homography_motions(model, matrix) if flat else _fundamental_motions(model, matrix)
-    views = [_depths(T, uv_a, uv_b, fitted, camera, config) for T in motions]
+    views = [_depths(T, uv_a, uv_b, fitted, camera) for T in motions]
     counts = np.array([np.count_nonzero(front) for _, front in views])
     best = int(np.argmax(counts))
     rivals = np.delete(counts, best)
-    if counts[best] < max(config.min_points, config.min_share * np.count_nonzero(fitted)):
+    if counts[best] < MIN_POINTS:
         return None
-    if len(rivals) and rivals.max() > config.rival_share * counts[best]:
+    if len(rivals) and rivals.max() > _RIVAL_SHARE * counts[best]:
         return None
-    return _refined(motions[best], *views[best], uv_a, uv_b, camera, flat, ratio, config)
+    return _refined(motions[best], *views[best], uv_a, uv_b, camera, flat, ratio)
 
 
-def _choose_model(uv_a: F64, uv_b: F64, config: TwoViewConfig, seed: int) -> tuple[bool, float, F64, Bool]:
+def _choose_model(uv_a: F64, uv_b: F64, seed: int) -> tuple[bool, float, F64, Bool]:
     """True if the homography fits better, R_H, the chosen matrix, and its inliers (n,)."""
-    h, h_score, h_in = two_view_models.homography(uv_a, uv_b, config.draws, config.sigma_px, seed)
-    f, f_score, f_in = two_view_models.fundamental(uv_a, uv_b, config.draws, config.sigma_px, seed)
+    h, h_score, h_in = two_view_models.homography(uv_a, uv_b, _DRAWS, _SIGMA_PX, seed)
+    f, f_score, f_in = two_view_models.fundamental(uv_a, uv_b, _DRAWS, _SIGMA_PX, seed)
     ratio = h_score / max(h_score + f_score, 1e-9)
-    flat = ratio > config.flat_ratio
+    flat = ratio > _FLAT_RATIO
     return (True, ratio, h, h_in) if flat else (False, ratio, f, f_in)
 
 
@@ -80,7 +88,7 @@ def _homography_motions(h: F64, matrix: F64) -> list[F64]:
     return out or [se3.from_rt(np.eye(3), np.array([1.0, 0.0, 0.0]))]
 
 
-def _depths(T_b_a: F64, uv_a: F64, uv_b: F64, fitted: Bool, camera: F64, config: TwoViewConfig) -> tuple[F64, Bool]:
+def _depths(T_b_a: F64, uv_a: F64, uv_b: F64, fitted: Bool, camera: F64) -> tuple[F64, Bool]:
     """Triangulated points (n,3) in a, and which lie in front of both views with a small reprojection error."""
     n = len(uv_a)
     lens, T_a_b = np.tile(camera, (n, 1)), se3.inverse(T_b_a)
@@ -92,13 +100,12 @@ def _depths(T_b_a: F64, uv_a: F64, uv_b: F64, fitted: Bool, camera: F64, config:
     front = front & fitted
     for uv, T in zip((uv_a, uv_b), places, strict=True):
         pixel, depth = project(points, lens, T)
-        front &= (depth > 0.0) & (np.linalg.norm(pixel - uv, axis=1) < config.reprojection_px)
+        front &= (depth > 0.0) & (np.linalg.norm(pixel - uv, axis=1) < _REPROJECTION_PX)
     return points, np.asarray(front)
 
 
 def _refined(
-    T_b_a: F64, points: F64, front: Bool, uv_a: F64, uv_b: F64, camera: F64, flat: bool, ratio: float,
-    config: TwoViewConfig,
+    T_b_a: F64, points: F64, front: Bool, uv_a: F64, uv_b: F64, camera: F64, flat: bool, ratio: float
 ) -> TwoView | None:  # fmt: skip
     """Bundle adjustment of the two views, rescaled to a distance of 1; None if parallax or points are too few."""
     rows = np.flatnonzero(front)
@@ -109,9 +116,9 @@ def _refined(
         BundleProblem(
             np.stack([np.eye(4), T_b_a]), np.tile(np.append(camera, 1.0), (2, 1)), np.array([False, True]),
             points[rows], np.arange(0, m + 1, 2, dtype=np.int32), np.tile(np.arange(2, dtype=np.int32), len(rows)),
-            measured, np.full((m, 2), config.sigma_px),
+            measured, np.full((m, 2), _SIGMA_PX),
         ),
-        config.bundle,
+        BundleConfig(),
     )  # fmt: skip
     T = result.T_c_m[1]
     length = float(np.linalg.norm(T[:3, 3]))
@@ -124,8 +131,8 @@ def _refined(
     angle = np.arccos(np.clip(parallax(np.zeros_like(points), origins, refined), -1.0, 1.0))
     good = np.zeros(len(points), np.bool_)
     good[rows] = result.inlier.reshape(-1, 2).all(axis=1) & (refined[rows, 2] > 0.0)
-    good &= angle > config.min_point_parallax_rad
-    if np.count_nonzero(good) < config.min_points:
+    good &= angle > _MIN_POINT_PARALLAX_RAD
+    if np.count_nonzero(good) < MIN_POINTS:
         return None
     typical = float(np.median(angle[good]))
-    return None if typical < config.min_parallax_rad else TwoView(T, refined, good, flat, ratio)
+    return None if typical < _MIN_PARALLAX_RAD else TwoView(T, refined, good, flat, ratio)

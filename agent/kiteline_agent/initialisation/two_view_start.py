@@ -11,7 +11,8 @@ import numpy as np
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.governor.cost_model import Work
 from kiteline_agent.imaging import alignment_kernels, features
-from kiteline_agent.initialisation.two_view import two_view
+from kiteline_agent.imaging.alignment_kernels import ALIGN_ITERATIONS, FINE_STEP_PX, MIN_NCC
+from kiteline_agent.initialisation.two_view import MIN_POINTS, two_view
 from kiteline_agent.keyframes.depth_from_motion import triangulated_sigma
 from kiteline_agent.keyframes.new_landmarks import NewPoints
 from kiteline_agent.local_map.local_map import LocalMap
@@ -25,6 +26,10 @@ from kiteline_core.order_statistics import median
 
 _MAX_RETURN_PX = 1.0  # px between a corner and where it lies when it is followed back
 _MARGIN_PX = 4.0  # px to the border, within which the flow's window hangs over it
+_CORNERS = 400  # corners followed from the first frame; half of them are lost or have no parallax
+_WINDOW_PX = 15  # px; window of the optical flow: the smallest that keeps hold of corners
+_MIN_SHARE = 0.4  # of the first corners; with fewer left a new first frame is taken
+_MAX_S = 1.98  # s after which a new first frame is taken: the view has changed too much
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,9 +65,7 @@ class TwoViewStart:
         self._camera = camera
         self._config = config
         self._work = work
-        self._detector = replace(
-            config.detector, cell_px=config.two_view_start.cell_px, max_corners=config.two_view_start.corners
-        )
+        self._detector = replace(config.detector, cell_px=config.two_view_start.cell_px, max_corners=_CORNERS)
         self._intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
         self._median_depth_m = config.two_view_start.median_depth_m
         self._first: FrameImages | None = None
@@ -101,12 +104,12 @@ class TwoViewStart:
         self._frames += 1
         flow = np.linalg.norm(self._uv - self._uv0, axis=1)
         start = None
-        if len(flow) >= config.two_view.min_points and np.median(flow) > config.min_flow * self._camera.fx:
+        if len(flow) >= MIN_POINTS and np.median(flow) > config.min_flow * self._camera.fx:
             start = self._reconstruct(self._first, ctx.images)
-        few = len(self._uv) < max(config.two_view.min_points, config.min_share * len(self._templates))
+        few = len(self._uv) < max(MIN_POINTS, _MIN_SHARE * len(self._templates))
         if start is not None:
             self._first = None
-        elif few or (ctx.t_ns - self._first_t_ns) * 1e-9 >= config.max_s:
+        elif few or (ctx.t_ns - self._first_t_ns) * 1e-9 >= _MAX_S:
             self._begin(ctx)
         return start
 
@@ -123,7 +126,7 @@ class TwoViewStart:
 
     def _follow(self, images: FrameImages) -> None:
         """Follow the corners by pyramidal optical flow from the last frame, checked backwards."""
-        image, window = images.left[0], self._config.two_view_start.window_px
+        image, window = images.left[0], _WINDOW_PX
         if len(self._uv):
             before = self._uv.astype(np.float32)
             size = {"winSize": (window, window), "maxLevel": 3}
@@ -139,15 +142,14 @@ class TwoViewStart:
 
     def _reconstruct(self, first: FrameImages, images: FrameImages) -> TwoViewMap | None:
         """Align the corners with their templates, and solve for motion and depth."""
-        align, config = self._config.align, self._config.two_view_start
         uv, found, ncc = self._uv.copy(), np.zeros(len(self._uv), np.bool_), np.zeros(len(self._uv))
         warp = np.tile(self._mean_warp(), (len(uv), 1, 1))
         alignment_kernels.align(
             images.aligned, NO_GRID, self._templates, self._index, self._octave, warp, uv, 0, 0,
-            align.iterations, align.fine_step_px, align.min_ncc, found, ncc,
+            ALIGN_ITERATIONS, FINE_STEP_PX, MIN_NCC, found, ncc,
         )  # fmt: skip
         uv[~found] = self._uv[~found]
-        seen = two_view(self._uv0, uv, self._intrinsics, config.two_view, self._frames)
+        seen = two_view(self._uv0, uv, self._intrinsics, self._frames)
         if seen is None:
             return None
         factor = self._median_depth_m / float(np.median(seen.points[seen.good, 2]))

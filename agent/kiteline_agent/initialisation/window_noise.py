@@ -15,6 +15,7 @@ _FEWEST = 12  # second differences that tell the noise of an interval, to a fift
 _EVEN, _GAP = 1.5, 2.5  # as in SampleBuffer: steps that are compared
 _LEAST_LEVEL, _MOST_LEVEL = 0.1, 4.0  # motors are off, and a landing
 _BESIDE = 2  # intervals before and after, half a second each, over which levels are averaged: rotors beat
+_PRIOR = 6.0  # degrees of freedom of the calibrated noise beside those of a window
 _NEWEST = 2  # intervals that tell the vibration now
 
 
@@ -37,13 +38,13 @@ class NoiseEvidence:
     chi2: F64
     expected: F64
 
-    def updated(self, noise: WindowNoise, prior: float, least_accel: float = LEAST) -> WindowNoise:
-        """The factors that explain these errors. prior: weight of 1, which is expected, in degrees of freedom.
+    def updated(self, noise: WindowNoise, least_accel: float = LEAST) -> WindowNoise:
+        """The factors that explain these errors, beside 1, which is expected.
 
         least_accel: smallest factor of the accelerometer's white noise that is believed.
         """
         before = np.array([noise.gyro, noise.accel, noise.walk])
-        found = np.sqrt((before**2 * self.chi2 + prior) / (self.expected + prior))
+        found = np.sqrt((before**2 * self.chi2 + _PRIOR) / (self.expected + _PRIOR))
         gyro, accel, walk = (float(x) for x in np.clip(found, LEAST, MOST))
         return WindowNoise(gyro, max(accel, least_accel), walk)
 

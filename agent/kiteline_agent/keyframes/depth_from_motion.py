@@ -9,6 +9,7 @@ import numpy as np
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.governor.cost_model import Work
 from kiteline_agent.imaging import alignment_kernels
+from kiteline_agent.imaging.alignment_kernels import ALIGN_ITERATIONS, FINE_STEP_PX, MIN_NCC
 from kiteline_agent.imaging.epipolar_kernels import search_segments
 from kiteline_agent.keyframes import seed_kernels as kernels
 from kiteline_agent.local_map.local_map import Candidates, LocalMap
@@ -22,13 +23,15 @@ _MARGIN_PX = 8.0
 _PER_FRAME_STEREO = 24  # seeds searched in a frame with stereo, which leaves only far and doubtful ones
 _MAX_STEPS = 40  # tries on an epipolar segment; longer ones are searched on a smaller image
 _MIN_SEARCH_NCC = 0.7  # correlation at a try, up to half a step from the peak
-_FAR_SHARE = 0.4  # of the typical inverse depth: the option `known` counts from there for farther landmarks
+_FAR_SHARE = 0.4  # of the typical inverse depth: _KNOWN counts from there for farther landmarks
 _MAX_TRIES = 60  # frames in view without a depth
 _FILTER_INFLATION = 6.0  # factor on variances of tracked landmarks: successive observations share the template's error
 _REACH = 2.5  # standard deviations of inverse depth that are searched
 _STEP_PX = 0.7  # px of the level between two tries: half the width of the correlation peak
 _DISTINCT = 0.93  # share of the best correlation that nothing else on the segment may reach
 _INFLATION = 2.0  # factor on variances of seeds: successive frames share the template's error
+_NEARER = 2.0  # times the inverse depth of the nearest twentieth of the landmarks: end of the search
+_KNOWN = 0.12  # deviation over inverse depth below which a seed becomes a landmark
 
 
 class DepthFromMotion:
@@ -53,9 +56,9 @@ class DepthFromMotion:
         if len(near) < self._config.pose.min_inliers:
             return 0
         typical, steepest = quantiles(near, (0.5, 0.95))
-        ceiling = steepest * config.nearer
+        ceiling = steepest * _NEARER
         self._map.initialise_seeds(typical, ceiling)
-        seeds = self._map.candidates(track.T_c_m, _MARGIN_PX, self._config.align.max_scale, seeds=True)
+        seeds = self._map.candidates(track.T_c_m, _MARGIN_PX, seeds=True)
         chosen = self._choose(seeds, images.first)
         if len(chosen) == 0:
             return 0
@@ -96,7 +99,6 @@ class DepthFromMotion:
 
     def _search(self, images: FrameImages, rows: I64, warp: F64, start: F64, end: F64) -> tuple[F64, I8]:
         """Find the templates: correlation along the segment, then alignment. Pixels (n,2), found (n,) 1 or 0."""
-        align = self._config.align
         octave = self._map.octave[rows]
         uv, found = np.zeros((len(rows), 2)), np.zeros(len(rows), np.int8)
         search_segments(
@@ -107,7 +109,7 @@ class DepthFromMotion:
         place, aligned, ncc = uv[seen], np.zeros(len(seen), np.bool_), np.zeros(len(seen))
         alignment_kernels.align(
             images.sampled, images.grid, self._map.templates, rows[seen], octave[seen], warp[seen], place, 1, 0,
-            align.iterations, align.fine_step_px, align.min_ncc, aligned, ncc,
+            ALIGN_ITERATIONS, FINE_STEP_PX, MIN_NCC, aligned, ncc,
         )  # fmt: skip
         uv[seen] = place
         found[seen[~aligned]] = 0
@@ -132,7 +134,7 @@ class DepthFromMotion:
         prior = sigma[rows] ** 2
         rho[rows] = np.maximum((rho[rows] * variance + measured * prior) / (variance + prior), 1e-6)
         sigma[rows] = np.sqrt(variance * prior / (variance + prior))
-        known = (sigma[rows] < config.known * np.maximum(rho[rows], _FAR_SHARE * typical)) & (
+        known = (sigma[rows] < _KNOWN * np.maximum(rho[rows], _FAR_SHARE * typical)) & (
             self._map.hits[rows] >= config.min_hits
         )
         self._map.promote(rows[known])

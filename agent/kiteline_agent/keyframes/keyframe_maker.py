@@ -12,6 +12,7 @@ from kiteline_agent.governor.cost_model import Work
 from kiteline_agent.imaging import alignment_kernels
 from kiteline_agent.imaging.row_alignment import RowAlignment
 from kiteline_agent.keyframes.new_landmarks import EarlierView, NewPoints, moved_to_frame, new_points
+from kiteline_agent.keyframes.pair_search import Fault, PairSearch
 from kiteline_agent.local_map.keyframe_landmarks import KeyframeLandmarks
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.tracking.frame_context import FrameContext
@@ -24,6 +25,7 @@ from kiteline_core.geometry import se3
 from kiteline_core.ids import NO_KEYFRAME, KeyframeId, point_id
 
 _MIN_RHO = 1e-4  # 1/m; farther counts as infinitely far
+_HARDLY = 0.25  # share of the corners with a disparity where rows are off; else there are three quarters and more
 _DEPTH_CAMERA_SIGMA_RHO = 2.85e-3  # 1/m, of a structured-light camera, constant (K. Khoshelham, S. Elberink, 2012)
 
 
@@ -37,9 +39,11 @@ class KeyframeMaker:
         self._map = local_map
         self._rows = rows
         self._camera = local_map.camera
+        self._pairs = None if rows is None else PairSearch(rows, work)
         self._has_depth = has_depth
         self._channel = channel
         self._work = work
+        self.fault: Fault | None = None  # why the last frame without a track had too few new landmarks
         self.new_uv: F64 = np.zeros((0, 2))  # px of the first keypoints of the last keyframe that was shared
 
     def lacks_depth(self, ctx: FrameContext) -> bool:
@@ -47,18 +51,28 @@ class KeyframeMaker:
         return self._has_depth and ctx.images.right is None and ctx.images.depth_m is None
 
     def first_points(self, ctx: FrameContext) -> NewPoints | None:
-        """New landmarks for a keyframe without a track; None if too few of them have a depth."""
+        """New landmarks for a keyframe without a track; None if too few of them have a depth: `fault` says why."""
         points = self._points(ctx, np.zeros((0, 2)))
-        enough = int(np.count_nonzero(points.disparity > 0.0)) >= ctx.config.local_map.first_points
-        return points if enough else None
+        least = ctx.config.local_map.first_points
+        if _with_depth(points) >= least:
+            return points
+        few = len(points.uv) < least
+        self.fault = Fault.CORNERS if few else Fault.DEPTH if ctx.images.right is None else Fault.PAIR
+        return None
 
     def points_beside(self, ctx: FrameContext, track: Track) -> NewPoints:
         """New landmarks where a tracked frame has none."""
         return self._points(ctx, self._inliers(track)[1][:, :2])
 
     def _points(self, ctx: FrameContext, taken: F64) -> NewPoints:
-        """New landmarks away from pixels `taken` (n,2), at the frame's stamp."""
+        """New landmarks away from pixels `taken` (n,2), at the frame's stamp.
+
+        If rows of the right image are off by pixels, hardly any is found along them: then they are searched for.
+        """
         points = self._points_of_image(ctx, taken)
+        hardly = len(points.uv) >= ctx.config.local_map.first_points and _with_depth(points) < _HARDLY * len(points.uv)
+        if hardly and self._pairs is not None and self._pairs.find_rows(ctx, points):
+            points = self._points_of_image(ctx, taken)
         return points if ctx.shutter is None else moved_to_frame(points, self._camera, ctx.shutter)
 
     def _points_of_image(self, ctx: FrameContext, taken: F64) -> NewPoints:
@@ -214,6 +228,10 @@ class KeyframeMaker:
         slot = self._map.add(header, T_m_k, new, ctx.number)
         self._map.rolled[slot] = ctx.shutter is None
         return seen_uv
+
+
+def _with_depth(points: NewPoints) -> int:
+    return int(np.count_nonzero(points.disparity > 0.0))
 
 
 def _in_order_of_rows(points: NewPoints, cell_px: float, first: int) -> I64:

@@ -18,17 +18,18 @@ from kiteline_agent.local_map import disparity_kernels as kernels
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_core.arrays import F64, I64
 from kiteline_core.geometry import se3
-from kiteline_core.geometry.disparity_offset import TERMS, none, terms
+from kiteline_core.geometry.disparity_offset import GOOD_PX, TERMS, none, terms
 from kiteline_core.ids import NO_KEYFRAME
 from kiteline_core.order_statistics import median
 
 _LEAST_RHO = 1e-4  # 1/m
-_LEAST_PARALLAX = 0.02  # distance over depth of a first pair, but for `growth`
+_LEAST_PARALLAX = 0.02  # distance over depth of a first pair, but for _PARALLAX_GROWTH
 _MIN_POINTS = 30  # landmarks of a pair; eleven numbers are estimated from them
 _USUAL_SQUARE = 0.45  # mean squared error above which a pair counts less before an offset is applied
 _KNOWN_PX = 0.1  # px; by which each number of an offset changes between two flights: mounts and temperature
 _PRIOR_PX = 0.9  # px; standard deviation of a constant offset of a worn rig: both centres moved
 _PRIOR_SLOPE_RAD = 1.1e-3  # rad; the same of the other terms: a right camera that is turned by 0.06 degrees
+_BENT, _BENT_LOG_ODDS = 8.0, -4.0  # times these of a mount that was bent by a degree; one worn rig in fifty is
 _LEAST_CHANGE_PX = 0.04  # px, rms over the image; of a later change that is applied
 _ROWS_SURE = 0.99  # probability of a worn rig by rows alone, above which it is applied in any motion
 _INFLATION = 2.0  # factor on variances: templates and lens errors are common to neighbouring points
@@ -39,6 +40,10 @@ _MIN_SIDEWAYS = 0.2  # share of the motion across the optical axis below which e
 _FORWARD_SHARE = 1.0 / 9.0  # of the information about a worn rig that is believed then: errors were three deviations
 _FORWARD_KEYFRAMES = 12  # that tell something of their own then; more of them repeat errors of lens and tracks
 _FORWARD_GOOD_KEYFRAMES = 3  # the same of a good calibration's offset, which is no larger than these errors are
+_PAIR_EVERY_S = 0.18  # s between two pairs, at most: slow cameras, and frames that the governor skips
+_PARALLAX_GROWTH = 1.2  # of the parallax between two pairs of the same keyframe
+_WORN_SHARE = 0.2  # probability of a worn rig before the flight
+_SURE = 0.95  # probability of a worn rig above which the offset is applied
 
 
 class DisparityAlignment:
@@ -62,8 +67,9 @@ class DisparityAlignment:
         self._share = np.ones(slots)
         self._evicted_sure_h, self._evicted_sure_b = np.zeros((TERMS, TERMS)), np.zeros(TERMS)
         self._refuted = False  # earlier flights were of another rig; the map still has their offset
-        self._good = np.eye(TERMS) / config.good_px**2
+        self._good = np.eye(TERMS) / GOOD_PX**2
         self._prior = np.diag(np.array([_PRIOR_PX, *[_PRIOR_SLOPE_RAD * camera.fx] * (TERMS - 1)]) ** -2.0)
+        self._bent = self._prior / _BENT**2
         x, y = np.meshgrid(np.linspace(0.0, camera.width, 7), np.linspace(0.0, camera.height, 5))
         self._grid = terms(np.stack([(x.ravel() - camera.cx) / camera.fx, (y.ravel() - camera.cy) / camera.fy], 1))
         self._frames = 0  # since the last one that could make a pair
@@ -73,9 +79,9 @@ class DisparityAlignment:
         # If the rig is not worn: what was expected of it, its most probable offset, and whether another one than the
         # expected is likelier, and differs from that by more than its deviation.
         self.expected_px, self._good_estimate, self._good_is_known = none(), none(), False
-        self._prior_log_odds = math.log(config.worn_share / (1.0 - config.worn_share))  # of a worn rig
+        self._prior_log_odds = math.log(_WORN_SHARE / (1.0 - _WORN_SHARE))  # of a worn rig
         self._log_odds = self._prior_log_odds  # by disparities alone
-        self.worn = self.rig_worn = config.worn_share  # probability of it: by disparities alone, and with rows
+        self.worn = self.rig_worn = _WORN_SHARE  # probability of it: by disparities alone, and with rows
         self._row_evidence = 0.0  # see add_row_evidence
         self.applied = False  # the rig is worn: an offset found here was applied
         self._applied_sigma_px = np.inf  # of the estimate that was applied
@@ -105,7 +111,7 @@ class DisparityAlignment:
         self._frames += 1
         if self._pair_t_ns is None:
             self._pair_t_ns = t_ns
-        if self._frames < config.every and t_ns - self._pair_t_ns < config.every_s * 1e9:
+        if self._frames < config.every and t_ns - self._pair_t_ns < _PAIR_EVERY_S * 1e9:
             return None
         self._frames, self._pair_t_ns = 0, t_ns
         slots, counts = np.unique(rows // m.slot_size, return_counts=True)
@@ -114,7 +120,7 @@ class DisparityAlignment:
                 self._begin(slot)
         ratios = {slot: self._parallax_ratio(slot, T_c_m) for slot in slots[counts >= _MIN_POINTS].tolist()}
         slot = max(ratios, key=lambda s: ratios[s], default=None)
-        if slot is None or ratios[slot] < config.growth:
+        if slot is None or ratios[slot] < _PARALLAX_GROWTH:
             return None
         if self._add_pair(slot, T_c_m, rows, observed):
             self._solve()
@@ -249,6 +255,8 @@ class DisparityAlignment:
         self._solve_good(own * h, own * b)
         own = self._own_share(_FORWARD_KEYFRAMES)
         h, b = own * h, own * b
+        if self._is_bent():
+            self._prior = self._bent
         log_odds = self._prior_log_odds
         if self._earlier_h.any() and self._moves_sideways():
             worn, usual = _log_evidence(h, b, self._prior), _log_evidence(h, b, good)
@@ -281,13 +289,24 @@ class DisparityAlignment:
         In forward motion, where disparities tell little, the rows of the right image count as well.
         """
         rows = 0.0 if self._moves_sideways() else self._row_evidence
-        if _probability(self._log_odds + rows) < self._config.sure:
+        if _probability(self._log_odds + rows) < _SURE:
             return False
         share = self._own_share(_FORWARD_KEYFRAMES) * self._believed_share()
-        h = share * (self._evicted_sure_h + np.einsum("s,sij->ij", self._share, self._pair_h)) + self._earlier_h
-        b = share * (self._evicted_sure_b + self._share @ self._pair_b) + self._earlier_b
+        h, b = self._sure()
+        h, b = share * h + self._earlier_h, share * b + self._earlier_b
         odds = self._prior_log_odds + _log_evidence(h, b, self._prior) - _log_evidence(h, b, self._good)
-        return _probability(odds + rows) >= self._config.sure
+        return _probability(odds + rows) >= _SURE
+
+    def _sure(self) -> tuple[F64, F64]:
+        """Information (5,5) of all pairs and its side (5,), less of those whose landmarks fit badly."""
+        h = self._evicted_sure_h + np.einsum("s,sij->ij", self._share, self._pair_h)
+        return h, self._evicted_sure_b + self._share @ self._pair_b
+
+    def _is_bent(self) -> bool:
+        """True if an offset beyond wear is likelier: the mount was bent by up to a degree or two."""
+        h, b = self._sure()
+        gain = _log_evidence(h, b, self._bent) - _log_evidence(h, b, self._prior)
+        return self._moves_sideways() and gain + _BENT_LOG_ODDS > 0.0
 
     def _own_share(self, most: int) -> float:
         """Share of the pairs' information, if in forward motion no more than so many keyframes tell on their own."""

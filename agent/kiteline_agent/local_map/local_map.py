@@ -29,6 +29,7 @@ _MIN_TRIES = 12  # frames that must have searched a landmark before it is given 
 _TRIES_A_HIT = 5  # frames that search a landmark for one that finds it; with more it is given up
 _REFINED_SIGMA_PX = 0.08  # px: virtual disparity error of a depth that the base refined
 _FLOOR_PX = 0.06  # px: smallest virtual disparity error of the filter
+_MAX_SCALE = 2.5  # change of distance since the template was cut, as a factor
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,7 +167,7 @@ class LocalMap:
         return np.asarray(rows % self.slot_size < self.shared[rows // self.slot_size])
 
     def candidates(
-        self, T_c_m: F64, margin_px: float, max_scale: float, *, seeds: bool = False, submap: SubmapId | None = None
+        self, T_c_m: F64, margin_px: float, *, seeds: bool = False, submap: SubmapId | None = None
     ) -> Candidates:
         """The usable landmarks (or seeds) that should be in view of a camera at T_c_m (4,4).
 
@@ -175,7 +176,7 @@ class LocalMap:
         wanted = self.active if submap is None else submap
         slots = self._searched((self.keyframe >> SEQUENCE_BITS == wanted).nonzero()[0])
         n = kernels.project(
-            T_c_m, self.intrinsics, self._size, margin_px, max_scale, slots, self.T_m_k, self.order, self.counts,
+            T_c_m, self.intrinsics, self._size, margin_px, _MAX_SCALE, slots, self.T_m_k, self.order, self.counts,
             self.seed if seeds else self.usable,
             self.bearing, self.rho, self.sigma_rho, self._row, self._uv, self._warp, self._xyz, self._ray, self._depth,
         )  # fmt: skip

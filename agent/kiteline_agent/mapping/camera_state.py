@@ -43,9 +43,7 @@ class CameraState:
         self.covariance = PoseCovariance(
             local_map, camera.T_b_c, config.covariance, has_body=rig.has_body, has_depth=has_depth
         )  # fmt: skip
-        self.gravity = GravityAligner(
-            camera, self.motion.tracker, config.inertial.min_tilt_rad, config.inertial.level_patience_s
-        )
+        self.gravity = GravityAligner(camera, self.motion.tracker)
         self.reference = ReferenceKeyframe(local_map)
         self.submaps = Submaps(identity)
 

@@ -32,7 +32,7 @@ class RightCamera:
         self._channel = channel
         self.rows = RowAlignment(rectifier, config.rows)
         self.disparities = DisparityAlignment(local_map, config.disparities) if config.disparities.on else None
-        self._good_cov = np.eye(disparity_offset.TERMS) * config.disparities.good_px**2
+        self._good_cov = np.eye(disparity_offset.TERMS) * disparity_offset.GOOD_PX**2
         self._cov_of: tuple[F64, F64] | None = None  # see disparity_cov: of which expected_cov it is, and its value
         self._found_px = disparity_offset.none()  # error of disparities, without the base's part
         self._sigma_px: float | None = None  # of it, once this flight found it

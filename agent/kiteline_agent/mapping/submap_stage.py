@@ -17,6 +17,7 @@ from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.mapping.camera_state import CameraState
 from kiteline_agent.mapping.earlier_views import earlier_views
 from kiteline_agent.mapping.keyframe_stage import KeyframeStage
+from kiteline_agent.mapping.start_watch import StartWatch
 from kiteline_agent.mapping.submaps import TRACKED_M, TRACKED_RAD
 from kiteline_agent.motion.loss_motion import LossMotion
 from kiteline_agent.relocalisation.relocaliser import Relocaliser
@@ -32,6 +33,7 @@ from kiteline_core.ids import NO_KEYFRAME, KeyframeId, SubmapId
 
 _IGNORED = "imu: not used from here on: the images alone are flown, in a unit of length of their own, as with --no-imu"
 _FAILURES = 2  # failed searches in frames with texture before a new submap is opened
+_SCALE_SIGMA = 0.02  # relative deviation below which the metric scale of two views is used
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +80,7 @@ class SubmapStage:
         self._channel = channel
         self._loss: _Loss | None = None
         self._warnings: list[str] = []
+        self._start_watch = StartWatch()
 
     def may_open(self, failed_searches: int) -> bool:
         """True if there is no map yet, or the search for the old one failed and ids and CPU time are left."""
@@ -96,6 +99,7 @@ class SubmapStage:
         if self._two_view_start is not None:
             return self._open_from_two_views(ctx, self._two_view_start)
         points = self._maker.first_points(ctx)
+        self._warnings += self._start_watch.note(ctx.t_ns, None if points is not None else self._maker.fault)
         if points is None:
             return None
         camera = self._camera
@@ -116,7 +120,7 @@ class SubmapStage:
         return OpenedSubmap(True, ["submap: opened"])
 
     def take_warnings(self) -> list[str]:
-        """Events since the last call: what keeps a monocular map from its scale."""
+        """Events since the last call: what keeps a map from beginning, or a monocular one from its scale."""
         warnings, self._warnings = self._warnings, []
         return warnings + ([] if self._inertial_start is None else self._inertial_start.take_warnings())
 
@@ -247,7 +251,7 @@ class SubmapStage:
         if self._two_view_start is None or ctx.number % limits.scale_every or not camera.submaps.room:
             return []
         correction = camera.motion.scale_correction()
-        unit_m = camera.motion.metres_per_unit(limits.scale_sigma) if correction is None else correction[0]
+        unit_m = camera.motion.metres_per_unit(_SCALE_SIGMA) if correction is None else correction[0]
         if unit_m is None:
             return []
         metric = metric_points(ctx, track, self._map, unit_m)

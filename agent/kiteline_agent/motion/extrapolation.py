@@ -6,6 +6,9 @@ from enum import StrEnum
 from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
 
+LEAST_PREDICTION_PERCENT = 10.0  # of a core: with less, predictions of skipped frames would take half of it
+MAX_PREDICTION_S = 1.0  # s after the last processed frame: later no pose is predicted
+
 
 class MotionSource(StrEnum):
     """What measured the motion since the last frame; VELOCITY: nothing, it is that of the last frames."""

@@ -9,13 +9,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kiteline_agent.inertial.inertial_config import LossMotionConfig
 from kiteline_agent.inertial.inertial_tracker import InertialTracker
 from kiteline_agent.inertial.preintegration import preintegrate
 from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuCalibration
 
 _LEAST_VARIANCE = 1e-12  # a record holds no deviation of 0
+_AFTER_S = 0.19  # s in the new submap after which the velocity is known: four frames at 20 Hz
+_MOST_S = 1.0  # s; later the velocity tells as little of the loss as the IMU of the time since
+_ACCEL_M_S2 = 0.3  # m/s^2; error of a worn accelerometer under vibration, meanwhile
+_IMAGE_M = 0.004  # m; error of the motion by images, meanwhile
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,12 +51,9 @@ class _Begin:
 class LossMotionEstimator:
     """Call `begin` where a submap begins after a loss, then `update` with each frame tracked in it."""
 
-    def __init__(
-        self, tracker: InertialTracker, calibration: ImuCalibration, config: LossMotionConfig, gravity_m_s2: float
-    ) -> None:
+    def __init__(self, tracker: InertialTracker, calibration: ImuCalibration, gravity_m_s2: float) -> None:
         self._tracker = tracker
         self._calibration = calibration
-        self._config = config
         self._gravity_m_s2 = gravity_m_s2
         self._begin: _Begin | None = None
 
@@ -80,18 +80,18 @@ class LossMotionEstimator:
 
     def update(self, t_ns: int, T_m_b: F64) -> LossMotion | None:
         """A frame was tracked at T_m_b (4,4) in the new submap. Returns the better motion, once, when it is known."""
-        begin, config = self._begin, self._config
+        begin = self._begin
         passed_s = 0.0 if begin is None else (t_ns - begin.t_ns) * 1e-9
-        if begin is None or passed_s < config.after_s:
+        if begin is None or passed_s < _AFTER_S:
             return None
         self._begin = None
         samples = self._tracker.samples_between(begin.t_ns, t_ns)
-        if samples is None or passed_s > config.most_s:
+        if samples is None or passed_s > _MOST_S:
             return None
         motion = preintegrate(samples, begin.bias, self._calibration)
         predicted, _ = motion.propagate(begin.T_m_b, begin.velocity, begin.bias, begin.gravity)
         wrong = (T_m_b[:3, 3] - predicted[:3, 3]) / passed_s
-        noise = (0.5 * config.accel_m_s2 * passed_s) ** 2 + (config.image_m / passed_s) ** 2
+        noise = (0.5 * _ACCEL_M_S2 * passed_s) ** 2 + (_IMAGE_M / passed_s) ** 2
         gain = begin.cov[:3, 3:] @ np.linalg.inv(begin.cov[3:, 3:] + noise * np.eye(3))
         left = begin.cov[:3, :3] - gain @ begin.cov[3:, :3]
         return LossMotion(gain @ wrong, _largest(left), begin.sigma_rad)

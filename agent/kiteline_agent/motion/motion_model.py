@@ -11,9 +11,10 @@ from kiteline_agent.inertial.calibration.known_imu import KnownImuConfig
 from kiteline_agent.inertial.fixed_lag import VisualPoints
 from kiteline_agent.inertial.gravity_alignment import up_of
 from kiteline_agent.inertial.imu_initialisation import InertialStartState
-from kiteline_agent.inertial.imu_watch import ImuWatch
+from kiteline_agent.inertial.imu_watch import SILENT_S, ImuWatch
 from kiteline_agent.inertial.inertial_config import InertialConfig
 from kiteline_agent.inertial.inertial_tracker import InertialTracker
+from kiteline_agent.inertial.scale_filter import INTERVAL_S
 from kiteline_agent.motion.extrapolation import Extrapolation, MotionSource, along_twist
 from kiteline_agent.motion.loss_motion import LossMotionEstimator
 from kiteline_agent.motion.odometer import Odometer
@@ -33,6 +34,7 @@ _CONTRADICTS = (
 )
 _NO_VERTICAL = "imu: the vertical is not known: a flight controller gets no poses, and no ground is found"
 _MOST_UP_RAD = 0.2  # deviation of a direction of gravity that is of use
+_TRUSTED_S = 1.0  # s for which dead reckoning counts as tracking
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,16 +59,15 @@ class MotionModel:
     ) -> None:  # fmt: skip
         """metric: the cameras alone measure in metres (stereo or depth)."""
         self._T_b_c, self._T_c_b = camera.T_b_c, se3.inverse(camera.T_b_c)
-        self._config = config
         self._pose = pose
         self._metric = metric
         self.tracker = None if imu is None else InertialTracker(camera, imu, config, metric=metric)
-        self._steps = None if imu is None or metric else StepRecorder(imu, config.scale_filter.interval_s)
+        self._steps = None if imu is None or metric else StepRecorder(imu, INTERVAL_S)
         self.loss_motion: LossMotionEstimator | None = None
         if self.tracker is not None and imu is not None and metric:
-            self.loss_motion = LossMotionEstimator(self.tracker, imu, config.loss_motion, config.gravity_m_s2)
+            self.loss_motion = LossMotionEstimator(self.tracker, imu, config.gravity_m_s2)
         self.odometer = Odometer(camera.T_b_c, odometer, metric=metric)
-        self._watch = ImuWatch(config.silent_s, config.gravity_m_s2)
+        self._watch = ImuWatch(SILENT_S, config.gravity_m_s2)
         self._events: list[str] = []
         self.has_false_vertical = False  # it came from an IMU that never agreed with the images
 
@@ -193,10 +194,10 @@ class MotionModel:
         state = None if self.tracker is None else self.tracker.dead_reckon(t_ns, self.odometer.velocity(t_ns))
         if self.tracker is None or state is None:
             cov = self.odometer.dead_reckon(predicted, t_ns)
-            trusted = self.odometer.used and self.odometer.image_loss_s <= self._config.trusted_dead_reckoning_s
+            trusted = self.odometer.used and self.odometer.image_loss_s <= _TRUSTED_S
             return DeadReckoning(predicted, cov, trusted)
         self.odometer.dead_reckon(state.T_m_b @ self._T_b_c, t_ns)
-        trusted = self.tracker.image_loss_s <= self._config.trusted_dead_reckoning_s
+        trusted = self.tracker.image_loss_s <= _TRUSTED_S
         return DeadReckoning(state.T_m_b @ self._T_b_c, state.pose_cov, trusted)
 
     def restart(self, t_ns: int) -> None:

@@ -39,6 +39,7 @@ _SEEN_RAD_S = 0.02  # rad/s; the same of the rotation rate
 _SCALE_WALK = 0.003  # relative change of the scale per sqrt(s): load and temperature
 _RISE = 0.5  # weight of such an unusual error: a slip is detected within 0.2 s
 _SETTLED = 0.4  # share of a rejected jump below which the velocity must fall before it is used again
+_ALIGNED = 0.9  # least cosine between both displacements for their lengths to be compared
 
 
 class Odometer:
@@ -66,7 +67,7 @@ class Odometer:
         self.image_loss_s = 0.0
         self._path, self._path_cov, self._path_cross = np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3))  # in m
         self._rotation_cov, self._rotation_cross = np.zeros((3, 3)), np.zeros((3, 3))  # about the body's axes
-        self._unit_scale = UnitScale(config.aligned)
+        self._unit_scale = UnitScale(_ALIGNED)
         self._unscaled_ns: int | None = None  # stamp of the first frame in a map of unknown scale
         self._trusted = self._reported_trust = False
         self._unmatched = 0  # windows without a sample before the first comparison
@@ -345,7 +346,7 @@ class Odometer:
             measured_scale = distance**2 / along if along > 0.0 else 0.0
             var = (_SCALE_SIGMA_M_S * dt / distance) ** 2 if distance > 0.0 else np.inf
             off = measured_scale - self.scale
-            aligned = along > c.aligned * distance * float(np.sqrt(square))
+            aligned = along > _ALIGNED * distance * float(np.sqrt(square))
             if aligned and off * off < 9.0 * (self._scale_var + var):
                 gain = self._scale_var / (self._scale_var + var)
                 self.scale = float(np.clip(self.scale + gain * off, 1.0 - _SCALE_MOST, 1.0 + _SCALE_MOST))

@@ -17,9 +17,9 @@ from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, KeyframeId, SubmapId
 from kiteline_core.imaging.descriptors import comparable
-from kiteline_core.imaging.matching import MatchConfig, Matches, match, match_near
+from kiteline_core.imaging.matching import Matches, match, match_near
 from kiteline_core.places.place_index import PlaceIndex, Vocabulary
-from kiteline_core.pose.pnp import RansacConfig, solve_pnp
+from kiteline_core.pose.pnp import PIXEL_CHI2, solve_pnp
 from kiteline_core.pose.pose_kernels import optimise_pose
 
 _MARGIN_PX = 4.0  # px beyond the border: landmarks just out of view have no corner
@@ -29,6 +29,8 @@ _OCTAVE_GAP = 1.2  # octaves between predicted and matched size
 _CORNER_PX = 1.0  # px at octave 0: standard deviation of a corner that was detected twice
 _MIN_MATCHES = 12  # matches that agree with one pose; chance matches reach 8
 _MIN_RELOCALISATION_MATCHES = 30  # the same with which a lost frame is relocalised
+_MIN_SHARE = 0.15  # of the landmarks that should be in view; not every one is a corner again
+_LANDMARKS = 128  # of a cached keyframe
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,17 +65,15 @@ class MapCache:
     """Cached keyframes, bounded in number: slot k holds a keyframe, row k * landmarks + i one of its landmarks."""
 
     def __init__(
-        self, camera: RectifiedCamera, config: MapCacheConfig, matching: MatchConfig, ransac: RansacConfig,
+        self, camera: RectifiedCamera, config: MapCacheConfig,
         vocabulary: Vocabulary | None,
     ) -> None:  # fmt: skip
-        k, p = config.keyframes, config.landmarks
+        k, p = config.keyframes, _LANDMARKS
         self._camera = camera
         self._intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy, camera.bf])
         self._size = np.array([camera.width, camera.height], np.float64)
         self._config = config
-        self._beyond_px = float(round(config.beyond * camera.width))
-        self._matching = matching
-        self._ransac = ransac
+        self._margin_px = float(round(config.margin * camera.width))
         self._vocabulary = vocabulary
         self._index: PlaceIndex | None = None  # filled at the first search
         self._indexed: set[int] = set()
@@ -142,9 +142,9 @@ class MapCache:
         """Store the landmarks of all parts that arrived, up to the capacity."""
         self._remove_from_index(slot)
         parts = [self._parts[slot][k] for k in sorted(self._parts[slot])]
-        keep = np.flatnonzero(np.concatenate([part.inv_depth for part in parts]) > 0.0)[: self._config.landmarks]
+        keep = np.flatnonzero(np.concatenate([part.inv_depth for part in parts]) > 0.0)[:_LANDMARKS]
         n, c = len(keep), self._camera
-        rows = slice(slot * self._config.landmarks, slot * self._config.landmarks + n)
+        rows = slice(slot * _LANDMARKS, slot * _LANDMARKS + n)
         uv = np.concatenate([part.uv for part in parts]).astype(np.float64)[keep]
         self._bearing[slot, :n] = (uv - (c.cx, c.cy)) / (c.fx, c.fy)
         self._rho[slot, :n] = np.concatenate([part.inv_depth for part in parts])[keep]
@@ -165,7 +165,6 @@ class MapCache:
         found = match_near(
             projected.uv, np.full(len(projected.rows), self._config.radius_px), projected.octave, wanted,
             seen.uv, seen.octave, offered, (self._camera.width, self._camera.height), _OCTAVE_GAP,
-            self._matching,
         )  # fmt: skip
         return self._consistent(T_c_m, projected, found, seen)
 
@@ -179,7 +178,7 @@ class MapCache:
         observed = np.column_stack([seen.uv[found.b], np.full(len(found.b), -1.0)])
         sigma_px = _CORNER_PX * np.ldexp(1.0, seen.octave[found.b].astype(np.int32))
         T, inlier = T_c_m.copy(), np.ones(len(found.a), np.bool_)
-        inliers, _ = optimise_pose(T, xyz, ray, observed, sigma_px, self._intrinsics, 3, 4, self._ransac.chi2, inlier)
+        inliers, _ = optimise_pose(T, xyz, ray, observed, sigma_px, self._intrinsics, 3, 4, PIXEL_CHI2, inlier)
         if inliers < _MIN_MATCHES or not np.isfinite(T).all():
             return None
         T = se3.orthonormalise(T)
@@ -211,22 +210,22 @@ class MapCache:
             T_c_m = self._pose_from(slot, submap, seen, frame_number)
             matches = None if T_c_m is None else self.match_landmarks(T_c_m, submap, seen)
             if matches is not None and len(matches.corner) >= max(
-                _MIN_RELOCALISATION_MATCHES, self._config.min_share * matches.in_view
+                _MIN_RELOCALISATION_MATCHES, _MIN_SHARE * matches.in_view
             ):
                 return submap, matches
         return None
 
     def _pose_from(self, slot: int, submap: SubmapId, seen: FrameFeatures, frame_number: int) -> F64 | None:
         """P3P on matches with the landmarks in view of a cached keyframe, or a little beyond its border."""
-        projected = self._project(se3.inverse(self._T_m_k[slot]), submap, -self._beyond_px)
+        projected = self._project(se3.inverse(self._T_m_k[slot]), submap, -self._margin_px)
         wanted, offered = comparable(self._descriptor[projected.rows], seen.descriptor)
-        found = match(wanted, self._angle[projected.rows], offered, seen.angle, self._matching)
+        found = match(wanted, self._angle[projected.rows], offered, seen.angle)
         if len(found.a) < _MIN_MATCHES:
             return None
         observed = np.column_stack([seen.uv[found.b], np.full(len(found.b), -1.0)])
         fit = solve_pnp(
             projected.xyz[found.a], projected.ray[found.a], observed, seen.octave[found.b], self._intrinsics,
-            frame_number, self._ransac,
+            frame_number,
         )  # fmt: skip
         return None if fit is None or fit.inliers < _MIN_MATCHES else fit.T_c_m
 

@@ -34,6 +34,7 @@ _AMBIGUOUS_SHARE = 0.6  # of the inliers: with so many another place is as likel
 _AMBIGUOUS_RATIO = 0.2  # of the depth: difference up to which two results are the same place
 _AMBIGUOUS_RAD = 0.15  # rad: the same for the rotation
 _AGREE_RAD = 0.035  # rad: rotation between two results beside a new submap, 2 degrees
+_MIN_SHARE = 0.4  # of the landmarks the tracker searched for; a place that only looks similar has fewer
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +72,7 @@ class Relocaliser:
         self._cache = cache
         self._config = config
         self._work = work
-        self._beyond_px = float(round(config.relocalisation.beyond * local_map.camera.width))
+        self._margin_px = float(round(config.relocalisation.margin * local_map.camera.width))
         self._detector = replace(
             config.detector, cell_px=config.relocalisation.cell_px, max_corners=config.relocalisation.max_corners
         )
@@ -96,7 +97,8 @@ class Relocaliser:
         for key in self._index.keys:
             if self._map.slot_of(key) < 0:
                 self._index.remove(key)
-        waiting, most = [k for k in self._waiting if self._map.slot_of(k) >= 0], self._config.relocalisation.entered
+        waiting = [k for k in self._waiting if self._map.slot_of(k) >= 0]
+        most = self._config.relocalisation.indexed_per_frame
         self._waiting = waiting[:-most]
         for keyframe in waiting[-most:]:
             self._work.places += 1
@@ -106,9 +108,7 @@ class Relocaliser:
         slot = self._map.slot_of(keyframe)
         first = slot * self._map.slot_size
         own = np.arange(first, first + int(self._map.counts[slot]))
-        in_view = self._map.candidates(
-            se3.inverse(self._map.T_m_k[slot]), 0.0, self._config.align.max_scale, submap=submap_of_keyframe(keyframe)
-        )
+        in_view = self._map.candidates(se3.inverse(self._map.T_m_k[slot]), 0.0, submap=submap_of_keyframe(keyframe))
         index.add(keyframe, self._map.descriptor[np.union1d(own, in_view.rows)])
 
     def start_joining(self, t_ns: int) -> None:
@@ -175,19 +175,16 @@ class Relocaliser:
     def _pose_from(self, keyframe: KeyframeId, seen: FrameFeatures, seed: int) -> PoseFit | None:
         """P3P on matches with the landmarks in view of a keyframe, or a little beyond its border."""
         T_m_k = self._map.T_m_k[self._map.slot_of(keyframe)]
-        around = self._map.candidates(
-            se3.inverse(T_m_k), -self._beyond_px, self._config.align.max_scale, submap=submap_of_keyframe(keyframe)
-        )
+        around = self._map.candidates(se3.inverse(T_m_k), -self._margin_px, submap=submap_of_keyframe(keyframe))
         matches = matching.match(
             self._map.descriptor[around.rows], self._map.angle[around.rows], seen.descriptor, seen.angle,
-            self._config.matching,
         )  # fmt: skip
         if len(matches.a) < _MIN_PNP_INLIERS:
             return None
         observed = np.column_stack([seen.uv[matches.b], np.full(len(matches.b), -1.0)])
         fit = solve_pnp(
             around.xyz[matches.a], around.ray[matches.a], observed, seen.octave[matches.b], self._map.intrinsics,
-            seed, self._config.ransac,
+            seed,
         )  # fmt: skip
         return None if fit is None or fit.inliers < _MIN_PNP_INLIERS else fit
 
@@ -198,7 +195,7 @@ class Relocaliser:
         self._map.activate(submap)
         track = self._tracker.track(ctx, T_c_m)
         self._map.activate(active)
-        if track.inliers < limits.min_inliers or track.inliers < limits.min_share * track.tried:
+        if track.inliers < limits.min_inliers or track.inliers < _MIN_SHARE * track.tried:
             return None
         return track
 

@@ -47,7 +47,8 @@ from kiteline_hw.system.vocabulary import shipped_vocabulary
 
 SAVE_FRAMES = 200  # frames between two looks at whether the rig file is up to date
 PROGRESS_FRAMES = 10  # frames between two reports of progress, and between two readings of the memory in use
-_WARNING, _MOST_WARNINGS = "imu:", 10  # events that begin so are noted in the report, as many at most
+_WARNING, _MOST_WARNINGS = ("imu:", "images:"), 10  # events that begin so are noted in the report, as many at most
+_IMAGES_WAITING = 12  # images that wait to be encoded, 9 MB; then live flights store images, others wait
 
 
 class AgentRuntime:
@@ -90,7 +91,7 @@ class AgentRuntime:
         self._files = ExitStack()
         self._log_shift_ns = options.start_ns  # log time minus the time handed to the agent: log times are source times
         self._log_config = config.log
-        self._encoder = ImageEncoder(EncodingPolicy(config.log.compressed, config.log.waiting))
+        self._encoder = ImageEncoder(EncodingPolicy(config.log.compressed, _IMAGES_WAITING))
         self._log: LogWriter | None = None
         self._budget: LogBudget | None = None
         self._lines: tuple[LineFile, ...] = ()

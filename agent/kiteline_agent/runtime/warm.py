@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 
 from kiteline_agent.agent import Agent
-from kiteline_agent.config import AgentConfig, TwoViewConfig
+from kiteline_agent.config import AgentConfig
 from kiteline_agent.ekf.filter_warm import warm_filter
 from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_agent.imaging.alignment_kernels import TEMPLATE, TEMPLATE_LEVELS
@@ -28,7 +28,7 @@ from kiteline_core.geometry.se3 import from_rt
 from kiteline_core.ground.config import GroundConfig
 from kiteline_core.ground.ground_warm import warm_ground
 from kiteline_core.ids import AgentId
-from kiteline_core.imaging.matching import MatchConfig, match, match_near
+from kiteline_core.imaging.matching import match, match_near
 from kiteline_core.places.place_index import PlaceIndex, Vocabulary, nodes
 from kiteline_core.pose.pnp import solve_pnp
 
@@ -93,7 +93,7 @@ def _warm_relocalisation(vocabulary: Vocabulary, noise: U8) -> None:
         places.add(key, descriptor)
     places.query(descriptor)
     places.remove(0)
-    match(descriptor, angle, descriptor, angle, MatchConfig())
+    match(descriptor, angle, descriptor, angle)
     points = noise[1280:1400].reshape(40, 3) / 128.0 + np.array([-1.0, -1.0, 2.0])
     observed = np.column_stack([100.0 * points[:, :2] / points[:, 2:] + 150.0, np.full(40, -1.0)])
     camera = np.array([100.0, 100.0, 150.0, 150.0, 10.0])
@@ -101,7 +101,7 @@ def _warm_relocalisation(vocabulary: Vocabulary, noise: U8) -> None:
     solve_pnp(points, np.zeros((40, 3)), observed, flat, camera, 0)
     uv = np.ascontiguousarray(observed[:, :2])
     match_near(
-        uv, np.full(40, 4.0), np.zeros(40), descriptor, uv, flat, descriptor, (320, 240), 1.2, MatchConfig()
+        uv, np.full(40, 4.0), np.zeros(40), descriptor, uv, flat, descriptor, (320, 240), 1.2
     )  # fmt: skip
 
 
@@ -115,7 +115,7 @@ def _warm_monocular(image: U8, draw: F64) -> None:
     """Both starts, on a cloud of points (3,n) drawn from 0 to 1 and on one point, and the search of a seed."""
     x, y, z = draw[0] - 0.5, draw[1] - 0.5, 1.0 + draw[2]
     a, b = (np.column_stack([200.0 * (x - shift) / z + 159.5, 200.0 * y / z + 119.5]) for shift in (0.0, 0.2))
-    two_view(a, b, np.array([200.0, 200.0, 159.5, 119.5]), TwoViewConfig(), 0)
+    two_view(a, b, np.array([200.0, 200.0, 159.5, 119.5]), 0)
     one, two, three, turn = np.ones((1, 1)), np.zeros((1, 1, 2)), np.zeros((1, 3)), np.eye(3)
     add_observations(
         two, two, one, 1.0, three[None], one, turn, turn[None], three, three[0], one[0], three, turn[None],

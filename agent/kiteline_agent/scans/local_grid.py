@@ -15,6 +15,7 @@ from kiteline_codec.schema import GridTile
 from kiteline_codec.schema.base.grid_tile import FREE, TILE_CELLS
 from kiteline_core.arrays import F64, I8
 from kiteline_core.ground.column_scan import ColumnScan, level_rotation
+from kiteline_core.ground.config import GroundConfig
 
 SECTORS = 72  # of 5 degrees
 _CELLS = 512  # along each side of the local grid
@@ -23,25 +24,37 @@ _MOST_DRAWN = 8000  # scans between two drawings of all: marks are 16-bit number
 _RAYS = 5  # in each sector
 _IN_A_FRAME = 8  # scans that are drawn again in a frame: 1 ms
 _NONE: I8 = np.zeros((0, 0), np.int8)
+_WORSE = 2.0  # times `level_rad` of a scan's vertical from which it is left out: 0.2 m of height at 3 m
 _LEAST_HEADING = 0.3  # horizontal part of the vehicle's forward axis: less has no heading
+_NEAR_M = 2.0  # m; nearer obstacles are told even if something before them is unknown
+_DOUBT_PX = 0.3  # px; deviation of disparities from which tiles of the base do not count: 6 cm at 3 m
+_GAP_M = 1.0  # m along a ray that may be unknown before an obstacle is told: a turn between two scans
+_LEVEL_RAD = 0.03  # rad; error of the vertical from which scans are levelled again: 0.1 m of height at 3 m
+LOST_S = 0.3  # s without a pose after which scans are forgotten: 0.15 m at a change of speed by 3 m/s^2
 
 
 @dataclass(slots=True)
 class _Drawn:
-    """A scan in the grid's axes. x_m, y_m, z_m: of its camera. heading: of its azimuth 0. offset_px: see `Scanned`."""
+    """A scan in the grid's axes.
+
+    x_m, y_m, z_m: of its camera. heading: of its azimuth 0. up: (3,) the vertical that it was made with. offset_px: see
+    `Scanned`.
+    """
 
     x_m: float
     y_m: float
     z_m: float
     heading: float
+    up: F64
     scan: ColumnScan
     offset_px: F64
     _ranges: tuple[RangeError, F64, F64] | None = None  # what `ranges` returned last, and by which error
 
     @staticmethod
-    def of(p: F64, ahead: F64, scan: ColumnScan, offset_px: F64) -> "_Drawn":
+    def of(p: F64, ahead: F64, up: F64, scan: ColumnScan, offset_px: F64) -> "_Drawn":
         """That of a camera at p (3,) whose azimuth 0 lies towards ahead (3,)."""
-        return _Drawn(float(p[0]), float(p[1]), float(p[2]), float(np.arctan2(ahead[1], ahead[0])), scan, offset_px)
+        heading = float(np.arctan2(ahead[1], ahead[0]))
+        return _Drawn(float(p[0]), float(p[1]), float(p[2]), heading, up, scan, offset_px)
 
     def ranges(self, error: RangeError, sigma_m: float) -> tuple[F64, F64]:
         """See `RangeError.ranges`. A scan is drawn again and again."""
@@ -52,7 +65,7 @@ class _Drawn:
     def turned(self, R: F64) -> "_Drawn":
         """The same in axes turned by R (3,3)."""
         ahead = np.array([np.cos(self.heading), np.sin(self.heading), 0.0])
-        return _Drawn.of(R @ [self.x_m, self.y_m, self.z_m], R @ ahead, self.scan, self.offset_px)
+        return _Drawn.of(R @ [self.x_m, self.y_m, self.z_m], R @ ahead, R @ self.up, self.scan, self.offset_px)
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,8 +120,9 @@ class LocalGrid:
     or more is known of the errors of ranges, all are drawn again on another canvas, some in each frame.
     """
 
-    def __init__(self, config: LocalGridConfig) -> None:
-        self._config = config
+    def __init__(self, config: LocalGridConfig, sight_m: float = GroundConfig().slab_m) -> None:
+        """sight_m: above and below the camera that a scan's line of sight covers."""
+        self._config, self._sight_m = config, sight_m
         self._error: RangeError | None = None  # by which scans are drawn
         self._told: RangeError | None = None  # the last one that `follow` was given
         self._sure_scans = config.scans  # in a row, since the rig was in doubt
@@ -128,10 +142,11 @@ class LocalGrid:
         self._take(error)
         T, scan = scanned.T_o_c, scanned.scan
         R_l_o = level_rotation(scan.up_c).T @ T[:3, :3].T
-        if self._R_g_o is None or float(self._R_g_o[2] @ R_l_o[2]) < np.cos(self._config.level_rad):
+        if self._R_g_o is None or float(self._R_g_o[2] @ R_l_o[2]) < np.cos(_LEVEL_RAD):
             self._level(R_l_o)
         assert self._R_g_o is not None
-        drawn = _Drawn.of(self._R_g_o @ T[:3, 3], self._R_g_o @ R_l_o[0], scan, scanned.offset_px)
+        R = self._R_g_o
+        drawn = _Drawn.of(R @ T[:3, 3], R @ R_l_o[0], R @ R_l_o[2], scan, scanned.offset_px)
         self._keep(drawn, scanned.repeats)
         self._ground_m = None if scanned.height_m is None else drawn.z_m - scanned.height_m
         self._draw(self._canvas, drawn)
@@ -161,16 +176,21 @@ class LocalGrid:
         self._canvas.fits, self._again = False, None
 
     def _level(self, R_g_o: F64) -> None:
-        """Level the grid by a better vertical: in a flight that begins in motion it is known late."""
+        """Level the grid by a better vertical: in a flight that begins in motion it is known late.
+
+        Scans that were made with a much worse one go: they took floor or ceiling for what stands at their height.
+        """
         if self._R_g_o is not None:
-            turn = R_g_o @ self._R_g_o.T
-            self._scans = deque((drawn.turned(turn) for drawn in self._scans), maxlen=self._scans.maxlen)
+            turn, least = R_g_o @ self._R_g_o.T, np.cos(_WORSE * _LEVEL_RAD)
+            turned = (drawn.turned(turn) for drawn in self._scans)
+            self._scans = deque((drawn for drawn in turned if drawn.up[2] >= least), maxlen=self._scans.maxlen)
+            self._repeats = min(self._repeats, len(self._scans))
             self._clear()
         self._R_g_o = R_g_o
 
     def _take(self, error: RangeError) -> None:
         """Take over what is known of ranges."""
-        if error.common_px > self._config.doubt_px or (self._error is not None and error.moved(self._error)):
+        if error.common_px > _DOUBT_PX or (self._error is not None and error.moved(self._error)):
             self._sure_scans = 0
         if self._error is None or error.differs(self._error):
             self._error, self._canvas.fits = error, False
@@ -207,19 +227,28 @@ class LocalGrid:
         own_at = np.array([*(p[:2] - canvas.corner), np.arctan2(ahead[1], ahead[0])])
         cell_m, tile_at = config.cell_m, np.zeros(3)
         if tiles and T_w_f is not None:
-            height_m = None if self._ground_m is None else float(p[2]) - self._ground_m
-            told = height_m is None or height_m <= bands_m[-1]  # of what is higher, tiles tell nothing
-            cell_m, corner = self._place_window(T_w_f, tiles, _mask(bands_m, height_m, config.body_m) if told else 0)
+            cell_m, corner = self._place_window(T_w_f, tiles, self._bands_at(float(p[2]), bands_m))
             tile_at = np.array([*(T_w_f[:2, 3] - corner), np.arctan2(T_w_f[1, 0], T_w_f[0, 0])])
             window = self._window
         out = np.empty(SECTORS)
         climbed_m = abs(float(p[2]) - canvas.z_m)  # since the frame
         own = canvas.cells if climbed_m < config.slab_m + config.body_m else _NONE
         kernels.read_distances(
-            own, canvas.marks, config.cell_m, own_at, window, cell_m, tile_at, config.vehicle_m, config.gap_m,
-            config.near_m, config.reach_m, _RAYS, out,
+            own, canvas.marks, config.cell_m, own_at, window, cell_m, tile_at, config.vehicle_m, _GAP_M,
+            _NEAR_M, config.reach_m, _RAYS, out,
         )  # fmt: skip
         return Surroundings(out, config.reach_m)
+
+    def _bands_at(self, z_m: float, bands_m: tuple[float, ...]) -> int:
+        """Mask of the height bands of tiles that a vehicle at z_m is in.
+
+        None above the bands, and none where own scans lost the ground: what lies below would be told as ahead. All of a
+        vehicle without scans, which never knows its height.
+        """
+        if self._ground_m is None:
+            return 0 if self._scans else _mask(bands_m, None, self._config.body_m)
+        height_m = z_m - self._ground_m
+        return _mask(bands_m, height_m, self._config.body_m) if height_m <= bands_m[-1] else 0
 
     def _move_on(self, x_m: float, y_m: float, z_m: float) -> None:
         """Draw scans again about a place if the canvas does not fit it any more, as many as a frame has time for."""
@@ -251,11 +280,11 @@ class LocalGrid:
             return False
         canvas.number += 1
         clear_m, certain_m = drawn.ranges(self._error, config.sigma_m)
-        seen_m = np.minimum(np.maximum(certain_m, config.near_m), config.reach_m)
+        seen_m = np.minimum(np.maximum(certain_m, _NEAR_M), config.reach_m)
         kernels.draw_rays(
             canvas.cells, canvas.marks, canvas.number, drawn.x_m - canvas.corner[0], drawn.y_m - canvas.corner[1],
             drawn.heading, scan.azimuths_rad, scan.azimuth_step_rad, clear_m, seen_m, config.cell_m,
-            away_m <= config.seen_m - config.slab_m,
+            away_m <= self._sight_m - config.slab_m,
         )  # fmt: skip
         return True
 

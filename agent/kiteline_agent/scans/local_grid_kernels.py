@@ -5,6 +5,8 @@ import numpy as np
 from kiteline_core.jit import njit
 
 HIT, MISS = 2, -1  # what a seen surface and a clear ray add to a cell
+LONE_HIT = 1  # what one adds that a single column saw: a matched block is wider, so many are errors of matching
+_LONE = 0.1  # of a range by which those of the columns beside it differ, at least: a wall seen at 14 degrees
 MOST, LEAST = 8, -6
 _THICK_M = 0.3  # m of a smeared surface, at most: it may be a solid that was seen from other sides
 OCCUPIED, FREE = 2, -1  # from which, and up to which a cell is so; unknown between
@@ -22,6 +24,15 @@ def _add(cells, drawn, number, i, j, value):  # type: ignore[no-untyped-def]
 
 
 @njit
+def _is_lone(clear_m, c):  # type: ignore[no-untyped-def]
+    """True if no column beside column c has its range."""
+    for i in range(max(c - 1, 0), min(c + 2, len(clear_m))):
+        if i != c and abs(clear_m[i] - clear_m[c]) < _LONE * clear_m[c]:
+            return False
+    return True
+
+
+@njit
 def draw_rays(cells, drawn, number, x, y, heading, azimuth, step, clear_m, reach_m, cell_m, clears):  # type: ignore[no-untyped-def]
     """Draw a scan into cells (n,n): clear up to clear_m (m,), where a surface is unless it lies beyond reach_m (m,).
 
@@ -32,6 +43,7 @@ def draw_rays(cells, drawn, number, x, y, heading, azimuth, step, clear_m, reach
     for c in range(len(azimuth)):
         if clear_m[c] <= 0.0:
             continue
+        hit = LONE_HIT if _is_lone(clear_m, c) else HIT
         until = min(clear_m[c], reach_m[c])
         parts = int(step * until / cell_m) + 1
         for p in range(parts):
@@ -40,7 +52,7 @@ def draw_rays(cells, drawn, number, x, y, heading, azimuth, step, clear_m, reach
             if clear_m[c] < reach_m[c]:
                 i, j = int((y + dy * until) / cell_m), int((x + dx * until) / cell_m)
                 if 0 <= i < n and 0 <= j < n:
-                    _add(cells, drawn, number, i, j, HIT)
+                    _add(cells, drawn, number, i, j, hit)
             if not clears:
                 continue
             for k in range(int((until - 1.5 * cell_m) / (0.7 * cell_m))):

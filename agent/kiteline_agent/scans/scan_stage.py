@@ -34,6 +34,8 @@ from kiteline_core.ground.wide_view import WideView
 from kiteline_core.ids import NO_KEYFRAME, KeyframeId
 
 _MOST_PARTS = 2  # of a scan in one frame, after a gap too
+_AGAIN_S = 0.5  # s after which a camera that stays where it is scans again for the local grid: people walk in
+_PART_S = 0.05  # s between frames in which a stripe is matched: two at 10 Hz, so that every keyframe can be scanned
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +104,7 @@ class ScanStage:
         self._begun: _Begun | None = None
         self._last_T_o_c: F64 | None = None  # of the newest scan of another view
         self._last_ns = 0  # when the newest scan was begun
-        self._ground: GroundHeight[KeyframeScan] = GroundHeight(ground)
+        self._ground: GroundHeight[KeyframeScan] = GroundHeight()
         self._keyframe = NO_KEYFRAME  # the newest one, whose scans are numbered
         self._part = 0  # of its newest scan
         self._queue = ScanQueue(channel)
@@ -141,7 +143,7 @@ class ScanStage:
             self._begun = None
             self._send_images(begun)
             return None
-        parts = min(_MOST_PARTS, max(1, round(ctx.dt_s / self._config.part_s)))
+        parts = min(_MOST_PARTS, max(1, round(ctx.dt_s / _PART_S)))
         for _ in range(parts):
             if begun.disparity is None and not self._match_stripe(begun):
                 continue
@@ -156,14 +158,14 @@ class ScanStage:
     def _begin_if_due(self, ctx: FrameContext, of_keyframe: bool) -> None:
         """Begin a scan of a frame that shows something new, or of any one after a while."""
         shows_more = self._shows_more() or (of_keyframe and self._begun is not None)
-        if shows_more or ctx.t_ns - self._last_ns > self._config.again_s * 1e9:
+        if shows_more or ctx.t_ns - self._last_ns > _AGAIN_S * 1e9:
             self._begin(ctx, of_keyframe, repeats=not shows_more)
 
     def forget(self) -> None:
         """The camera has moved by an unknown way: the ground lies elsewhere than where it was seen, in o."""
         self._begun = self._last_T_o_c = None
         self._stretch += 1
-        self._ground = GroundHeight(self._segmenter.config)
+        self._ground = GroundHeight()
 
     def _match_stripe(self, begun: _Begun) -> bool:
         """Match the next stripe; True if there was none left, and the disparity is whole."""

@@ -39,14 +39,22 @@ class RightImage:
         return self._rectifier.remaps
 
     def coarse(self) -> Pyramid:
-        """Pyramid of the rectified image; level 0 is blank if the camera needs rectification."""
+        """Pyramid of the rectified image; level 0 is blank if it needs rectification or is read at other rows."""
         if self._coarse is None:
             raw = self.raw()
             self._coarse = raw
-            if self._rectifier.remaps:
+            if self._rectifier.remaps or self._rectifier.right_rows is not None:
                 half = self._rectifier.halved(1, raw[1])
                 self._coarse = (self._rectifier.blank, *build_pyramid(half, self._levels - 1))
         return self._coarse
+
+    def rectified(self) -> Pyramid:
+        """Pyramid of the whole image, rectified as calibrated."""
+        return build_pyramid(self._rectifier.right(self._image), self._levels)
+
+    def rows_changed(self) -> None:
+        """The rectifier reads other rows than before."""
+        self._coarse = None
 
     def raw_half(self) -> U8:
         """Level 1 of the image as it came, alone."""

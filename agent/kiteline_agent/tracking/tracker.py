@@ -5,6 +5,7 @@ import numpy as np
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.governor.cost_model import Work
 from kiteline_agent.imaging import alignment_kernels
+from kiteline_agent.imaging.alignment_kernels import ALIGN_ITERATIONS, FINE_STEP_PX, MIN_NCC
 from kiteline_agent.local_map import projection_kernels
 from kiteline_agent.local_map.local_map import Candidates, LocalMap
 from kiteline_agent.tracking.frame_context import FrameContext
@@ -16,6 +17,7 @@ from kiteline_core.order_statistics import median
 from kiteline_core.pose import pose_kernels
 
 _SURE_PX = 0.4  # px of the octave: deviation of the predicted disparity below which no coarser level is searched
+_COARSE = 3  # times fewer landmarks in the coarse pass than in the fine one
 _COARSEST = 2  # template level at which the coarse pass begins
 _MARGIN_PX = 8.0  # nearer to the border a template hangs over the edge
 _COARSE_STEP_PX = 7.0  # px of the coarse level: half a template
@@ -31,11 +33,11 @@ class Tracker:
 
     def track(self, ctx: FrameContext, predicted_T_c_m: F64) -> Track:
         """Measure the pose of a frame from a prediction (4,4) that is good to some 28 px."""
-        align = ctx.config.align
+        align, least = ctx.config.align, 2 * ctx.config.pose.min_inliers
         T_c_m = predicted_T_c_m.copy()
         # Coarse pass: few landmarks and large steps on small images correct the prediction.
-        coarse = self._map.candidates(T_c_m, _MARGIN_PX, align.max_scale)
-        chosen = self._choose(coarse, ctx.number, align.coarse_points, 1, 2 * align.cell_px)
+        coarse = self._map.candidates(T_c_m, _MARGIN_PX)
+        chosen = self._choose(coarse, ctx.number, max(align.points // _COARSE, least), 1, 2 * align.cell_px)
         rough = self._measure(ctx, coarse, chosen, T_c_m, _COARSEST, coarse_only=True)
         if rough.inliers >= ctx.config.pose.min_inliers // 2:
             T_c_m = rough.T_c_m
@@ -56,7 +58,7 @@ class Tracker:
         first: template level at which alignment begins. near_px: see `_measure`.
         """
         align = ctx.config.align
-        fine = self._map.candidates(T_c_m, _MARGIN_PX, align.max_scale)
+        fine = self._map.candidates(T_c_m, _MARGIN_PX)
         chosen = self._choose(fine, ctx.number, align.points, 2, align.cell_px)
         return self._measure(ctx, fine, chosen, T_c_m, first, coarse_only=False, near_px=near_px)
 
@@ -112,7 +114,7 @@ class Tracker:
         octave = self._map.octave.take(rows)
         found = np.zeros(len(rows), np.bool_)
         last = 1 if coarse_only else 0
-        step = _COARSE_STEP_PX if coarse_only else align.fine_step_px
+        step = _COARSE_STEP_PX if coarse_only else FINE_STEP_PX
         # Templates from a finer level than this frame has are aligned one level up.
         least = 0 if coarse_only else images.first
         raised = np.maximum(octave, least) - octave if least else np.zeros_like(octave)
@@ -122,7 +124,7 @@ class Tracker:
             place, aligned = uv[some], found[some]  # views, or copies that are written back
             alignment_kernels.align(
                 images.sampled, images.grid, self._map.templates, rows[some], octave[some], warp[some], place,
-                max(first, finest), finest, align.iterations, step, align.min_ncc, aligned, np.empty(len(place)),
+                max(first, finest), finest, ALIGN_ITERATIONS, step, MIN_NCC, aligned, np.empty(len(place)),
             )  # fmt: skip
             if len(parts) > 1:
                 uv[some], found[some] = place, aligned

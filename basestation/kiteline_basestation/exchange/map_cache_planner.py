@@ -28,6 +28,7 @@ _HYSTERESIS = 1.5  # factor on the landmarks in view of a keyframe that is cache
 _POSE_M = 0.002  # m; smaller corrections of a cached keyframe are not sent: half a pixel at 2 m
 _POSE_RAD = 0.0005  # rad; a quarter of a pixel at 500 px of focal length
 _MAX_SCALE_CHANGE = 0.01  # relative change of the agent's unit of length at which keyframes are sent again
+_PERIOD_S = 1.0  # s between two plans
 
 
 @dataclass(slots=True)
@@ -63,13 +64,13 @@ class MapCachePlanner:
 
     def update(self, agent: AgentId, live: LivePose | None, channel: RecordChannel, now_ns: int) -> None:
         """Plan the cache of an agent at `live` once a period, and send the changes over its channel."""
-        cache = self._caches.setdefault(agent, _AgentCache(AgentVelocity(self._config.period_s)))
+        cache = self._caches.setdefault(agent, _AgentCache(AgentVelocity(_PERIOD_S)))
         if not self._config.max_keyframes or live is None or now_ns < cache.due_ns:
             return
         T_w_k = self._map.world_pose(live.keyframe)
         if T_w_k is None or agent not in self._map.cameras:
             return
-        cache.due_ns = now_ns + round(self._config.period_s * 1e9)
+        cache.due_ns = now_ns + round(_PERIOD_S * 1e9)
         T_w_c = se3.orthonormalise(T_w_k @ live.T_k_c)
         submap = submap_of_keyframe(live.keyframe)
         predicted = T_w_c.copy()

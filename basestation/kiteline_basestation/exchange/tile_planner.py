@@ -24,6 +24,9 @@ from kiteline_core.ids import AgentId, SubmapId, agent_of_submap, submap_of_keyf
 
 _KEPT_RATIO = 1.5  # of the option reach_m; tiles farther away are removed
 _SOLID_WEIGHT = 4  # cells added for each one that became an obstacle, or is none any more
+_PERIOD_S = 1.0  # s between two plans
+_NEAR_M = 4.0  # m; added to distances: among near tiles changes decide
+_OVERHEAD_BYTES = 14  # bytes of a tile in a packet: its key, version and a share of headers
 
 
 @dataclass(slots=True)
@@ -63,7 +66,7 @@ class TilePlanner:
 
     def update(self, agent: AgentId, live: LivePose | None, channel: RecordChannel, now_ns: int) -> None:
         """Plan the tiles of an agent at `live` once a period, and send the changes over its channel."""
-        velocity = AgentVelocity(self._config.period_s)
+        velocity = AgentVelocity(_PERIOD_S)
         state = self._agents.setdefault(agent, _AgentTiles(self._config.most_credit_bytes, velocity))
         if not self._config.max_tiles or live is None or now_ns < state.due_ns or self._updates.behind:
             return
@@ -72,7 +75,7 @@ class TilePlanner:
         ground_m = self._updates.ground_below(live.keyframe)
         if S_w_m is None or T_m_k is None or ground_m is None:
             return
-        state.due_ns = now_ns + round(self._config.period_s * 1e9)
+        state.due_ns = now_ns + round(_PERIOD_S * 1e9)
         here = sim3.place(S_w_m, T_m_k @ live.T_k_c)[:3, 3]
         ahead = here + self._config.horizon_s * state.velocity.update(live.t_ns, submap, here)
         keyframes = sum(len(k) for s, k in self._map.submaps.items() if agent_of_submap(s) == agent)
@@ -144,14 +147,14 @@ class TilePlanner:
                 np.count_nonzero(other & ((cells > 0) != (before > 0)))
             )
             if changes >= self._config.min_changes:
-                ranked.append((-changes / (distance + self._config.near_m), place, cells))
+                ranked.append((-changes / (distance + _NEAR_M), place, cells))
             elif held is not None and not changes:
                 held.revision = grid.revision
         for _, place, cells in sorted(ranked, key=lambda item: item[:2]):
             if room <= 0 or state.credit_bytes <= 0.0:
                 return
             record = GridTile(place.column, place.row, place.storey, grid.config.cell_m, cells)
-            state.credit_bytes -= messages.length(record) + self._config.overhead_bytes
+            state.credit_bytes -= messages.length(record) + _OVERHEAD_BYTES
             channel.put(record)
             state.sent[place] = _Sent(cells, grid.revision)
             room -= 1

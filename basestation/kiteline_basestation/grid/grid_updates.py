@@ -20,6 +20,9 @@ from kiteline_core.ids import AgentId, KeyframeId, SubmapId, agent_of_keyframe, 
 
 _MOST_WAITS = 3  # busy steps in a row that leave the drawing to the next one
 _LOOKED = 16  # keyframes looked at for each that one step may draw: most may not have moved
+_SPARSE_LAG = 5  # keyframes after which the landmarks of one without a scan are drawn again: they are refined by then
+_SPARSE_WINDOW = 4  # keyframes before and after it whose landmarks tell where its ground lies
+_GROUND_KEYFRAMES = 20  # newest keyframes among which one must know the height of the ground: 20 s
 
 
 class _Hung(NamedTuple):
@@ -71,8 +74,8 @@ class GridUpdates:
             return
         siblings = self._map.submaps[submap_of_keyframe(keyframe)]
         self._unmade[keyframe] = None
-        if len(siblings) > self._config.sparse_lag:
-            self._unmade[siblings[-1 - self._config.sparse_lag]] = None
+        if len(siblings) > _SPARSE_LAG:
+            self._unmade[siblings[-1 - _SPARSE_LAG]] = None
 
     def rebuild(self) -> None:
         """Draw what moved, after whole submaps may have; what was not drawn before is drawn if it can be now."""
@@ -154,7 +157,7 @@ class GridUpdates:
     def ground_below(self, keyframe: KeyframeId) -> float | None:
         """Height in w of the ground below a keyframe, or below the last one before it with a scan; None without one."""
         siblings = self._map.submaps.get(submap_of_keyframe(keyframe), [])
-        for other in siblings[: bisect_right(siblings, keyframe)][: -1 - self._config.ground_keyframes : -1]:
+        for other in siblings[: bisect_right(siblings, keyframe)][: -1 - _GROUND_KEYFRAMES : -1]:
             S_w_k = self._pose(other)
             if S_w_k is None:
                 continue
@@ -207,7 +210,7 @@ class GridUpdates:
         submap = submap_of_keyframe(keyframe)
         siblings = self._map.submaps[submap]
         at = self._map.number_of(keyframe)
-        near = siblings[max(0, at - self._config.sparse_window) : at + self._config.sparse_window + 1]
+        near = siblings[max(0, at - _SPARSE_WINDOW) : at + _SPARSE_WINDOW + 1]
         seen = self._map.landmarks_of(keyframe)
         around = self._map.sorted_by_id(np.concatenate([self._map.landmarks_of(k) for k in near]))
         xyz, known = self._map.positions(around)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from kiteline_basestation.grid.scan_grid import ScanGrid
+from kiteline_basestation.grid.scan_grid import CellRules, ScanGrid, ViewWeights
 from kiteline_basestation.grid.scan_kernels import SIDE
 from kiteline_basestation.grid.tile_store import Place
 from kiteline_codec.schema import GridTile, messages
@@ -177,13 +177,12 @@ def grid_files(grid: ScanGrid, stem: str = "grid") -> dict[str, bytes]:
 
 def _binary(grid: ScanGrid) -> Callable[[Place], I8]:
     """Cells of a tile, occupied where any scan saw an obstacle, else free where any saw ground (Segfloor, 5.6)."""
-    config = replace(grid.config, hole_neighbours=9, free_from=1, free_clear=1, free_beside=1)
-    hit = grid.redrawn(
-        replace(config, log_free=0, log_free_sure=0, log_free_fair=0, log_free_far=0, occupied_from=1)
-    )  # fmt: skip
+    config, any_view = replace(grid.config, hole_neighbours=9), CellRules(1, 1, 1)
+    hit = grid.redrawn(config, ViewWeights(free=0, free_sure=0, free_far=0), any_view)
     only_seen = (0.0, *config.bands_m[1:])
-    config = replace(config, log_free=1, log_free_sure=1, log_free_fair=1, log_free_far=1)
-    seen = grid.redrawn(replace(config, bands_m=only_seen, log_hit=0, occupied_from=_NEVER))
+    seen = grid.redrawn(
+        replace(config, bands_m=only_seen), ViewWeights(0, 1, 1, 1), any_view._replace(occupied_from=_NEVER)
+    )
 
     def cells_of(place: Place) -> I8:
         occupied = hit.cells(place)[0]

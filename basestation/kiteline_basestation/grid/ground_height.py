@@ -6,25 +6,34 @@ a plane for each patch, fitted to the points near it in narrowing bands (a hard-
 
 import numpy as np
 
-from kiteline_basestation.config import GroundHeightConfig
 from kiteline_basestation.grid import ground_kernels as kernels
 from kiteline_core.arrays import F32, F64, I64, Bool
 
+_CAMERA_ABOVE_M = 0.1  # m; ground points are at least this far below every camera that observes them
+_PATCH_M = 2.0  # m; side of a patch; three by three patches share their points
+_HEIGHT_BIN_M = 0.05  # m; the points of a floor, with stereo noise, fill two or three bins
+_SLOPE = 0.25  # m/m; steepest ground: a ramp, or a map whose z is 10 degrees off the vertical
+_PEAK_SHARE = 0.25  # of the highest peak; the lowest peak with this share is the ground, below it is noise
+_MIN_PEAK_POINTS = 4.0  # points of a peak
+_PLANE_BANDS_M = (0.3, 0.2, 0.12, 0.1)  # m; half-widths around the plane, from a bin's error to noise
+_MIN_PLANE_POINTS = 12.0  # points that a patch needs for a fit of its plane
+_SLOPE_PRIOR_M = 0.3  # m; points with less horizontal spread than this leave the slope near zero
 
-def ground_heights(config: GroundHeightConfig, points: F64, camera_z: F64) -> F64:
+
+def ground_heights(points: F64, camera_z: F64) -> F64:
     """z of the ground at each point (n,). points: (n,3) in w. camera_z: (n,) z of the lowest camera that observes it.
 
     NaN at all points if the histogram of heights below the cameras has no peak.
     """
-    below = points[:, 2] < camera_z - config.camera_above_m
-    patches = _Patches(config.patch_m, points)
-    ground_z = _lowest_peaks(config, patches, points[:, 2], below)
+    below = points[:, 2] < camera_z - _CAMERA_ABOVE_M
+    patches = _Patches(_PATCH_M, points)
+    ground_z = _lowest_peaks(patches, points[:, 2], below)
     if ground_z is None:
         return np.full(len(points), np.nan)
     planes = np.stack([ground_z, np.zeros_like(ground_z), np.zeros_like(ground_z)])
-    for band_m in config.bands_m:
+    for band_m in _PLANE_BANDS_M:
         near = below & (np.abs(points[:, 2] - patches.heights(planes)) < band_m)
-        planes = _fit(config, patches, points[:, 2], near, planes)
+        planes = _fit(patches, points[:, 2], near, planes)
     return patches.heights(planes)
 
 
@@ -69,13 +78,13 @@ class _Patches:
         return out
 
 
-def _lowest_peaks(config: GroundHeightConfig, patches: _Patches, z: F64, below: Bool) -> F64 | None:
+def _lowest_peaks(patches: _Patches, z: F64, below: Bool) -> F64 | None:
     """z (rows, columns) of the lowest peak in every patch; None if there is no peak."""
     if not below.any():
         return None
     bins = 256  # 12.8 m of heights
-    base = float(np.median(z[below])) - bins / 2 * config.height_bin_m
-    b = np.floor((z - base) / config.height_bin_m).astype(np.int64)
+    base = float(np.median(z[below])) - bins / 2 * _HEIGHT_BIN_M
+    b = np.floor((z - base) / _HEIGHT_BIN_M).astype(np.int64)
     keep = below & (b >= 0) & (b < bins)
     shape = (patches.rows, patches.columns, bins)
     sums = np.bincount(patches.flat[keep] * bins + b[keep], minlength=int(np.prod(shape))).reshape(shape)
@@ -83,35 +92,35 @@ def _lowest_peaks(config: GroundHeightConfig, patches: _Patches, z: F64, below: 
     for axis in range(3):
         count = _box3(count, axis)
     counts = count.astype(np.float32)
-    ground_bin = _lowest_peak(counts.sum(axis=(0, 1)), config)
+    ground_bin = _lowest_peak(counts.sum(axis=(0, 1)))
     if ground_bin is None:
         return None
-    reach = max(1, round(config.slope * config.patch_m / config.height_bin_m))
+    reach = max(1, round(_SLOPE * _PATCH_M / _HEIGHT_BIN_M))
     near = counts[:, :, max(0, ground_bin - reach) : ground_bin + reach + 1].sum(axis=2)
     seed = int(np.argmax(near))
-    seed_bin = _lowest_peak(counts[seed // patches.columns, seed % patches.columns], config)
+    seed_bin = _lowest_peak(counts[seed // patches.columns, seed % patches.columns])
     ground = np.zeros((patches.rows, patches.columns), np.int32)
     kernels.spread_ground(
-        counts, seed, ground_bin if seed_bin is None else seed_bin, reach, config.peak_share, config.min_peak_points,
+        counts, seed, ground_bin if seed_bin is None else seed_bin, reach, _PEAK_SHARE, _MIN_PEAK_POINTS,
         ground, np.zeros(ground.size, np.int32),
     )  # fmt: skip
-    return np.asarray(base + (ground.astype(np.float64) + 0.5) * config.height_bin_m)
+    return np.asarray(base + (ground.astype(np.float64) + 0.5) * _HEIGHT_BIN_M)
 
 
-def _fit(config: GroundHeightConfig, patches: _Patches, z: F64, near: Bool, planes: F64) -> F64:
+def _fit(patches: _Patches, z: F64, near: Bool, planes: F64) -> F64:
     """Least-squares planes (3, rows, columns) of the points `near` in every patch, with limited slope."""
     x, y = patches.xy.T
     n = patches.total(near, np.ones_like(x))
-    enough = n >= config.min_plane_points
+    enough = n >= _MIN_PLANE_POINTS
     m = np.maximum(n, 1.0)
     mx, my, mz = (patches.total(near, v) / m for v in (x, y, z))
-    xx, yy = (patches.total(near, u * u) / m - w * w + config.slope_prior_m**2 for u, w in ((x, mx), (y, my)))
+    xx, yy = (patches.total(near, u * u) / m - w * w + _SLOPE_PRIOR_M**2 for u, w in ((x, mx), (y, my)))
     xy, xz, yz = (
         patches.total(near, u * v) / m - w * t for u, v, w, t in ((x, y, mx, my), (x, z, mx, mz), (y, z, my, mz))
     )
     det = xx * yy - xy * xy
-    a = np.clip((xz * yy - yz * xy) / det, -config.slope, config.slope)
-    b = np.clip((yz * xx - xz * xy) / det, -config.slope, config.slope)
+    a = np.clip((xz * yy - yz * xy) / det, -_SLOPE, _SLOPE)
+    b = np.clip((yz * xx - xz * xy) / det, -_SLOPE, _SLOPE)
     cx, cy = patches.centres()
     return np.where(enough, np.stack([mz + a * (cx - mx) + b * (cy - my), a, b]), planes)
 
@@ -126,9 +135,9 @@ def _box3(values: F64, axis: int) -> F64:
     return out
 
 
-def _lowest_peak(count: F32, config: GroundHeightConfig) -> int | None:
+def _lowest_peak(count: F32) -> int | None:
     """The lowest bin that is a peak with enough points and a share of the highest count; None without a peak."""
     after = np.append(count[1:], 0.0)
-    need = max(config.peak_share * float(count.max()), config.min_peak_points)
+    need = max(_PEAK_SHARE * float(count.max()), _MIN_PEAK_POINTS)
     peaks = np.flatnonzero((count >= need) & (count >= after))
     return int(peaks[0]) if len(peaks) else None

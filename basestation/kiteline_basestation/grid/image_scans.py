@@ -164,7 +164,7 @@ class ImageScans:
         """The ground of a record's stretch of flight."""
         key = int(record.keyframe) >> SEQUENCE_BITS + SUBMAP_BITS, record.stretch
         if key not in self._ground:
-            self._ground[key] = GroundHeight(self._config)
+            self._ground[key] = GroundHeight()
             if len(self._ground) > _STRETCHES * max(1, len(self._waiting)):
                 del self._ground[next(iter(self._ground))]
         return self._ground[key]

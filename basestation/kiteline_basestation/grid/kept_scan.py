@@ -18,6 +18,9 @@ _MOST = 65535
 _ANGLE_STEPS = 1 << 16  # codes in 1 rad
 _LATTICE = 4  # positions along a cell's side, and of a scan's farthest end as it turns
 _SCALE_STEPS = 1 << 10
+_FENCE = 1.5  # interquartile ranges above the upper quartile: longer rays to the ground are cut (Segfloor eq. 5.3)
+_ACCURATE_SIGMA_M = 0.05  # m; up to this deviation of a range a view counts in full: a cell by default
+GAP_SIGMAS = 3.0  # standard deviations before an obstacle within which ground is not freed
 
 
 class Lattice(NamedTuple):
@@ -50,7 +53,7 @@ class KeptScan:
 
     def accurate_m(self, config: GridConfig) -> float:
         """Range up to which a view counts in full."""
-        return math.sqrt(config.accurate_sigma_m / self.sigma_per_m2) if self.sigma_per_m2 > 0.0 else config.max_range_m
+        return math.sqrt(_ACCURATE_SIGMA_M / self.sigma_per_m2) if self.sigma_per_m2 > 0.0 else config.max_range_m
 
     def ranges(self) -> F64:
         """Obstacle, bands, free from, free to and clear (5, n), ranges in m; inf without an obstacle."""
@@ -105,7 +108,7 @@ def keep(config: GridConfig, scan: ColumnScan, bf_px_m: float, unit_m: float = 1
 
     bf_px_m: focal length times baseline: ranges are used up to where their deviation passes a limit. 0: it never does.
     unit_m: metres in a unit of the keyframe's submap, as it is known now: the scan is rescaled with its submap.
-    Free ranges are cut at the third quartile and `fence` interquartile ranges (Segfloor, equation 5.3).
+    Free ranges are cut at the third quartile and _FENCE interquartile ranges (Segfloor, equation 5.3).
     """
     if not math.isfinite(scan.camera_height_m):
         return None
@@ -116,14 +119,14 @@ def keep(config: GridConfig, scan: ColumnScan, bf_px_m: float, unit_m: float = 1
     seen = scan.free_m[scan.free_m > 0.0]
     if len(seen):
         q1, q3 = np.quantile(seen, (0.25, 0.75))
-        free_limit_m = min(limit_m, float(q3 + config.fence * (q3 - q1)))
+        free_limit_m = min(limit_m, float(q3 + _FENCE * (q3 - q1)))
     else:
         free_limit_m = 0.0
     solid = (scan.bands > 0) & (scan.obstacle_m <= limit_m)
     stop = np.where(scan.bands > 0, scan.obstacle_m, np.inf)  # nothing is known behind an obstacle, however far it is
     # Before an obstacle that is too far to be drawn, nothing is free within some deviations of its range, either.
     far_m = np.where((scan.bands > 0) & ~solid & np.isfinite(scan.obstacle_m), scan.obstacle_m, np.nan)
-    before = np.fmin(far_m - np.maximum(config.gap_sigmas * sigma_per_m2 * far_m**2, config.cell_m), np.inf)
+    before = np.fmin(far_m - np.maximum(GAP_SIGMAS * sigma_per_m2 * far_m**2, config.cell_m), np.inf)
     free = np.minimum(np.minimum(scan.free_m, free_limit_m), before)
     free = np.where(free > scan.free_from_m, free, 0.0)
     free_from = np.where(free > 0.0, scan.free_from_m, 0.0)

@@ -33,6 +33,10 @@ from kiteline_basestation.grid.tile_store import Place, TileStore
 from kiteline_core.arrays import F64, I8, I16, I32, U16
 
 Name = int | tuple[int, int]
+_MAX_POSITION_M = 100_000.0  # m; scans farther from the origin are not drawn: only a faulty map has them
+_MAX_REACH_M = 100.0  # m; scans that reach farther are not drawn: only a faulty scale makes them
+_VIEW_M = 0.5  # m; scans of an agent whose cameras lie in a square of this side ...
+_VIEW_RAD = 0.39  # rad; ... and head the same way within this, a quarter of the field of view, are one view
 
 
 class _Placed(NamedTuple):
@@ -51,11 +55,30 @@ class _View(NamedTuple):
     heading: int
 
 
+class ViewWeights(NamedTuple):
+    """Log-odds, in 1/32, that one view adds to an obstacle's cells and takes from free ones."""
+
+    hit: int = 12  # of a near view of an obstacle (p = 0.59); in inverse proportion to the range
+    free: int = 6  # of a near view of free space (p = 0.45): half, as an edge is seen beside itself
+    free_sure: int = 4  # the same of a far view well before what it sees
+    free_far: int = 2  # of a far view elsewhere (box and wall may be one surface), and before seen ground
+
+
+class CellRules(NamedTuple):
+    """Log-odds, in 1/32, from which a cell is occupied or free. A band is occupied, a cell is free in all bands."""
+
+    occupied_from: int = 9  # one near view, two far ones
+    free_from: int = 4  # below minus this: one sure view, two far ones
+    free_beside: int = 10  # the same beside an occupied cell: a near view and a sure one, as one may lie a cell off
+
+
 class ScanGrid:
     """Tiles of log-odds, and the scans that are drawn in them, by name."""
 
-    def __init__(self, config: GridConfig) -> None:
+    def __init__(self, config: GridConfig, weights: ViewWeights | None = None, rules: CellRules | None = None) -> None:
         self.config = config
+        self._weights = weights or ViewWeights()
+        self._rules = rules or CellRules()
         self.revision = 0  # number of changes so far
         self.touched: dict[
             Place, int
@@ -90,10 +113,10 @@ class ScanGrid:
         tile or storey, or of a scale that makes it reach too far, is not drawn.
         """
         config = self.config
-        if not np.isfinite(S_w_c).all() or np.abs(S_w_c[:3, 3]).max() > config.max_position_m:
+        if not np.isfinite(S_w_c).all() or np.abs(S_w_c[:3, 3]).max() > _MAX_POSITION_M:
             return self.remove(name)
         new = _Placed(scan.lattice(config, S_w_c), scan, source)
-        if not new.lattice.storeys or scale_of(new.lattice) * scan.reach_m > config.max_reach_m:
+        if not new.lattice.storeys or scale_of(new.lattice) * scan.reach_m > _MAX_REACH_M:
             return self.remove(name)
         if new == self._placed.get(name):
             return False
@@ -132,8 +155,8 @@ class ScanGrid:
 
     def _view(self, placed: _Placed) -> _View:
         config, lattice = self.config, placed.lattice
-        x, y = (floor(v * config.cell_m / config.view_m) for v in position_cells(lattice))
-        heading = floor(placed.scan.heading_rad(config, lattice) / config.view_rad)
+        x, y = (floor(v * config.cell_m / _VIEW_M) for v in position_cells(lattice))
+        heading = floor(placed.scan.heading_rad(config, lattice) / _VIEW_RAD)
         return _View(placed.source, lattice.storeys, x, y, heading)
 
     def storey_of(self, ground_m: float) -> int:
@@ -172,10 +195,7 @@ class ScanGrid:
             slots,
             self._store.pool,
             bands,
-            config.occupied_from,
-            config.free_from,
-            config.free_clear,
-            config.free_beside,
+            *self._rules,
             config.hole_neighbours,
             int(config.opening),
             cells,
@@ -183,9 +203,9 @@ class ScanGrid:
         self._store.close()
         return cells, int(known)
 
-    def redrawn(self, config: GridConfig) -> "ScanGrid":
+    def redrawn(self, config: GridConfig, weights: ViewWeights, rules: CellRules) -> "ScanGrid":
         """The same scans where they lie now, all of them, drawn with other weights and thresholds."""
-        grid = ScanGrid(config)
+        grid = ScanGrid(config, weights, rules)
         for placed in self._placed.values():
             grid._draw(placed, 1)
         return grid
@@ -206,7 +226,7 @@ class ScanGrid:
         self._storeys[lattice.storeys] += sign
         if not self._storeys[lattice.storeys]:
             del self._storeys[lattice.storeys]
-        sectors = sectors_of(config, scan, lattice)
+        sectors = sectors_of(config, scan, lattice, self._weights.hit)
         box = sectors.box()
         rows, columns = box[2] - box[0], box[3] - box[1]
         sectors = sectors._replace(x=sectors.x - SIDE * box[1], y=sectors.y - SIDE * box[0])
@@ -219,8 +239,7 @@ class ScanGrid:
             kernels.draw_free(
                 sectors.x, sectors.y, sectors.first_rad, sectors.step_rad, sectors.begin, sectors.start, sectors.end,
                 sectors.low, sectors.under, sectors.clear, sectors.camera_band, sectors.accurate, sectors.sure,
-                sectors.fair, (config.log_free, config.log_free_sure, config.log_free_fair, config.log_free_far), hits,
-                sign, slots, spare, used,
+                self._weights[1:], hits, sign, slots, spare, used,
                 self._store.pool, touched,
             )  # fmt: skip
             for r, c in np.argwhere(touched).tolist():

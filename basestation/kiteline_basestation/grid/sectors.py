@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from kiteline_basestation.config import GridConfig
-from kiteline_basestation.grid.kept_scan import KeptScan, Lattice, position_cells, scale_of
+from kiteline_basestation.grid.kept_scan import GAP_SIGMAS, KeptScan, Lattice, position_cells, scale_of
 from kiteline_basestation.grid.scan_kernels import BANDS, SIDE
 from kiteline_core.arrays import F64, I64, U8, Bool
 
@@ -13,6 +13,8 @@ _AT_BORDER = 0.1  # of a scan's columns, at least, in which ground is seen from 
 _HIDDEN = 1.25  # times that distance, from which on something hides the ground before
 _STEEPEST = 4.0  # tangent of the angle under which a surface is seen that goes on from column to column
 _MOST = 0.5  # of an inverse range, by which it changes from column to column of one surface, at most
+_SURE_SIGMAS = 2.0  # standard deviations beyond GAP_SIGMAS from which on a far view is well before what it sees
+_OPEN_SIGMAS = 1.0  # the same before a scan's end without an obstacle, which lies two before the last ground
 
 
 class Sectors(NamedTuple):
@@ -21,9 +23,8 @@ class Sectors(NamedTuple):
     obstacle: (n,3) nearest obstacle at the lower edge, in the middle and at the upper edge, inf without. bands: (n,) of
     it; weight: (n,) of a hit. begin, start: (n,) from where rays to the nearest seen ground are low, from where the
     ground was seen. end: (n,3) up to where all bands are free; under: (n,) bands that are free from there up to `low`
-    (n,). clear: (n,) up to where camera_band is free, -1 none. accurate: (n,) up to where a view counts in full; sure,
-    fair: (n,) up to where it frees cells alone, as what it sees is well behind, and up to where it does with no sign of
-    an obstacle near. All three are 0 in columns at the sides of the view.
+    (n,). clear: (n,) up to where camera_band is free, -1 none. accurate, sure: (n,) up to where a view counts in full,
+    and up to where it frees cells alone, as what it sees is well behind; 0 in columns at the sides of the view.
     """
 
     x: float
@@ -42,7 +43,6 @@ class Sectors(NamedTuple):
     camera_band: int
     accurate: F64
     sure: F64
-    fair: F64
 
     def box(self) -> tuple[int, int, int, int]:
         """First row and column, and those after the last, of the tiles around the sectors."""
@@ -58,8 +58,8 @@ class Sectors(NamedTuple):
         )  # fmt: skip
 
 
-def sectors_of(config: GridConfig, scan: KeptScan, lattice: Lattice) -> Sectors:
-    """The sectors of a scan at a pose."""
+def sectors_of(config: GridConfig, scan: KeptScan, lattice: Lattice, hit: int) -> Sectors:
+    """The sectors of a scan at a pose. hit: log-odds of a near view of an obstacle."""
     scale = scale_of(lattice)
     unit, ranges = scale / config.cell_m, scan.ranges()
     bands = ranges[1].astype(np.uint8)
@@ -67,7 +67,7 @@ def sectors_of(config: GridConfig, scan: KeptScan, lattice: Lattice) -> Sectors:
     obstacle = _surfaces(middle, bands, scan.step)
     near_m = np.where(np.isfinite(ranges[0]), ranges[0], 0.0)
     # Cells before an obstacle are free up to some deviations of its range, and at least a cell, before it.
-    gap = np.maximum(1.0, config.gap_sigmas * scan.sigma_per_m2 * near_m**2 * unit)
+    gap = np.maximum(1.0, GAP_SIGMAS * scan.sigma_per_m2 * near_m**2 * unit)
     before = obstacle - gap[:, None]
     under = np.where(bands & 1, 0, 1).astype(np.uint8)  # the floor is seen below what stands higher, a table
     behind = start > middle  # ground that was seen over a low obstacle, which hides what lies before it
@@ -77,24 +77,22 @@ def sectors_of(config: GridConfig, scan: KeptScan, lattice: Lattice) -> Sectors:
     end = np.where((free > 0.0)[:, None], end, 0.0)
     accurate_m = scan.accurate_m(config)
     last_m = np.where(bands > 0, near_m, ranges[3])
-    margin = np.where(bands > 0, config.sure_sigmas, config.open_sigmas)
-    deviation = scan.sigma_per_m2 * last_m**2 * unit
-    sure = np.maximum(end.min(1) - margin * deviation, 0.0)
-    fair = np.maximum(end.min(1) - (margin - config.fair_sigmas) * deviation, 0.0)
-    weight = np.clip(np.rint(config.log_hit * accurate_m / np.maximum(near_m, accurate_m)), 1, 127).astype(np.int64)
+    margin = np.where(bands > 0, _SURE_SIGMAS, _OPEN_SIGMAS)
+    sure = np.maximum(end.min(1) - margin * scan.sigma_per_m2 * last_m**2 * unit, 0.0)
+    weight = np.clip(np.rint(hit * accurate_m / np.maximum(near_m, accurate_m)), 1, 127).astype(np.int64)
     camera_band = int(np.searchsorted(config.bands_m, scan.height_m, side="right")) - 1
     accurate = np.full(scan.columns, accurate_m / config.cell_m)
     begin = _begin(config, scan, start, free, behind)
     # What stands at the image's side is not seen whole, and matching is worst there: such a view frees no cell alone.
     for side in (slice(0, config.side_columns), slice(max(scan.columns - config.side_columns, 0), None)):
-        accurate[side] = sure[side] = fair[side] = 0.0
+        accurate[side] = sure[side] = 0.0
         begin[side] = start[side]
     x, y = position_cells(lattice)
     return Sectors(
         x, y, scan.heading_rad(config, lattice) + scan.first_rad, scan.step, obstacle, bands, weight,
         begin, start, end, np.where(under > 0, free, 0.0), under,
         np.minimum(clear, before.min(1)), camera_band if 0 <= camera_band < BANDS else -1,
-        accurate, sure, fair,
+        accurate, sure,
     )  # fmt: skip
 
 

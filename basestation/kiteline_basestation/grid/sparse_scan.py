@@ -13,11 +13,16 @@ from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ground.column_scan import ColumnScan, level_rotation
 
 UNLABELLED, GROUND, OBSTACLE = 0, 1, 2  # labels of landmarks
+_COLUMNS = 36  # of a scan from landmarks: more would leave gaps between rays
+_FLOOR_POINTS = 20  # nearest landmarks on the ground, whose median is the camera's height
+_DEPTH_M = 0.3  # m; landmarks so far behind the nearest obstacle of a column belong to it
+_FREE_BELOW_M = 0.7  # m; a ray to a landmark frees cells only where it is lower: it passes over boxes and chairs
+_NOISE_PER_M = 0.01  # m/m; height noise of landmarks per distance
 
 
 def label(config: GridConfig, height_m: F64, distance_m: F64) -> U8:
     """Labels (n,) uint8 of points by height above the ground (n,) and distance (n,), both m; NaN: unlabelled."""
-    low = config.bands_m[0] + config.noise_per_m * distance_m
+    low = config.bands_m[0] + _NOISE_PER_M * distance_m
     out = np.zeros(len(height_m), np.uint8)
     out[np.abs(height_m) <= low] = GROUND  # comparisons with NaN are false
     out[(height_m > low) & (height_m <= config.bands_m[-1])] = OBSTACLE
@@ -40,16 +45,16 @@ def sparse_scan(
     if not near.any():
         return None
     ground = np.full(len(local), np.nan)
-    ground[near] = ground_heights(config.ground, local[near], np.zeros(int(near.sum())))
+    ground[near] = ground_heights(local[near], np.zeros(int(near.sum())))
     labels[near] = label(config, (local[:, 2] - ground)[near], distance[near])
     floor = labels == GROUND
     if not floor.any():
         return None
-    nearest = np.argsort(distance + np.where(floor, 0.0, np.inf))[: config.sparse_floor_points]
+    nearest = np.argsort(distance + np.where(floor, 0.0, np.inf))[:_FLOOR_POINTS]
     height = -float(np.median(ground[nearest[floor[nearest]]]))
     if not height > 0.0:
         return None
-    n = config.sparse_columns
+    n = _COLUMNS
     half = float(np.arctan2(0.5 * camera.width, camera.fx))
     step = 2.0 * half / n
     column = np.floor((np.arctan2(local[:, 1], local[:, 0]) + half) / step).astype(np.int64)
@@ -61,14 +66,14 @@ def sparse_scan(
     np.minimum.at(obstacle, column[solid], distance[solid])
     bands = np.zeros(n, np.uint8)
     band = np.searchsorted(config.bands_m[1:-1], above, side="right").astype(np.uint8)
-    front = solid & (distance <= obstacle[column] + config.sparse_depth_m)
+    front = solid & (distance <= obstacle[column] + _DEPTH_M)
     np.bitwise_or.at(bands, column[front], np.uint8(1) << band[front])
-    # A ray frees the cells over which it is lower than `free_below_m`.
+    # A ray frees the cells over which it is lower than _FREE_BELOW_M.
     drop = np.maximum(height - np.where(solid, above, 0.0), 1e-6)
     start = np.where(
-        solid & (above >= config.free_below_m),
+        solid & (above >= _FREE_BELOW_M),
         distance,
-        distance * np.clip((height - config.free_below_m) / drop, 0.0, 1.0),
+        distance * np.clip((height - _FREE_BELOW_M) / drop, 0.0, 1.0),
     )
     free, free_from = np.zeros(n), np.full(n, np.inf)
     np.maximum.at(free, column, np.where(start < distance, distance, 0.0))

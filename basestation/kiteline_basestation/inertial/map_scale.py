@@ -31,6 +31,10 @@ _BIAS_WALK = (
     0.03  # m/s^2 per sqrt(s); slow errors of the accelerometer: axes, vibration, temperature, as true poses show them
 )
 _AGENT_SIGMA = 0.03  # relative deviation of the agent's scale
+_ITERATIONS = 5  # of Gauss-Newton
+_GRAVITY_M_S2 = 9.81  # m/s^2; differs by 0.3 % over the earth, which the accelerometer bias absorbs
+_FLOOR_M = 3e-5  # m; of a step by the IMU: the code's quanta
+_IMAGE_RAD = 5e-4  # rad; error of a step by images, over the distance of what they see
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +90,7 @@ def map_scale(
     drift = drift_along(segments, path, T_w_c, shared, config)
     state, weight = _start(path, drift, config), np.ones(len(path.begin))
     agent_units = told_units(segments, T_w_c)
-    for _ in range(config.iterations):
+    for _ in range(_ITERATIONS):
         J, e, chi2 = _linearised(path, drift, state, weight, config)
         solved = _solve(path, drift, state, J, e, agent_units, config)
         if solved is None:
@@ -114,7 +118,7 @@ def _start(path: MapPath, drift: ScaleDrift, config: InertialScaleConfig) -> _St
     first = a[path.fresh[a]]
     velocity[first] = velocity[first + 1]
     force = np.einsum("nij,nj->i", path.R_w_b[a], path.velocity) - (velocity[a + 1] - velocity[a]).sum(axis=0)
-    gravity = -config.gravity_m_s2 * force / max(float(np.linalg.norm(force)), 1e-9)
+    gravity = -_GRAVITY_M_S2 * force / max(float(np.linalg.norm(force)), 1e-9)
     return _State(np.concatenate([place, velocity, np.zeros_like(place)], axis=1), gravity, np.ones(len(drift.mean)))
 
 
@@ -158,13 +162,13 @@ def _linearised(
     # whitening: L L^T = inverse covariance of [velocity, position] by white noise
     density = _NOISE_INFLATION * path.noise
     v, vp, p = density**2 * dt, 0.5 * density**2 * dt**2, density**2 * dt**3 / 3.0
-    v, p = v + _FLOOR_M_S**2, p + config.floor_m**2
+    v, p = v + _FLOOR_M_S**2, p + _FLOOR_M**2
     by_p = 1.0 / np.sqrt(p - vp**2 / v)
     position = by_p[:, None] * (e[:, 3:6] - (vp / v)[:, None] * e[:, :3])
     e[:, :3], e[:, 3:6] = e[:, :3] / np.sqrt(v)[:, None], position
     position_J = by_p[:, None, None] * (J[:, 3:6] - (vp / v)[:, None, None] * J[:, :3])
     J[:, :3], J[:, 3:6] = J[:, :3] / np.sqrt(v)[:, None, None], position_J
-    image = 1.0 / np.hypot(config.image_rad * path.depth_m, _IMAGE_M)
+    image = 1.0 / np.hypot(_IMAGE_RAD * path.depth_m, _IMAGE_M)
     chi2 = np.square(image[:, None] * e[:, 6:9]).sum(axis=1)
     walk = 1.0 / (_BIAS_WALK * np.sqrt(dt))
     for rows, factor in ((slice(6, 9), image * np.sqrt(weight)), (slice(9, 12), walk)):
@@ -213,6 +217,6 @@ def _solve(
     if not (np.isfinite(x).all() and np.isfinite(cov).all() and variance > 0.0):
         return None
     gravity = state.gravity + _tangent(state.gravity) @ step[:2]
-    gravity *= config.gravity_m_s2 / float(np.linalg.norm(gravity))
+    gravity *= _GRAVITY_M_S2 / float(np.linalg.norm(gravity))
     moved = _State(state.node + x.reshape(k, _NODE), gravity, state.units + step[2:])
     return moved, variance

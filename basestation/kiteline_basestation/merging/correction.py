@@ -27,6 +27,8 @@ _SIGMA_SCALE = 0.003  # of the logarithm of the scale between neighbours in a mo
 _LOOP_SIGMA_SCALE = 0.01  # of the logarithm of the scale of a loop edge
 _LOOP_SIGMA_DEPTH = 0.005  # of a loop edge: added share of the median depth
 _LOOP_SIGMA_RAD = 0.003  # rad; of a loop edge
+_SIGMA_M = 0.005  # m; standard deviation of an edge between neighbours
+_SIGMA_RAD = 0.003  # rad; of an edge between neighbours
 
 
 def keyframes_of(sparse_map: SparseMap, map_id: SubmapId) -> list[KeyframeId]:
@@ -54,13 +56,13 @@ def essential_graph_of(
     edges = np.unique(np.concatenate([tree, sparse_map.covisible_pairs(rows, _MIN_SHARED)]), axis=0)
     between = np.linalg.inv(poses[edges[:, 0]]) @ poses[edges[:, 1]]
     length = np.linalg.norm(between[:, :3, 3], axis=1)
-    sigma = np.column_stack([config.sigma_m + _SIGMA_PATH * length, np.full(len(edges), config.sigma_rad)])
+    sigma = np.column_stack([_SIGMA_M + _SIGMA_PATH * length, np.full(len(edges), _SIGMA_RAD)])
     inside = [e for e in loops if e.old in number and e.new in number]
     loop_edges = [graph_edge_of(sparse_map, e) for e in inside]
     loop_pairs = np.array([[number[e.old], number[e.new]] for e in inside], np.int64).reshape(-1, 2)
     measured = np.array([T for T, _ in loop_edges]).reshape(-1, 4, 4)
     loop_sigma = np.array(
-        [[config.sigma_m + _LOOP_SIGMA_DEPTH * depth_of(sparse_map, e), _LOOP_SIGMA_RAD] for e in inside]
+        [[_SIGMA_M + _LOOP_SIGMA_DEPTH * depth_of(sparse_map, e), _LOOP_SIGMA_RAD] for e in inside]
     ).reshape(-1, 2)  # fmt: skip
     held = np.zeros(len(keyframes), np.bool_)
     held[number[KeyframeId(sparse_map.submaps[sparse_map.map_id(map_id)][0])]] = True

@@ -21,6 +21,9 @@ from kiteline_basestation.refinement.odometry_factors import with_odometry_facto
 from kiteline_core.ids import AgentId, SubmapId
 
 _RETRY_GROWTH = 1.1  # growth of the map after which an insignificant offset is estimated again
+_FIRST_FULL = 3  # keyframes of a map at its first full bundle: a worn rig is seen in it
+_ROBUST_TRIALS = 6  # trial steps of a full bundle before the outlier test
+_FINAL_TRIALS = 6  # trial steps of a full bundle after the outlier test
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,7 +163,7 @@ class CorrectionJobs:
             if window is not None:
                 bundle = self._with_calibration(FullBundle(map_id, window, (), part=part))
                 problem = with_odometry_factors(self._map, bundle.window, self._config.odometry_factors)
-                trials = self._config.graph.robust_trials, self._config.graph.final_trials
+                trials = _ROBUST_TRIALS, _FINAL_TRIALS
                 solver = replace(self._config.bundle, robust_trials=trials[0], final_trials=trials[1])
                 chain = segments_of(self._map, bundle.window.rows, bundle.window.problem) if self.fits(map_id) else ()
                 chain = chain if tells_scale(chain) else ()
@@ -189,7 +192,7 @@ class CorrectionJobs:
         sizes: dict[Part, int] = {}
         for map_id, submaps in maps.items():
             count = sum(len(self._map.submaps[s]) for s in submaps)
-            if self._config.graph.first_full <= count <= self._config.graph.max_full:
+            if _FIRST_FULL <= count <= self._config.graph.max_full:
                 sizes[map_id, 0] = count + sum(self._map.keypoints_of.get(s, 0) for s in submaps)
             elif count > self._config.graph.max_full:
                 sizes |= {(s, part): size for s in submaps for part, size in enumerate(self._sizes_of_parts(s))}

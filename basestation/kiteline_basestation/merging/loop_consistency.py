@@ -23,9 +23,16 @@ _FUSE_RAD = 0.005  # rad; the same of rotations
 _FUSE_SCALE = 0.005  # the same of the logarithm of a scale
 _OFF_PLANE = 0.03  # of the median depth; landmarks farther from the common plane lie off it
 _MIN_OFF_PLANE = 0.15  # share of landmarks off the plane to merge maps: a wallpaper has copies
+_TILT_RAD = 0.05  # rad; by which gravity of two maps may differ that are merged: cameras on worn mounts
+MONOCULAR_DRIFT_PATH = 0.05  # share of the path instead of drift_path if the scale drifts too
+_AGREE_M = 0.10  # m; between two corrections that agree
+_AGREE_DEPTH = 0.04  # added share of the median depth
+_AGREE_PATH = 0.02  # added share of the path between the two keyframes
+_AGREE_RAD = 0.05  # rad; between two corrections that agree
+_AGREE_SCALE = 0.05  # difference of the logarithms of two scales that agree
 
 
-def agreeing(sparse_map: SparseMap, matches: Sequence[LoopMatch], config: LoopConfig) -> list[LoopMatch]:
+def agreeing(sparse_map: SparseMap, matches: Sequence[LoopMatch]) -> list[LoopMatch]:
     """Matches that imply the same correction as the last one, up to the drift between their keyframes."""
     table, rows = sparse_map.keyframes, sparse_map.rows
     new, old = (np.array([rows[k] for k in ks]) for ks in ([m.new for m in matches], [m.old for m in matches]))
@@ -48,10 +55,10 @@ def agreeing(sparse_map: SparseMap, matches: Sequence[LoopMatch], config: LoopCo
     apart = np.linalg.norm(there - there[-1], axis=1)
     path = np.where(same, np.linalg.norm(at_new - at, axis=1), 0.0)
     depth = np.array([m.depth_m for m in matches]) * table.scale[old]
-    limit = config.agree_m + config.agree_depth * np.maximum(depth, depth[-1]) + config.agree_path * path
+    limit = _AGREE_M + _AGREE_DEPTH * np.maximum(depth, depth[-1]) + _AGREE_PATH * path
     chord = np.linalg.norm(R - R[-1], axis=(1, 2)) / np.sqrt(8.0)
     turn = 2.0 * np.arcsin(np.minimum(chord, 1.0))
-    fits = (apart <= limit) & (turn <= config.agree_rad) & (np.abs(np.log(scale / scale[-1])) <= config.agree_scale)
+    fits = (apart <= limit) & (turn <= _AGREE_RAD) & (np.abs(np.log(scale / scale[-1])) <= _AGREE_SCALE)
     return [match for match, fit in zip(matches, fits.tolist()) if fit]
 
 
@@ -66,9 +73,7 @@ def within_drift(sparse_map: SparseMap, edge: LoopEdge, config: LoopConfig, time
     path = path_length(sparse_map, edge.old, edge.new)
     share = config.drift_path
     if any(sparse_map.is_up_to_scale(submap_of_keyframe(k)) for k in (edge.new, edge.old)):
-        share = config.monocular_drift_path + abs(
-            float(np.log(sim3.scale_of(X)))
-        )  # scale drift displaces the end of the path
+        share = MONOCULAR_DRIFT_PATH + abs(float(np.log(sim3.scale_of(X))))  # scale drift displaces the end of the path
     moved = float(np.linalg.norm(se3.transform(X, pose[None, :3, 3])[0] - pose[:3, 3]))
     return (
         moved <= times * (config.drift_m + share * path)
@@ -81,23 +86,23 @@ def exceeds_expected_drift(sparse_map: SparseMap, matches: Sequence[LoopMatch], 
     """True if matches in one submap that agree are so many, and so independent, that drift was larger than expected."""
     strong = [m for m in matches if m.inliers >= config.min_inliers_loop]
     keyframes = sorted({m.new for m in strong})
-    if len(keyframes) < config.drift_votes or len({m.old for m in strong}) < config.drift_votes // 2:
+    if len(keyframes) < config.drift_matches or len({m.old for m in strong}) < config.drift_matches // 2:
         return False
     positions = sparse_map.keyframes.T_w_k[[sparse_map.rows[k] for k in keyframes], :3, 3]
     apart = float(np.linalg.norm(positions - positions[0], axis=1).max())  # a path to and fro shows one thing often
     return (
         apart >= _DRIFT_APART * depth_of(sparse_map, strong[-1])
         and within_drift(sparse_map, strong[-1], config, config.most_drift)
-        and keeps_level(sparse_map, strong[-1], config)
+        and keeps_level(sparse_map, strong[-1])
         and has_depth_relief(sparse_map, strong, config)
     )
 
 
-def keeps_level(sparse_map: SparseMap, edge: LoopEdge, config: LoopConfig) -> bool:
+def keeps_level(sparse_map: SparseMap, edge: LoopEdge) -> bool:
     """False if the correction would tilt one map against the other, as far as both agents know gravity."""
     new, old = submap_of_keyframe(edge.new), submap_of_keyframe(edge.old)
     found = tilt_between(sparse_map, new, old, correction_of(sparse_map, edge))
-    return found is None or found[0] <= config.tilt_rad + _TILT_DEVIATIONS * found[1]
+    return found is None or found[0] <= _TILT_RAD + _TILT_DEVIATIONS * found[1]
 
 
 def is_fusible(sparse_map: SparseMap, edge: LoopEdge) -> bool:

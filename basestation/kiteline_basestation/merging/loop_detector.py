@@ -15,6 +15,7 @@ from kiteline_basestation.config import LoopConfig
 from kiteline_basestation.exchange.sharing import SharingPolicy
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.merging import loop_consistency as consistency
+from kiteline_basestation.merging.loop_consistency import MONOCULAR_DRIFT_PATH
 from kiteline_basestation.merging.loop_edges import LoopMatch, correction_of, rescaled, slot_pairs
 from kiteline_basestation.merging.loop_verification import (
     KeyframeObservations,
@@ -39,6 +40,7 @@ _MIN_NEIGHBOUR_RATIO = 0.03  # in one map, of the similarity to the previous key
 _MIN_KEYFRAMES = 3  # keyframes that agree on a correction
 _RECENT_KEYFRAMES = 24  # keyframes of a submap within which matches are counted together
 _AMBIGUOUS_M = 1.0  # m; similar places of one map that lie farther apart make it ambiguous
+_AGAINST = 3  # agreeing keyframes needed more for each one that contradicts
 
 
 @dataclass(frozen=True, slots=True)
@@ -229,10 +231,10 @@ class LoopDetector:
         matches.append(match)
         self._matches[key] = matches
         same_map = self._map.map_id(new) == self._map.map_id(old)
-        if not same_map and not consistency.keeps_level(self._map, match, config):
+        if not same_map and not consistency.keeps_level(self._map, match):
             self.refused += 1
             return None
-        chosen = consistency.agreeing(self._map, matches, config)
+        chosen = consistency.agreeing(self._map, matches)
         supporters = {m.new for m in chosen}
         best = max(chosen, key=lambda m: (m.inliers, m.new))
         if same_map and not consistency.within_drift(self._map, match, config):
@@ -248,7 +250,7 @@ class LoopDetector:
         if same_map and match.inliers < config.min_inliers_loop:
             return None
         against = {m.new for m in matches} - supporters
-        needed = _MIN_KEYFRAMES * (1 + 2 * self._contradicted.get(key, 0)) + config.against * len(against)
+        needed = _MIN_KEYFRAMES * (1 + 2 * self._contradicted.get(key, 0)) + _AGAINST * len(against)
         if _pair(self._map.map_id(new), self._map.map_id(old)) in self.requested:
             needed = 1
         enough = len(supporters) >= needed if same_map else _is_supported(chosen, needed)
@@ -314,11 +316,7 @@ class LoopDetector:
         assert T is not None
         observations = observations_of(sparse_map, keyframe)
         map_id = sparse_map.map_id(submap_of_keyframe(keyframe))
-        share = (
-            config.monocular_drift_path
-            if sparse_map.is_up_to_scale(submap_of_keyframe(keyframe))
-            else config.drift_path
-        )
+        share = MONOCULAR_DRIFT_PATH if sparse_map.is_up_to_scale(submap_of_keyframe(keyframe)) else config.drift_path
         tried = 0
         places = self._index.query(observations.descriptor, {keyframe}, _QUERIED * config.candidates)
         for key in places.keys.tolist():

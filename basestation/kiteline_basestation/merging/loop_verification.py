@@ -33,6 +33,10 @@ _SCALE_SPREAD = 0.2  # of the logarithm of depth ratios; ratios within it agree
 _SCALE_SHARE = 0.7  # of the depth ratios that must agree: two different objects fix no scale
 _CELL_INLIERS = 2  # inliers that fill a cell
 _MIN_CELLS = 8  # filled cells, of 24
+_SIGMA_DISPARITY_PX = 0.4  # px; standard deviation of the disparities behind the landmarks' depths
+_MIN_INLIERS_ACROSS = 13  # landmarks of two maps that agree before guided matching: by chance up to 10
+MAX_NEIGHBOURS = 8  # covisible keyframes whose landmarks are matched too
+_SCALE_SIGMA = 0.02  # standard error of the scale's logarithm: the bundle corrects a few percent
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,19 +113,18 @@ def verify_loop(
     """
     mine = observations_of(sparse_map, new) if view is None else view
     across = sparse_map.map_id(submap_of_keyframe(new)) != sparse_map.map_id(submap_of_keyframe(old))
-    theirs = local_landmarks(sparse_map, old, config.max_neighbours if across else 0)
-    if not across:  # loops in one map wait for near views, which correct it best
-        config = replace(config, min_inliers_local=config.min_inliers)
+    theirs = local_landmarks(sparse_map, old, MAX_NEIGHBOURS if across else 0)
+    enough = _MIN_INLIERS_ACROSS if across else config.min_inliers  # one map waits for near views: they correct best
     wanted, offered = comparable(mine.descriptor, theirs.descriptor)
-    pairs = matching.match(wanted, mine.angle, offered, theirs.angle, config.match)
+    pairs = matching.match(wanted, mine.angle, offered, theirs.angle)
     a, b = pairs.a, pairs.b
     free = any(sparse_map.is_up_to_scale(submap_of_keyframe(k)) for k in (new, old))
     if free:
         mine = replace(mine, disparity=np.full(len(mine.uv), -1.0))  # in another unit than the old map
     start = None
-    if len(a) >= config.min_inliers_local:
-        start = _solve_similarity(sparse_map, new, old, mine, theirs, a, b, config) if free else None
-        start = start or _solve_pnp(sparse_map, new, old, mine, theirs, a, b, config)
+    if len(a) >= enough:
+        start = _solve_similarity(sparse_map, new, old, mine, theirs, a, b, enough) if free else None
+        start = start or _solve_pnp(sparse_map, new, old, mine, theirs, a, b, enough)
     start = start or guess
     if start is None:
         return None
@@ -163,14 +166,14 @@ def guessed_pose(sparse_map: SparseMap, correction: F64, keyframe: KeyframeId) -
 
 def _solve_pnp(
     sparse_map: SparseMap, new: KeyframeId, old: KeyframeId, mine: KeyframeObservations,
-    theirs: LocalLandmarks, a: I32, b: I32, config: LoopConfig,
+    theirs: LocalLandmarks, a: I32, b: I32, enough: int,
 ) -> tuple[F64, float] | None:  # fmt: skip
     """T_c_w (4,4) of the new camera in the old map by RANSAC PnP, and a rough scale of the old over the new map."""
-    rays = _depth_rays(sparse_map, theirs.points, theirs.xyz, config)
+    rays = _depth_rays(sparse_map, theirs.points, theirs.xyz)
     observed = np.column_stack([mine.uv, mine.disparity])
     camera = sparse_map.keyframes.camera[sparse_map.rows[new]].copy()
-    fit = pnp.solve_pnp(theirs.xyz[b], rays[b], observed[a], mine.octave[a], camera, _seed(new, old), config.ransac)
-    if fit is None or fit.inliers < config.min_inliers_local:
+    fit = pnp.solve_pnp(theirs.xyz[b], rays[b], observed[a], mine.octave[a], camera, _seed(new, old))
+    if fit is None or fit.inliers < enough:
         return None
     a, b = a[fit.inlier], b[fit.inlier]
     other = se3.transform(fit.T_c_m, theirs.xyz[b])[mine.known[a], 2]
@@ -180,7 +183,7 @@ def _solve_pnp(
 
 def _solve_similarity(
     sparse_map: SparseMap, new: KeyframeId, old: KeyframeId, mine: KeyframeObservations,
-    theirs: LocalLandmarks, a: I32, b: I32, config: LoopConfig,
+    theirs: LocalLandmarks, a: I32, b: I32, enough: int,
 ) -> tuple[F64, float] | None:  # fmt: skip
     """T_c_w (4,4) of the new camera in the old map, and the scale of the old over the new map.
 
@@ -192,16 +195,16 @@ def _solve_similarity(
     in_old = se3.transform(se3.inverse(T_old), theirs.xyz)
     both = mine.known[a] & (in_old[b, 2] > _NEAREST_M)
     a, b = a[both], b[both]
-    if len(a) < config.min_inliers_local:
+    if len(a) < enough:
         return None
     in_old = in_old[b]
     uv_old = in_old[:, :2] / in_old[:, 2:] * lens_old[:2] + lens_old[2:4]  # where `old` sees them, or would
     fit = align_views(
         in_old, uv_old, sparse_map.keypoints.octave[theirs.points[b]], lens_old,
         se3.transform(se3.inverse(T_new), mine.xyz[a]), mine.uv[a], mine.octave[a], lens_new,
-        with_scale=True, seed=_seed(new, old), config=config.ransac,
+        with_scale=True, seed=_seed(new, old),
     )  # fmt: skip
-    if fit is None or fit.inliers < config.min_inliers_local or not np.isfinite(fit.S_a_b).all():
+    if fit is None or fit.inliers < enough or not np.isfinite(fit.S_a_b).all():
         return None
     return se3.inverse(se3.orthonormalise(T_old @ sim3.rigid(fit.S_a_b))), fit.scale
 
@@ -234,7 +237,7 @@ def depth_scale(own: F64, other: F64, config: LoopConfig) -> float | None:
     apart = np.abs(ratio - middle)
     close = apart < _SCALE_SPREAD
     sigma = 1.2533 * 1.4826 * float(np.median(apart)) / np.sqrt(len(ratio))  # standard error of a median
-    if float(np.mean(close)) < _SCALE_SHARE or sigma > config.scale_sigma:
+    if float(np.mean(close)) < _SCALE_SHARE or sigma > _SCALE_SIGMA:
         return None
     return float(np.exp(middle))
 
@@ -270,7 +273,7 @@ def _match_neighbours(
     scale: of the old over the new map. Returns the pose, rows of `mine` and landmark slots (k,) that agree, and their
     share of the landmarks expected in view.
     """
-    around = [old, *sparse_map.covisible_keyframes(old, 1)[: config.max_neighbours]]
+    around = [old, *sparse_map.covisible_keyframes(old, 1)[:MAX_NEIGHBOURS]]
     points = sparse_map.sorted_by_id(np.concatenate([sparse_map.landmarks_of(k) for k in around]))
     _, known = sparse_map.positions(points)
     points = points[known & is_described(sparse_map.keypoints.descriptor[points])]
@@ -284,7 +287,7 @@ def _match_neighbours(
         wanted, offered = comparable(sparse_map.keypoints.descriptor[seen], mine.descriptor)
         near = matching.match_near(
             uv, radius * np.exp2(np.clip(octave, 0.0, 4.0)), octave, wanted, mine.uv, mine.octave,
-            offered, (size.width, size.height), _OCTAVE_GAP, config.match,
+            offered, (size.width, size.height), _OCTAVE_GAP,
         )  # fmt: skip
         if len(near.a) < config.min_inliers:
             return None
@@ -292,10 +295,10 @@ def _match_neighbours(
         xyz, _ = sparse_map.positions(b)
         inlier = np.ones(len(a), np.bool_)
         T = T.copy()
-        sigma = config.ransac.sigma_px * np.ldexp(1.0, mine.octave[a].astype(np.int32))
+        sigma = pnp.CORNER_SIGMA_PX * np.ldexp(1.0, mine.octave[a].astype(np.int32))
         optimise_pose(
-            T, xyz, _depth_rays(sparse_map, b, xyz, config), np.ascontiguousarray(observed[a]), sigma, camera, 3, 5,
-            config.ransac.chi2, inlier,
+            T, xyz, _depth_rays(sparse_map, b, xyz), np.ascontiguousarray(observed[a]), sigma, camera, 3, 5,
+            pnp.PIXEL_CHI2, inlier,
         )  # fmt: skip
         if not np.isfinite(T).all():
             return None
@@ -328,7 +331,7 @@ def _expected_in_view(
     return int(np.count_nonzero(inside))
 
 
-def _depth_rays(sparse_map: SparseMap, points: I32, xyz: F64, config: LoopConfig) -> F64:
+def _depth_rays(sparse_map: SparseMap, points: I32, xyz: F64) -> F64:
     """One standard deviation (n,3) m of landmarks along their viewing rays."""
     rows = sparse_map.keypoints.row[points]
     pose = sparse_map.keyframes.T_w_k[rows]
@@ -336,4 +339,4 @@ def _depth_rays(sparse_map: SparseMap, points: I32, xyz: F64, config: LoopConfig
     depth = np.maximum(np.einsum("ni,ni->n", pose[:, :3, 2], ray), 1e-3)
     bf = np.maximum(sparse_map.keyframes.camera[rows, 4], 1.0)
     own = depth / sparse_map.keyframes.scale[rows]
-    return np.ascontiguousarray(ray * (config.sigma_disparity_px * own / bf)[:, None])
+    return np.ascontiguousarray(ray * (_SIGMA_DISPARITY_PX * own / bf)[:, None])

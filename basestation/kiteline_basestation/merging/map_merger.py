@@ -28,10 +28,12 @@ from kiteline_basestation.merging.loop_detector import (
     known_matches,
 )
 from kiteline_basestation.merging.loop_edges import LoopEdge, LoopMatch, rescaled, slot_pairs
+from kiteline_basestation.merging.loop_verification import MAX_NEIGHBOURS
 from kiteline_basestation.merging.merges import NOTHING, MapMerge, MergeResult, is_contradicted
 from kiteline_basestation.refinement import disparity_calibration as disparity
 from kiteline_basestation.refinement import landmark_matching
 from kiteline_basestation.refinement.apply_bundle import apply_bundle, keep_scales
+from kiteline_basestation.refinement.bundle_window import MIN_SHARED
 from kiteline_basestation.refinement.odometry_factors import without_odometry_factors
 from kiteline_codec.schema import FusedLandmarks
 from kiteline_core.arrays import F64
@@ -362,8 +364,8 @@ class MapMerger:
             self.merges[-1].fused = np.concatenate([self.merges[-1].fused, ids])
         seen: set[KeyframeId] = set()
         for match in matches:
-            around = self._map.covisible_keyframes(match.new, self._config.bundle_window.min_shared)
-            for keyframe in [match.new, *around[: self._config.loops.max_neighbours]]:
+            around = self._map.covisible_keyframes(match.new, MIN_SHARED)
+            for keyframe in [match.new, *around[:MAX_NEIGHBOURS]]:
                 if keyframe not in seen:
                     seen.add(keyframe)
                     landmark_matching.match_landmarks(

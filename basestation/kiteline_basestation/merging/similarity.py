@@ -6,7 +6,7 @@ import numpy as np
 
 from kiteline_basestation.merging import similarity_kernels
 from kiteline_core.arrays import F64, U8, Bool
-from kiteline_core.pose.pnp import RansacConfig, generator_state
+from kiteline_core.pose.pnp import RANSAC_CONFIDENCE, RANSAC_DRAWS, RANSAC_LIMIT_PX, generator_state
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,21 +30,20 @@ def align_points(a: F64, b: F64, with_scale: bool = False) -> F64 | None:
 def align_views(
     a: F64, uv_a: F64, octave_a: U8, camera_a: F64,
     b: F64, uv_b: F64, octave_b: U8, camera_b: F64,
-    *, with_scale: bool, seed: int, config: RansacConfig | None = None,
+    *, with_scale: bool, seed: int,
 ) -> SimilarityFit | None:  # fmt: skip
     """Similarity between two cameras from common points: three-point RANSAC, with inliers counted in both images.
 
     a, b: (n,3) m of each pair in either camera. uv: (n,2) px. octave: (n,). camera: fx, fy, cx, cy first. with_scale:
     False fixes the scale at 1 (stereo, RGB-D). None without enough inliers.
     """
-    config = config or RansacConfig()
     if len(a) < 4:
         return None
     S, inlier = np.eye(4), np.zeros(len(a), np.bool_)
-    limit_a = config.limit_px * np.ldexp(1.0, octave_a.astype(np.int32))
-    limit_b = config.limit_px * np.ldexp(1.0, octave_b.astype(np.int32))
+    limit_a = RANSAC_LIMIT_PX * np.ldexp(1.0, octave_a.astype(np.int32))
+    limit_b = RANSAC_LIMIT_PX * np.ldexp(1.0, octave_b.astype(np.int32))
     count = similarity_kernels.align_ransac(
-        a, uv_a, limit_a, camera_a, b, uv_b, limit_b, camera_b, with_scale, config.draws, config.confidence,
+        a, uv_a, limit_a, camera_a, b, uv_b, limit_b, camera_b, with_scale, RANSAC_DRAWS, RANSAC_CONFIDENCE,
         generator_state(seed), S, inlier,
     )  # fmt: skip
     if count < 4:

@@ -18,6 +18,7 @@ _SIGMA_CALIBRATED_PX = 0.2  # px at octave 0; of a disparity once the agent's di
 _SIGMA_FUSED_PX = 0.6  # px at octave 0; of a new landmark that was fused: two detections of one corner
 _SIGMA_FUSED_GROWTH = 2.0  # factor per octave; corners are detected to a fraction of the octave's pixels
 _MIN_LANDMARKS = 20  # landmarks of a bundle: fewer do not constrain the poses
+MIN_SHARED = 12  # landmarks that two covisible keyframes share
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +33,7 @@ class BundleWindow:
 
 def local_keyframes(sparse_map: SparseMap, keyframe: KeyframeId, config: BundleWindowConfig) -> list[KeyframeId]:
     """A keyframe and its most covisible ones, which a local bundle around it adjusts."""
-    free = [keyframe, *sparse_map.covisible_keyframes(keyframe, config.min_shared)[: config.max_free - 1]]
+    free = [keyframe, *sparse_map.covisible_keyframes(keyframe, MIN_SHARED)[: config.max_free - 1]]
     parent = keyframe
     while len(free) < config.max_free // 2:  # few shared landmarks: add ancestors
         parent = KeyframeId(int(sparse_map.keyframes.parent[sparse_map.rows[parent]]))

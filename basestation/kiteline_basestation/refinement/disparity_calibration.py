@@ -11,15 +11,18 @@ import numpy as np
 from kiteline_basestation.config import DisparityCalibrationConfig
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_core.arrays import F64, I32, I64
-from kiteline_core.geometry.disparity_offset import TERMS, none, terms
+from kiteline_core.geometry.disparity_offset import GOOD_PX, TERMS, none, terms
 from kiteline_core.ids import BOOT_BITS, SEQUENCE_BITS, SUBMAP_BITS, AgentId
 from kiteline_core.optimisation.bundle import Border, BundleProblem, BundleResult
 
-_PRIOR_PX = 0.1  # px; standard deviation of a constant offset: the accuracy of calibrations
 _PRIOR_RAD = 3e-4  # rad; of the right camera's rotation (times the focal length: px where x or y is 1)
 _KNOWN_FROM = 2.0  # prior deviations, rms; from which the offset of earlier flights is that of a worn rig
 _USUAL_ROWS_PX = 0.25  # px; by which rows are off in good calibrations: more, and the motion does not matter
 _MIN_SIGNIFICANCE = 0.5  # standard deviations; from which an offset is accepted: by chance 1 in 20
+_TAIL = 6.0  # standard deviations, inflated: beyond two of the prior's own it yields to the data
+_DETERMINED = 0.7  # share of the prior's deviation; a term yields that data alone determine better
+CALIBRATED_PX = 0.03  # px; standard deviation of the offset below which it counts as known
+_WORN = 15.0  # factor on both deviations for a rig that has changed since its calibration: one or two pixels
 
 
 def at_keypoints(sparse_map: SparseMap, slots: I32) -> F64:
@@ -61,17 +64,17 @@ def with_border(
     prior = _prior_px(focal)
     onboard = [sparse_map.onboard_sigma_px.get(a) for a in agents]
     tells = sideways_share(problem.T_c_m) >= config.min_sideways
-    worn = prior * config.worn  # where forward motion told an agent no more than that its rig is worn
+    worn = prior * _WORN  # where forward motion told an agent no more than that its rig is worn
     sigma = np.stack([
-        prior if s is None else worn if s > _PRIOR_PX and not tells else np.full(TERMS, s) for s in onboard
+        prior if s is None else worn if s > GOOD_PX and not tells else np.full(TERMS, s) for s in onboard
     ])  # fmt: skip
     start = np.stack([sparse_map.disparity_offset_px.get(a, none()) for a in agents])
     mean = np.stack([prior_mean(sparse_map, a) for a in agents])
     # What was found on board rests on this flight: data that contradict it are the fewer ones.
     believed = np.array([s is None and (tells or has_bent(sparse_map, a)) for a, s in zip(agents, onboard)])
     border = Border(
-        group, at_keypoints(sparse_map, slots), start, sigma / config.inflation, config.tail, config.determined,
-        config.worn, np.where(believed, config.inflation**2 * config.contradicts, np.inf), mean,
+        group, at_keypoints(sparse_map, slots), start, sigma / config.inflation, _TAIL, _DETERMINED,
+        _WORN, np.where(believed, config.inflation**2 * config.contradicts, np.inf), mean,
     )  # fmt: skip
     return replace(problem, measured=measured, border=border), agents
 
@@ -96,7 +99,7 @@ def _is_worn(offset: F64, focal: float) -> bool:
 
 def _prior_px(focal: float) -> F64:
     """Standard deviations (5,) of a good calibration's offset."""
-    return np.array([_PRIOR_PX, *[_PRIOR_RAD * focal] * (TERMS - 1)])
+    return np.array([GOOD_PX, *[_PRIOR_RAD * focal] * (TERMS - 1)])
 
 
 def has_bent(sparse_map: SparseMap, agent: AgentId) -> bool:
@@ -156,7 +159,7 @@ def set_offsets(
         at = border.terms[border.group == g]
         cov = result.offset_cov[TERMS * g : TERMS * (g + 1), TERMS * g : TERMS * (g + 1)]
         sigma_px = config.inflation * float(np.sqrt(np.mean(np.einsum("ni,ij,nj->n", at, cov, at))))
-        if sigma_px < config.calibrated_px:
+        if sigma_px < CALIBRATED_PX:
             sparse_map.disparity_calibrated.add(agent)
         sparse_map.disparity_sigma_px.pop(agent, None)
         if agent in sparse_map.onboard_sigma_px or _is_worn(result.offset[g], sparse_map.cameras[agent].fx):

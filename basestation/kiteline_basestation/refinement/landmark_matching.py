@@ -22,6 +22,7 @@ _NEAR_RATIO = 0.5  # distance of such a keyframe over the median depth
 _NEAR_COSINE = 0.7  # cosine of the angle between the optical axes: 45 degrees
 _OCTAVE_GAP = 1.2  # octaves between the predicted and the detected scale
 _ANGLE_GAP = 24  # 1/256 turns; between the predicted and the detected orientation: 34 degrees
+_RATIO = 0.8  # best over second-best distance: below it, a match is distinct
 
 
 def match_landmarks(
@@ -96,7 +97,7 @@ def _match_projected(
         uv, octave, angle, disparity, projected,
         table.uv[slots].astype(np.float64), table.octave[slots], table.angle[slots], measured,
         detected,
-        config.radius_px, _OCTAVE_GAP, _ANGLE_GAP, config.disparity_px, config.max_hamming, config.ratio,
+        config.radius_px, _OCTAVE_GAP, _ANGLE_GAP, config.disparity_px, config.max_hamming, _RATIO,
         best, distance,
     )  # fmt: skip
     fused = 0

@@ -40,6 +40,7 @@ _LEAST_POINTS = 4  # synthetic points of a step
 _NO_DISPARITY, _NO_GROUP = -1.0, -1
 _ROTATION_SIGMA_PX = 0.1  # px; of each of 6 far synthetic points: together they hold rotation to 0.15 mrad
 _SCALE_SIGMA_PX = 2.0  # px; of each of 12 more in monocular submaps in metres, whose images tell no scale
+_RUN = 20  # keyframes; consecutive rotations whose common error is estimated together
 
 
 class _Step(NamedTuple):
@@ -101,8 +102,8 @@ def _steps(
     problem, table = window.problem, sparse_map.keyframes
     counts = np.bincount(problem.camera, minlength=len(window.rows))
     number = {int(table.id[row]): i for i, row in enumerate(window.rows.tolist())}
-    difference_px = _PX_OF_ROTATION * _rotation_difference_px(sparse_map, window, number, config.run)
-    depth, units = median_depths(problem), units_of(sparse_map, window.rows, config.run)
+    difference_px = _PX_OF_ROTATION * _rotation_difference_px(sparse_map, window, number, _RUN)
+    depth, units = median_depths(problem), units_of(sparse_map, window.rows, _RUN)
     for k, row in enumerate(window.rows.tolist()):
         keyframe = KeyframeId(int(table.id[row]))
         if agent_of_keyframe(keyframe) not in sparse_map.cameras:

@@ -20,6 +20,8 @@ from kiteline_core.ids import KeyframeId
 
 _MAX_COVISIBLE = 6  # covisible keyframes searched
 _MIN_BASELINE_RATIO = 0.01  # baseline over median depth: below it two keyframes have one viewpoint
+_RATIO = 0.75  # best over second-best distance
+_REPROJECTION_PX = 2.0  # px at octave 0; in every view
 
 
 def triangulate_landmarks(
@@ -81,7 +83,7 @@ def _from_epipolar_matches(
         kernels.match_epipolar(
             table.uv[here].astype(np.float64), table.octave[here], ours,
             table.uv[there].astype(np.float64), table.octave[there], theirs,
-            fundamental, config.epipolar_px, config.max_hamming, config.ratio, best, distance,
+            fundamental, config.epipolar_px, config.max_hamming, _RATIO, best, distance,
         )  # fmt: skip
         matched = best >= 0
         a, b = here[matched], there[best[matched]]
@@ -125,7 +127,7 @@ def _intersect(sparse_map: SparseMap, a: I32, b: I32, config: TriangulationConfi
     good &= parallax(lines[0][0], lines[1][0], position) < config.max_cosine
     for slots, (uv, camera, T_w_k) in zip((a, b), views, strict=True):
         pixel, depth = project(position, camera, T_w_k)
-        limit = config.reprojection_px * np.exp2(table.octave[slots])
+        limit = _REPROJECTION_PX * np.exp2(table.octave[slots])
         good &= (depth > 0.05) & (np.linalg.norm(pixel - uv, axis=1) < limit)
     return position, good
 

@@ -112,14 +112,11 @@ def _near(a: _Place, b: _Place) -> bool:
 
 def _verdict(place: _Place, old: _Place) -> str:
     """Judge a candidate: "refused", or "right" or "wrong" where it is accepted."""
-    config = AgentConfig()
     has = np.flatnonzero(np.isfinite(old.xyz[:, 2]))
-    matches = matching.match(old.descriptor[has], old.angle[has], place.descriptor, place.angle, config.matching)
+    matches = matching.match(old.descriptor[has], old.angle[has], place.descriptor, place.angle)
     rows = has[matches.a]
     observed = np.column_stack([place.uv[matches.b], np.full(len(rows), -1.0)])
-    fit = solve_pnp(
-        old.xyz[rows], np.zeros((len(rows), 3)), observed, place.octave[matches.b], place.camera, 1, config.ransac
-    )
+    fit = solve_pnp(old.xyz[rows], np.zeros((len(rows), 3)), observed, place.octave[matches.b], place.camera, 1)
     if fit is None or fit.inliers < _ACCEPTED:
         return "refused"
     error = fit.T_c_m @ se3.inverse(old.T_w_c) @ place.T_w_c

@@ -132,12 +132,12 @@ def _near(a: _Place, b: _Place) -> bool:
 
 
 def _matches(old: _Place, place: _Place) -> int:
-    return len(matching.match(old.descriptor, old.angle, place.descriptor, place.angle, AgentConfig().matching).a)
+    return len(matching.match(old.descriptor, old.angle, place.descriptor, place.angle).a)
 
 
 def _accepted(place: _Place, old: _Place) -> bool:
     """True if an essential matrix explains enough matches."""
-    matches = matching.match(old.descriptor, old.angle, place.descriptor, place.angle, AgentConfig().matching)
+    matches = matching.match(old.descriptor, old.angle, place.descriptor, place.angle)
     if len(matches.a) < _ACCEPTED:
         return False
     cv2.setRNGSeed(1)

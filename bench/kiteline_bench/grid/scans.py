@@ -40,7 +40,7 @@ class Scanner:
     def __init__(
         self, rig: CameraRig, damage: Callable[[F32], F32] | None = None, ground_z: float | None = None
     ) -> None:
-        self._ground: GroundHeight[int] = GroundHeight(GroundConfig())
+        self._ground: GroundHeight[int] = GroundHeight()
         self._start_z = ground_z
         self._made: list[PosedScan] = []
         self._believed: set[int] = set()

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kiteline_basestation.config import GroundHeightConfig
 from kiteline_basestation.grid.ground_height import ground_heights
 from kiteline_bench.grid.ray_kernels import cast_rays
 from kiteline_core.arrays import F64, I64, U8, Bool
@@ -48,7 +47,7 @@ def labels_by_height(sparse: SparsePoints) -> tuple[U8, F64]:
     used = np.isfinite(distance)
     ground = np.full(len(sparse.points), np.nan)
     if used.any():
-        ground[used] = ground_heights(GroundHeightConfig(), sparse.points[used], camera_z[used])
+        ground[used] = ground_heights(sparse.points[used], camera_z[used])
     height = sparse.points[:, 2] - ground
     band = _LOW_M + _NOISE_PER_M * np.where(used, distance, 0.0)
     labels = np.zeros(len(height), np.uint8)

@@ -1,6 +1,6 @@
 """The bars of real and worn recordings."""
 
-from kiteline_bench.agent import altitude, rigs
+from kiteline_bench.agent import altitude, bent, rigs
 from kiteline_bench.base import real_places
 from kiteline_bench.reality import (
     base,
@@ -29,6 +29,7 @@ PARTS = {
     "starts": ("Reality: random monocular starts, forward and backward", starts.run),
     "nees": ("Reality: consistent poses of worn rigs", nees.run),
     "people": ("Reality: people who walk through", people.run),
+    "bent": ("Reality: right cameras that were bent", bent.run),
     "rigs": ("Reality: rigs of many kinds", rigs.run),
     "altitude": ("Reality: high above ground", altitude.run),
     "difficult": ("Reality: difficult images", difficult.run),

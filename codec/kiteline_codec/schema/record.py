@@ -96,6 +96,7 @@ class Record:
     KIND: ClassVar[int]  # number on the wire, 1 to 62
     ID: ClassVar[IdOf]
     PRIORITY: ClassVar[Priority]
+    URGENCY: ClassVar[Priority] = Priority.POSE  # at most this urgent, whatever its priority: GRID waits for others
     PARTS: ClassVar[int] = 1  # how many records may share an id; with more than one there is a field `part`
     FIRST_PARTS: ClassVar[int] = 1  # parts that go at PRIORITY; the others wait until REST
     PREDICTS: ClassVar[bool] = False  # whether residual codes are predicted from it

@@ -7,7 +7,7 @@ them, old sections of low priority are dropped instead.
 from collections.abc import Callable
 
 from kiteline_codec.coding.packing import Writer
-from kiteline_codec.schema import KEYFRAME_KINDS, PREDICTOR_KINDS, Key, KeyframeScan, Priority
+from kiteline_codec.schema import KEYFRAME_KINDS, PREDICTOR_KINDS, RECORD_TYPES, Key
 from kiteline_codec.sync import ranges
 from kiteline_codec.sync.archive import Archive, Row, Spill
 from kiteline_codec.sync.digest import MODULUS, Digest, hash_value
@@ -20,6 +20,7 @@ from kiteline_codec.transport.packet import write_item
 Known = Callable[[Key], tuple[int, bytes] | None]  # version and code of an own value that the peer holds
 Compress = Callable[[Key, bytes, Known], bytes | None]  # a residual code, None where there is none
 
+_URGENCY = {kind: int(record.URGENCY) for kind, record in RECORD_TYPES.items()}
 _MAX_SKIPPED = 8  # values too long for the rest of a packet that are passed over in search of a shorter one
 _ENTRY_BYTES = 700  # memory of a value beside its code, roughly
 _POSES = (1,)  # lower orders, poses and placements, go before the value that has waited longest
@@ -269,11 +270,9 @@ class Outbox:
         return (least if here is None else min(here, least)) - 1
 
     def urgency(self) -> int | None:
-        """The priority of what is sent next, least first; None if nothing waits. Scans may wait as tiles do."""
+        """How urgent what is sent next is: its priority, or that of its kind's `URGENCY`; None if nothing waits."""
         key = self._top()
-        if key is None:
-            return None
-        return int(Priority.GRID) if key.kind == KeyframeScan.KIND else self._entries[key].order[0]
+        return None if key is None else max(self._entries[key].order[0], _URGENCY.get(key.kind, 0))
 
     def _top(self) -> Key | None:
         key = self._queue.top()

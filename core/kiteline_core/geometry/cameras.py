@@ -208,8 +208,8 @@ class Rectifier:
     def set_right_rows(self, offset_px: Callable[[F64], F64]) -> None:
         """Read the right image lower than its calibration says, where points are read singly.
 
-        offset_px: by how much (n,) at pixels (n,2) of the rectified image. Level 1 of its pyramid follows if images are
-        remapped at all; a whole right image does not.
+        offset_px: by how much (n,) at pixels (n,2) of the rectified image. Level 1 of its pyramid follows; a whole
+        right image does not.
         """
         self.right_rows = offset_px
         columns, rows = ((side + GRID_STEP - 1) // GRID_STEP + 1 for side in self._size)
@@ -221,9 +221,8 @@ class Rectifier:
         offset = offset_px(pixels.reshape(-1, 2).astype(np.float64)).reshape(rows, columns, 1)
         lower = np.gradient(told, float(GRID_STEP), axis=0) * offset
         self.right_grid = np.ascontiguousarray(told + lower, np.float32)
-        if self.remaps:
-            fixed = cv2.convertMaps(*_level_maps(self.right_grid, self._size, 1), cv2.CV_16SC2)
-            self._halves[1] = (np.asarray(fixed[0], np.int16), np.asarray(fixed[1], np.uint16))
+        fixed = cv2.convertMaps(*_level_maps(self.right_grid, self._size, 1), cv2.CV_16SC2)
+        self._halves[1] = (np.asarray(fixed[0], np.int16), np.asarray(fixed[1], np.uint16))
 
     def left_level(self, image: U8, level: int) -> U8:
         """Rectify a coarse level of a raw left image's pyramid; for few images: its maps are not kept."""

@@ -9,6 +9,7 @@ import numpy as np
 from kiteline_core.arrays import F64
 
 TERMS = 5
+GOOD_PX = 0.1  # px; standard deviation of an offset that a good calibration leaves
 
 
 def terms(xy: F64) -> F64:

@@ -48,39 +48,45 @@ class Brightness:
 
     def learned(self, pair: tuple[U8, U8], disparity: F32, falloff: F32) -> "Brightness":
         """What is known with another pair (h,w) as it was taken, and its disparities (h,w) in px, 0 unknown."""
-        found, left, right = disparity[::_EVERY, ::_EVERY], pair[0][::_EVERY, ::_EVERY], pair[1][::_EVERY]
-        rows, columns = np.nonzero(found > 0.0)
-        at = _EVERY * columns - found[rows, columns]
+        found, left = disparity[::_EVERY, ::_EVERY], pair[0][::_EVERY, ::_EVERY]
+        h, w = disparity.shape
+        at = np.arange(0, w, _EVERY) - found
         first = np.floor(at).astype(np.int64)
+        seen = (found > 0.0) & (first >= 0) & (first + 1 < w)
         part = at - first
-        inside = (first >= 0) & (first + 1 < right.shape[1])
-        rows, columns, first, part = rows[inside], columns[inside], first[inside], part[inside]
-        a = left[rows, columns].astype(np.float64)
-        b = (1.0 - part) * right[rows, first] + part * right[rows, first + 1]
-        seen = (a > _DARK) & (a < _BRIGHT) & (b > _DARK) & (b < _BRIGHT)
+        index = np.clip(first, 0, w - 2) + w * np.arange(0, h, _EVERY)[:, None]  # of the right image, and the next
+        right = (1.0 - part) * pair[1].take(index) + part * pair[1].take(index + 1)
+        seen &= (left > _DARK) & (left < _BRIGHT) & (right > _DARK) & (right < _BRIGHT)
         if np.count_nonzero(seen) < _LEAST:
             return self
-        rows, columns, first, part = rows[seen], columns[seen], first[seen], part[seen]
-        thinned = falloff[::_EVERY]
-        there = (1.0 - part) * thinned[rows, first] + part * thinned[rows, first + 1]
-        darker = there - thinned[rows, _EVERY * columns]  # logarithm of left over right for a power of 1
-        ratio = np.log(a[seen] / b[seen])
+        index, part = index[seen], part[seen]
+        there = (1.0 - part) * falloff.take(index) + part * falloff.take(index + 1)
+        darker = there - falloff[::_EVERY, ::_EVERY][seen]  # logarithm of left over right for a power of 1
+        ratio = np.log(left[seen].astype(np.float64) / right[seen])
         return self._with(ratio, np.asarray(darker, np.float64))
 
     def _with(self, ratio: F64, darker: F64) -> "Brightness":
         """Add observed (n,) logarithms of left over right, robustly."""
-        x, total = np.array([np.median(ratio - self.power * darker), self.power]), np.zeros(5)
+        x, total = np.array([_median(ratio - self.power * darker), self.power]), np.zeros(5)
+        kept, squared, product = _KEPT * np.array(self.sums), darker**2, darker * ratio
         for _ in range(_ROUNDS):
             error = ratio - x[0] - x[1] * darker
-            sigma = max(1.48 * float(np.median(np.abs(error))), _LEAST_SIGMA)
+            sigma = max(1.48 * _median(np.abs(error)), _LEAST_SIGMA)
             w = 1.0 / (1.0 + (0.5 * error / sigma) ** 2) ** 2
-            own = w.sum(), w @ darker, w @ darker**2, w @ ratio, w @ (darker * ratio)
-            total = _KEPT * np.array(self.sums) + own
+            total = kept + (w.sum(), w @ darker, w @ squared, w @ ratio, w @ product)
             a00, a01, a11, b0, b1 = total.tolist()
             x = np.linalg.solve([[a00, a01], [a01, a11 + _STIFFNESS * a00]], [b0, b1])
         gain, power = np.clip(x, (-_MOST_GAIN, 0.0), (_MOST_GAIN, _MOST_POWER)).tolist()
         a00, a01, a11, b0, b1 = total.tolist()
         return Brightness(gain, power, (a00, a01, a11, b0, b1))
+
+
+def _median(values: F64) -> float:
+    """That of numpy, in a third of its time: selected once."""
+    middle = len(values) // 2
+    parted = np.partition(values, middle)
+    upper = float(parted[middle])
+    return upper if len(values) % 2 else 0.5 * (float(parted[:middle].max()) + upper)
 
 
 def falloff(width: int, height: int, fx: float, fy: float, cx: float, cy: float) -> F32:

@@ -17,6 +17,10 @@ _OVERLAP_ROWS = 3  # beside a stripe: matching knows what lies above and below
 _STEPS = 16  # of OpenCV's disparities in a pixel
 _DOUBTED = 0.1  # of the pixels, at most, whose disparities are corrected by their rows: 0.3 to 1 % in rooms
 _SPECKLE_PX = 40  # px of an island that differs from all around it by more than a pixel: an error
+BLOCK_PX = 7  # px; side of a matched block: smaller ones are noisier, larger ones widen obstacles
+_SMALL_STEP = 1  # cost of a step of one pixel of disparity, times the block's pixels: slanted ground has many
+_LARGE_STEP = 5  # cost of a larger step: an edge
+_UNIQUENESS = 10  # percent by which the best cost is below the next: rejects floors without texture
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,11 +76,11 @@ class DisparityStripes:
 
     def __init__(self, camera: DisparityCamera, config: GroundConfig) -> None:
         self._camera = camera
-        area = config.block_px**2
+        area = BLOCK_PX**2
         self._matcher = cv2.StereoSGBM.create(
-            minDisparity=0, numDisparities=config.disparities, blockSize=config.block_px,
-            P1=config.small_step * area, P2=config.large_step * area, disp12MaxDiff=1, preFilterCap=31,
-            uniquenessRatio=config.uniqueness, mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
+            minDisparity=0, numDisparities=config.disparities, blockSize=BLOCK_PX,
+            P1=_SMALL_STEP * area, P2=_LARGE_STEP * area, disp12MaxDiff=1, preFilterCap=31,
+            uniquenessRatio=_UNIQUENESS, mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
         )  # fmt: skip
         self.stripes = config.stripes
         self.brightness = Brightness()
@@ -87,7 +91,7 @@ class DisparityStripes:
         self._raw = np.empty((camera.height, camera.width + _PAD_PX), np.int16)
         self._most_px = config.disparities
         doubted = int(_DOUBTED * camera.width * camera.height)
-        self._errors, self._search = np.empty(camera.width, np.float32), np.empty((4, camera.width), np.int32)
+        self._errors, self._search = np.empty((2, camera.width), np.float32), np.empty((4, camera.width), np.int16)
         self._doubted, self._better = np.empty(doubted, np.int32), np.empty(doubted, np.float32)
 
     def begin(self, left: U8, right: U8) -> None:

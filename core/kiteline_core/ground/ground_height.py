@@ -8,8 +8,7 @@ import numpy as np
 
 from kiteline_core.arrays import F64
 from kiteline_core.ground.column_scan import ColumnScan, level_rotation
-from kiteline_core.ground.config import GroundConfig
-from kiteline_core.ground.segmentation import ExpectedGround
+from kiteline_core.ground.segmentation import EXPECTED_M, LOWER_M, ExpectedGround
 
 Tag = TypeVar("Tag")
 
@@ -17,6 +16,12 @@ _HELD = 16  # scans that wait until the height is known
 _BELIEVED = 64  # newest ones that can be withdrawn
 _LOW = 32  # newest ones whose lowest points count
 _REFUTED = 2  # views of something lower, until the ground is no ground: one may be an error
+_CLIMB = 0.1  # m a m that the ground may climb from one scan to another: ramps and hills
+_MOST_CLIMB_M = 0.15  # m that the ground may climb from one scan to another, at most: boxes are higher
+_AGREEING_M = 0.1  # m between two cameras that saw the same ground, at least, until it is believed
+_GROUND_WIDTH_M = 3.0  # m that ground is wide before it is believed: tables are narrower
+_KNOWN_FOR_M = 8.0  # m of flight without a view of the ground after which its height is unknown
+_OTHER_VERTICAL = 0.06  # rad from one scan to the next: it was not known before, and heights were 0.2 m off at 3 m
 
 
 class Seen(NamedTuple):
@@ -56,9 +61,9 @@ class GroundHeight(Generic[Tag]):
     they saw is known to be as wide as no table is, and are withdrawn if something lower appears.
     """
 
-    def __init__(self, config: GroundConfig) -> None:
-        self._config = config
+    def __init__(self) -> None:
         self._foot: F64 | None = None  # (3,) in o, of the ground that was seen last
+        self._up: F64 | None = None  # (3,) in o, the vertical of the newest scan
         self._refuted = 0
         self._lower = 0  # newest scans that saw ground below the foot, and none as high
         self._held: deque[_Place[Tag]] = deque(maxlen=_HELD)
@@ -74,15 +79,18 @@ class GroundHeight(Generic[Tag]):
         if self._foot is None:
             return None
         along, across = _apart(T_o_c[:3, 3], self._foot, T_o_c[:3, :3] @ up_c)
-        if across > self._config.known_for_m:
+        if across > _KNOWN_FOR_M:
             self._foot = None
             return None
         return ExpectedGround(along, self._level_m(across))
 
     def note(self, tag: Tag, seen: Seen) -> Verdict[Tag]:
         """Take in a scan that was made with the height of `expected`."""
-        config, scan, T = self._config, seen.scan, seen.T_o_c
+        scan, T = seen.scan, seen.T_o_c
         up = T[:3, :3] @ scan.up_c
+        before, self._up = self._up, up
+        if before is not None and float(before @ up) < np.cos(_OTHER_VERTICAL):
+            return Verdict([], self._begin_anew())
         camera = T[:3, 3].copy()
         low = camera - seen.lowest_m * up
         if np.isfinite(seen.lowest_m):
@@ -116,13 +124,21 @@ class GroundHeight(Generic[Tag]):
         ]
         ends = np.concatenate([other.ends for other in same])
         moved_m = max(float(np.linalg.norm(other.camera - camera)) for other in same)
-        if len(same) < 2 or moved_m < config.agreeing_m or _width(ends, up) < config.ground_width_m:
+        if len(same) < 2 or moved_m < _AGREEING_M or _width(ends, up) < _GROUND_WIDTH_M:
             return Verdict([], [])
         self._foot, self._refuted = foot, 0
         self._held.clear()
         withdrawn = self._withdraw(up)
         self._believed.extend(same)
         return Verdict([other.tag for other in same], withdrawn)
+
+    def _begin_anew(self) -> list[Tag]:
+        """Forget all that was seen. Returns the tags of scans that were believed."""
+        tags = [place.tag for place in self._believed]
+        self._foot, self._refuted, self._lower = None, 0, 0
+        for seen in (self._held, self._believed, self._low):
+            seen.clear()
+        return tags
 
     def _withdraw(self, up: F64) -> list[Tag]:
         """Forget scans whose ground lies above what was seen. Returns their tags."""
@@ -137,7 +153,7 @@ class GroundHeight(Generic[Tag]):
 
     def _is_above(self, foot: F64, low: F64, up: F64) -> bool:
         along, across = _apart(foot, low, up)
-        return along > self._config.lower_m + self._config.climb * across
+        return along > LOWER_M + _CLIMB * across
 
     def _is_level(self, a: F64, b: F64, up: F64) -> bool:
         along, across = _apart(a, b, up)
@@ -145,7 +161,7 @@ class GroundHeight(Generic[Tag]):
 
     def _level_m(self, across_m: float) -> float:
         """By how much heights of ground may differ over a distance."""
-        return self._config.expected_m + min(self._config.climb * across_m, self._config.most_climb_m)
+        return EXPECTED_M + min(_CLIMB * across_m, _MOST_CLIMB_M)
 
 
 def without_ground(scan: ColumnScan) -> ColumnScan:

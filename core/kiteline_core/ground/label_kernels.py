@@ -104,12 +104,18 @@ def _surface(counts, more, least, lowest):  # type: ignore[no-untyped-def]
     """
     bins = len(counts)
     half, behind = int(_PX / BIN_PX), int(_BEHIND_PX / BIN_PX)
+    n, whole = 0, 0  # of the window around bin j
+    for i in range(max(bins - half, 0), bins):
+        n += counts[i]
+        whole += counts[i] + more[i]
     j = bins - 1
     while j >= lowest:
-        n, whole = 0, 0
-        for i in range(max(j - half, 0), min(j + half + 1, bins)):
-            n += counts[i]
-            whole += counts[i] + more[i]
+        if j >= half:
+            n += counts[j - half]
+            whole += counts[j - half] + more[j - half]
+        if j + half + 1 < bins:
+            n -= counts[j + half + 1]
+            whole -= counts[j + half + 1] + more[j + half + 1]
         if n >= least:
             most, most_whole = n, whole
             for k in range(j - 1, max(j - behind, lowest) - 1, -1):

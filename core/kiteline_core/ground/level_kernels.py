@@ -34,14 +34,16 @@ def correct_thin_surfaces(left, right, most_px, disparity, errors, best, least, 
     Semi-global matching gives such a surface the disparity of what lies behind. A disparity is in doubt where a row of
     2 _HALF_PX + 1 pixels does not fit, and a larger one, up to most_px, fits well: it takes that one, or becomes
     unknown (0) if too few pixels around have it.
-    left, right: (h,w) uint8. errors: (w,) float32, best, least, lowest, difference: (w,) int32, doubted: (k,) int32,
+    left, right: (h,w) uint8. errors: (2,w) float32, best, least, lowest, difference: (w,) int16, doubted: (k,) int32,
     better: (k,) float32, for the kernel's own use. At most k pixels are changed. Returns how many.
     """
     h, w = left.shape
     n = 0
     for v in range(h):
-        _errors_of_row(left[v], right[v], disparity[v], errors)
-        first, last = _search_row(left[v], right[v], most_px, disparity[v], errors, best, least, lowest, difference)
+        _errors_of_row(left[v], right[v], disparity[v], errors[0])
+        first, last = _search_row(
+            left[v], right[v], most_px, disparity[v], errors[0], errors[1], best, least, lowest, difference
+        )  # fmt: skip
         for u in range(first, last + 1):
             if best[u] >= 0 and n < len(doubted):
                 doubted[n], better[n] = v * w + u, best[u]
@@ -77,55 +79,59 @@ def _errors_of_row(left, right, disparity, errors):  # type: ignore[no-untyped-d
 
 
 @helper
-def _search_row(left, right, most_px, disparity, errors, best, least, lowest, difference):  # type: ignore[no-untyped-def]
+def _search_row(left, right, most_px, disparity, errors, sums, best, least, lowest, difference):  # type: ignore[no-untyped-def]
     """The larger disparity that fits a row best at each pixel whose disparity is in doubt.
 
-    best: (w,) out, that disparity in px, -1 where none fits far better. Returns the first and the last pixel in
-    doubt; none if the first is not below the last. All disparities of a row are searched together in loops
-    without branches, of which the compiler takes several pixels at a time; so the sum over _HALF_PX is written out.
+    sums: (w,) out, errors over 2 _HALF_PX + 1 pixels. best: (w,) out, that disparity in px, -1 where none fits far
+    better. Returns the first and the last pixel in doubt; none if the first is not below the last. All disparities of
+    a row are searched together in loops without branches, of which the compiler takes many pixels at a time; so sums
+    over _HALF_PX are written out, and numbers are short.
     """
     w = len(left)
     first, last, begin_q = w, -1, most_px
     for u in range(_HALF_PX, w - _HALF_PX):
-        error = np.float32(0.0)
-        for k in range(u - _HALF_PX, u + _HALF_PX + 1):
-            error += errors[k]
-        best[u], least[u], lowest[u] = -1, 0, most_px
-        if disparity[u] > 0.0 and error > _LEAST_ERROR * (2 * _HALF_PX + 1):
+        best[u] = -1
+        error = errors[u - 4] + errors[u - 3] + errors[u - 2] + errors[u - 1] + errors[u]
+        error = error + errors[u + 1] + errors[u + 2] + errors[u + 3] + errors[u + 4]
+        sums[u] = error
+    for u in range(_HALF_PX, w - _HALF_PX):
+        least[u], lowest[u] = 0, most_px
+        error = sums[u]
+        if error > _LEAST_ERROR * (2 * _HALF_PX + 1) and disparity[u] > 0.0:
             least[u] = int(np.ceil(min(_BETTER * error, np.float32(_FITS * (2 * _HALF_PX + 1)))))
             lowest[u] = int(disparity[u] + _NEARER_PX) + 1
             first, last, begin_q = min(first, u), u, min(begin_q, lowest[u])
     for q in range(begin_q, most_px):
-        begin = max(first, q + _HALF_PX)
+        begin, nearer = max(first, q + _HALF_PX), np.int16(q)
         for k in range(begin - _HALF_PX, last + _HALF_PX + 1):
-            difference[k] = abs(np.int32(left[k]) - np.int32(right[k - q]))
+            difference[k] = abs(np.int16(np.int16(left[k]) - np.int16(right[k - q])))
         for u in range(begin, last + 1):
             other = difference[u - 4] + difference[u - 3] + difference[u - 2] + difference[u - 1] + difference[u]
             other += difference[u + 1] + difference[u + 2] + difference[u + 3] + difference[u + 4]
-            is_better = (other < least[u]) & (q >= lowest[u])
+            other = np.int16(other)
+            is_better = (other < least[u]) & (nearer >= lowest[u])
             least[u] = other if is_better else least[u]
-            best[u] = q if is_better else best[u]
+            best[u] = nearer if is_better else best[u]
     return first, last
 
 
 @helper
-def _below(rotation, x, y):  # type: ignore[no-untyped-def]
-    """True if a ray looks below the horizon."""
-    return rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] < 0.0
+def _matched_columns(disparity, x, rotation, camera):  # type: ignore[no-untyped-def]
+    """First and last image column that both cameras saw; none if the first is not below the last.
 
-
-@helper
-def _matched_columns(disparity, rotation, camera):  # type: ignore[no-untyped-def]
-    """First and last image column that both cameras saw; none if the first is not below the last."""
+    x: (3,w) what its column adds to a pixel's ray in the levelled frame.
+    """
     h, w = disparity.shape
+    known, pixels = np.zeros(w, np.int32), np.zeros(w, np.int32)
+    for v in range(h):
+        below = rotation[2, 1] * ((v - camera[3]) / camera[1])
+        for u in range(w):
+            is_below = x[2, u] + below + rotation[2, 2] < 0.0
+            pixels[u] += is_below
+            known[u] += is_below & (disparity[v, u] > 0.0)
     first, last = w, -1
     for u in range(w):
-        x, known, pixels = (u - camera[2]) / camera[0], 0, 0
-        for v in range(h):
-            if _below(rotation, x, (v - camera[3]) / camera[1]):
-                pixels += 1
-                known += disparity[v, u] > 0.0
-        if known > _MATCHED * pixels:
+        if known[u] > _MATCHED * pixels[u]:
             first, last = min(first, u), u
     return first, last
 
@@ -151,20 +157,28 @@ def level_points(disparity, rotation, camera, bf, offset, far_px, slopes, x_out,
         while at < n - 1 and slopes[at + 1] <= low + (i + 0.5) / scale:
             at += 1
         table[i] = at
-    first, last = _matched_columns(disparity, rotation, camera)
+    x_image, x_level = np.empty(w), np.empty((3, w))  # what its column adds to a pixel's ray: in the camera; levelled
+    for u in range(w):
+        x_image[u] = (u - cx) / fx
+        for i in range(3):
+            x_level[i, u] = rotation[i, 0] * x_image[u]
+    first, last = _matched_columns(disparity, x_level, rotation, camera)
+    one_ahead, one_left, one_up = rotation[0, 2], rotation[1, 2], rotation[2, 2]
+    o0, o1, o2, o3, o4 = offset[0], offset[1], offset[2], offset[3], offset[4]
     for v in range(h):
         y = (v - cy) / fy
+        y_ahead, y_left, y_up = rotation[0, 1] * y, rotation[1, 1] * y, rotation[2, 1] * y
         for u in range(w):
             column_out[v, u] = NO_COLUMN
             d = disparity[v, u]
-            x = (u - cx) / fx
-            below = first <= u <= last and _below(rotation, x, y)
+            up = x_level[2, u] + y_up + one_up
+            below = (first <= u <= last) & (up < 0.0)
             if not (d > 0.0 or below):
                 continue
-            ahead = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2]
+            ahead = x_level[0, u] + y_ahead + one_ahead
             if ahead < 0.2:
                 continue
-            slope = (rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2]) / ahead
+            slope = (x_level[1, u] + y_left + one_left) / ahead
             i = int((slope - low) * scale)
             if slope < low or i >= 1024:
                 continue
@@ -172,10 +186,11 @@ def level_points(disparity, rotation, camera, bf, offset, far_px, slopes, x_out,
             if not d > 0.0:
                 continue
             known_out[table[i], 0] += below
-            d -= offset[0] + offset[1] * x + offset[2] * y + offset[3] * x * x + offset[4] * x * y
+            x = x_image[u]
+            d -= o0 + o1 * x + o2 * y + o3 * x * x + o4 * x * y
             depth = bf / max(d, far_px)
             x_out[v, u] = ahead * depth
-            z_out[v, u] = (rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2]) * depth
+            z_out[v, u] = up * depth
             column_out[v, u] = table[i]
 
 

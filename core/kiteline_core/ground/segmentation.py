@@ -39,6 +39,28 @@ _WIDER_RAD = 0.2  # to each side beyond the field of view of a level camera
 _WIDEST_RAD = 1.3  # of an azimuth
 _NEARER_M = 0.15  # between obstacles of two columns that are not one surface
 _GAP_M = 0.25  # without seen ground that are free between free ones: beyond, a pit would fit
+_TEXTURE_PX = 16  # px along a row within which a pixel has texture: semi-global matching fills in between
+_OBSTACLE_ROWS = 5.0  # rows of one disparity in a column, beyond those of level ground: `a` of Segfloor
+_MAX_SLOPE = 0.35  # m a m of the ground, at most: steeper is an obstacle; ramps have up to 0.2
+_LEAST_HEIGHT_M = 0.15  # m of the camera above the ground, at least
+_LEAST_PIXELS = 150  # on the ground, at least
+_LEAST_SHARE = 0.4  # of what is neither upright nor unknown at these distances, that is ground: else it is noise
+_LEAST_BINS = 6  # quarter pixels of disparity over which ground is seen, at least: less may be a wall's foot
+EXPECTED_M = 0.1  # m between the height found and the one expected, at most: beyond, it is a table or a box
+_EXPECTED_PIXELS = 30  # near the expected height, from which the height is that of these pixels
+_LOWEST_PIXELS = 60  # that must lie as low to tell that the ground lies no higher: fewer may be errors
+_LOWEST_AHEAD_M = 5.0  # m ahead up to which lowest pixels count
+_LOWEST_SIGMA_M = 0.1  # m; deviation of the height of lowest pixels, at most
+_LOWEST_SLOPE = 0.06  # m a m that the ground may fall ahead
+_CURVE_SLOPE = 0.25  # m a m of a curve that takes the place of level ground where its height is known
+LOWER_M = 0.25  # m below the ground from which points refute it: their errors are half of that
+_GROUND_SIGMAS = 2.5  # standard deviations of the measured height above or below the curve that are still ground
+_GROUND_MOST_M = 0.15  # m; farther above or below nothing is ground, however uncertain: it may be a low box
+_LEAST_KNOWN = 0.7  # of a column's pixels below the horizon: among more unknown ones an obstacle may hide
+_COLUMN_PIXELS = 5  # of an obstacle in a column, at least: fewer are chance
+_MAX_RANGE_M = 60.0  # m; farther ground and obstacles are left out
+_MAX_RANGE_SIGMA = 0.1  # relative deviation of a range, at most: a disparity of 2.5 px
+_TEXTURE = 4  # grey levels over two pixels along a row, at least: six times the noise of a plain floor
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +129,7 @@ class GroundSegmenter:
         self._bins = bins = round(config.disparities / level_kernels.BIN_PX)
         heights = round(config.largest_height_m / _HEIGHT_STEP_M)
         self._far_px = 0.25 if camera.stereo else 0.02 * self.bf
-        self._lowest_px = max(self.sigma_px / config.max_range_sigma, self.bf / config.max_range_m)
+        self._lowest_px = max(self.sigma_px / _MAX_RANGE_SIGMA, self.bf / _MAX_RANGE_M)
         self._bands = np.array(config.bands_m)
         self.x, self.z = np.empty((h, w), np.float32), np.empty((h, w), np.float32)
         self._column, self._known = np.empty((h, w), np.int16), np.empty((n, 2), np.int32)
@@ -134,7 +156,6 @@ class GroundSegmenter:
         up_c: (3,) unit vector against gravity. offset_px: (5,) error of disparities. expected: where the
         height is known: what lies there is ground, however little of it is seen.
         """
-        config = self.config
         offset_px = disparity_offset.none() if offset_px is None else offset_px
         view = _View(up_c, np.ascontiguousarray(level_rotation(up_c).T), offset_px, pair)
         self._known.fill(0)
@@ -143,13 +164,13 @@ class GroundSegmenter:
             self._column, self._known,
         )  # fmt: skip
         if pair is not None:
-            label_kernels.mark_texture(pair[0], config.texture, config.texture_px, self._textured)
+            label_kernels.mark_texture(pair[0], _TEXTURE, _TEXTURE_PX, self._textured)
         self._depths.fill(0)
         level_kernels.count_depths(
-            self.x, self.z, self._column, (config.lowest_ahead_m, config.lowest_sigma_m), config.lowest_slope,
+            self.x, self.z, self._column, (_LOWEST_AHEAD_M, _LOWEST_SIGMA_M), _LOWEST_SLOPE,
             self.sigma_px / self.bf, _DEPTH_STEP_M, self._depths,
         )  # fmt: skip
-        below = np.flatnonzero(np.cumsum(self._depths[::-1]) >= config.lowest_pixels)
+        below = np.flatnonzero(np.cumsum(self._depths[::-1]) >= _LOWEST_PIXELS)
         lowest_m = (len(self._depths) - 1 - int(below[0])) * _DEPTH_STEP_M if len(below) else float("nan")
         ground = self._find_ground(up_c, expected, lowest_m)
         scan, refuted = self._scan(ground, view, expected)
@@ -167,7 +188,7 @@ class GroundSegmenter:
 
     def _find_ground(self, up_c: F64, expected: ExpectedGround | None, lowest_m: float) -> Ground | None:
         """The ground by u- and v-disparity, and by what is expected; None if too little of it is seen."""
-        config, counts, bf = self.config, self._counts[0], self.bf
+        counts, bf = self._counts[0], self.bf
         in_image = float(np.hypot(up_c[0], up_c[1]))
         if in_image < _LEAST_IN_IMAGE:  # the camera looks straight up or down
             return None
@@ -176,7 +197,7 @@ class GroundSegmenter:
         level_kernels.count_columns(self.x, self.z, self._column, bf, counts, self._sums)
         # Rows that level ground 1 m below fills with each pixel of disparity.
         rows_m = float(self._camera[1]) / bf
-        level_kernels.find_upright(counts, self._sums, self._widths, 0.5 * config.obstacle_rows, rows_m, self._upright)
+        level_kernels.find_upright(counts, self._sums, self._widths, 0.5 * _OBSTACLE_ROWS, rows_m, self._upright)
         below = round(-_BELOW_PX * up_c[0] / in_image), round(-0.5 * _BELOW_PX * up_c[1] / in_image)
         self._heights.fill(0)
         self._height_sums.fill(0.0)
@@ -186,7 +207,7 @@ class GroundSegmenter:
         )  # fmt: skip
         if expected is None:
             curved = self._curved_ground(expected)
-            if curved is None or curved.height_m < lowest_m - config.lower_m:
+            if curved is None or curved.height_m < lowest_m - LOWER_M:
                 return self._lowest_ground(lowest_m)
             return curved
         level = self._expected_ground(expected)
@@ -209,7 +230,7 @@ class GroundSegmenter:
         ahead = self.bf / centres
         heights = -slope * ahead
         climb = np.abs(np.diff(heights[seen]) / np.diff(ahead[seen]))
-        if (climb > self.config.curve_slope).any():
+        if (climb > _CURVE_SLOPE).any():
             return False
         on_curve, on_level = (
             self._pixels_near(height_m)[seen].sum() for height_m in (-heights, np.full(self._bins, level.height_m))
@@ -224,21 +245,21 @@ class GroundSegmenter:
 
     def _curved_ground(self, expected: ExpectedGround | None) -> Ground | None:
         """The ground as a curve over the distance; None if too little of it is seen."""
-        config, bf, heights = self.config, self.bf, self._heights
+        bf, heights = self.bf, self._heights
         path = np.zeros(self._bins, np.int64)
-        first, hint, near = int(config.least_height_m / _HEIGHT_STEP_M), -1, 0
+        first, hint, near = int(_LEAST_HEIGHT_M / _HEIGHT_STEP_M), -1, 0
         if expected is not None:
             hint, near = (max(int(m / _HEIGHT_STEP_M), 0) for m in (expected.height_m, expected.within_m))
         profile_kernels.ground_path(
-            heights, first, hint, near, bf, _HEIGHT_STEP_M, config.max_slope, self.sigma_px, _HALF_COUNTS, path
+            heights, first, hint, near, bf, _HEIGHT_STEP_M, _MAX_SLOPE, self.sigma_px, _HALF_COUNTS, path
         )
         # Cells near the path, in bins of which enough pixels lie there.
         centres = (np.arange(self._bins) + 0.5) * level_kernels.BIN_PX
         found, total = np.empty((2, self._bins), np.int64)
         profile_kernels.count_path(heights, path, self.sigma_px, found, total)
         bins = np.flatnonzero((found >= max(0.02 * found.max(), 3.0)) & (centres >= self._lowest_px))
-        enough = max(config.least_pixels, config.least_share * total[bins].sum())
-        if found[bins].sum() < enough or len(bins) < config.least_bins:
+        enough = max(_LEAST_PIXELS, _LEAST_SHARE * total[bins].sum())
+        if found[bins].sum() < enough or len(bins) < _LEAST_BINS:
             return None
         disparities, slopes = self._height_sums
         first_bin, last_bin = int(bins[0]), int(bins[-1])
@@ -257,30 +278,29 @@ class GroundSegmenter:
         """Level ground next to the lowest points; None if too little of it is seen."""
         if np.isnan(lowest_m):
             return None
-        config = self.config
         rows = self._heights.sum(0)
-        first = max(int((lowest_m - config.expected_m) / _HEIGHT_STEP_M), 0)
-        last = int((lowest_m + config.lower_m) / _HEIGHT_STEP_M) + 1
+        first = max(int((lowest_m - EXPECTED_M) / _HEIGHT_STEP_M), 0)
+        last = int((lowest_m + LOWER_M) / _HEIGHT_STEP_M) + 1
         some = np.convolve(rows, np.ones(3), "same")[first:last]
-        if not len(some) or some.max() < config.least_pixels:
+        if not len(some) or some.max() < _LEAST_PIXELS:
             return None
         height_m = (first + int(np.argmax(some)) + 0.5) * _HEIGHT_STEP_M
-        ground = self._expected_ground(ExpectedGround(height_m, config.expected_m))
+        ground = self._expected_ground(ExpectedGround(height_m, EXPECTED_M))
         return ground if ground.seen else None
 
     def _expected_ground(self, expected: ExpectedGround) -> Ground:
         """Level ground where it is expected, as high as pixels near it say."""
-        config, bf, bins = self.config, self.bf, self._bins
+        bf, bins = self.bf, self._bins
         expected_m = expected.height_m
         first = round((expected_m - expected.within_m) / _HEIGHT_STEP_M)
         last = round((expected_m + expected.within_m) / _HEIGHT_STEP_M) + 1
         near = slice(max(first, 0), max(last, 0))
         centres = (np.arange(bins) + 0.5) * level_kernels.BIN_PX
-        sure = (centres >= self._lowest_px) & (expected_m * self.sigma_px / centres < config.expected_m)
+        sure = (centres >= self._lowest_px) & (expected_m * self.sigma_px / centres < EXPECTED_M)
         n = self._heights[sure, near].sum(1)
         disparities, slopes = (sums[sure, near].sum(1) for sums in self._height_sums)
         some, height_m = n > 0, expected_m
-        seen = bool(n.sum() >= config.expected_pixels)
+        seen = bool(n.sum() >= _EXPECTED_PIXELS)
         if seen:
             found = np.repeat(self.bf * slopes[some] / disparities[some], n[some])
             gain = n.sum() / (n.sum() + _HALF_SURE)
@@ -300,7 +320,7 @@ class GroundSegmenter:
         if ground is not None:
             profile_kernels.sample_spline(ground.coefficients, ground.low_px, ground.high_px, borders, slope)
             seen = (borders[:-1] >= ground.low_px - _BEYOND_PX) & (borders[1:] <= ground.high_px * _NEARER)
-            seen[: _beyond_fall(slope, seen, self.bf, config.curve_slope)] = False
+            seen[: _beyond_fall(slope, seen, self.bf, _CURVE_SLOPE)] = False
             height_m = ground.height_m
         elif expected is not None:
             slope, height_m = borders * (expected.height_m / self.bf), expected.height_m
@@ -311,7 +331,7 @@ class GroundSegmenter:
             counts.fill(0)
         on, under = label_kernels.label_points(
             self.x, self.z, self._column, self._textured, slope, seen, self.bf, self.sigma_px, config.ground_m,
-            config.ground_sigmas, config.ground_most_m, self._bands, config.slab_m, self.labels, grounds, obstacles,
+            _GROUND_SIGMAS, _GROUND_MOST_M, self._bands, config.slab_m, self.labels, grounds, obstacles,
             above, falls, astray, self._ground_heights, self._sums, self._in_band, slab, self._slab_sums,
         )  # fmt: skip
         if ground is not None and under > _UNDER * on:
@@ -319,7 +339,7 @@ class GroundSegmenter:
         lowest = round(self._lowest_px / level_kernels.BIN_PX)
         surface, bands = self._surface, np.empty(n, np.uint8)
         label_kernels.find_surfaces(
-            obstacles, above, self._sums, self._in_band, slab, self._slab_sums, config.column_pixels, lowest, surface,
+            obstacles, above, self._sums, self._in_band, slab, self._slab_sums, _COLUMN_PIXELS, lowest, surface,
             bands,
         )  # fmt: skip
         if view.pair is not None:
@@ -329,7 +349,7 @@ class GroundSegmenter:
             )  # fmt: skip
         free_from, free, obstacle, clear = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
         column_kernels.collect_scan(
-            grounds, self._ground_heights, obstacles, falls, astray, config.column_pixels, surface, bands, self._bands,
+            grounds, self._ground_heights, obstacles, falls, astray, _COLUMN_PIXELS, surface, bands, self._bands,
             height_m, self._azimuths, self.bf, 1.0 / float(self._camera[1]), lowest, self.sigma_px, _GAP_M, free_from,
             free, obstacle, clear,
         )  # fmt: skip
@@ -338,7 +358,7 @@ class GroundSegmenter:
         nearer = np.minimum(padded[:-2], padded[2:])
         ends = (free_from < nearer) & (nearer < np.minimum(free, obstacle - _NEARER_M))
         free[ends] = nearer[ends]
-        hidden = self._known[:, 0] < config.least_known * self._known[:, 1]
+        hidden = self._known[:, 0] < _LEAST_KNOWN * self._known[:, 1]
         free[hidden] = free_from[hidden] = 0.0
         some = np.flatnonzero((free > 0.0) | (bands > 0) | (clear > 0.0))
         first, last = (int(some[0]), int(some[-1]) + 1) if len(some) else (0, n)

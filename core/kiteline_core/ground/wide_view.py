@@ -12,7 +12,7 @@ import numpy as np
 from kiteline_core.arrays import F32, F64, I16, U8, U16, Bool
 from kiteline_core.geometry.cameras import RawSide, RectifiedCamera, Rectifier, undistortion_maps
 from kiteline_core.ground.config import GroundConfig
-from kiteline_core.ground.disparity import DisparityCamera
+from kiteline_core.ground.disparity import BLOCK_PX, DisparityCamera
 
 Fixed = tuple[I16, U16]  # OpenCV's fastest maps
 
@@ -28,7 +28,7 @@ class WideView:
 
     def __init__(self, rectifier: Rectifier, config: GroundConfig) -> None:
         self._rectifier = rectifier
-        self._reach = config.block_px // 2 + 1  # px of a matched block beyond its middle, and of what was interpolated
+        self._reach = BLOCK_PX // 2 + 1  # px of a matched block beyond its middle, and of what was interpolated
         self.camera, self._corner = rectifier.camera, np.zeros(2)
         self._maps: list[Fixed] = []  # of both cameras' half-size images; empty: those of the rectified images
         self._left_seen: Bool | None = None  # (h,w) of a disparity image: there is a raw pixel

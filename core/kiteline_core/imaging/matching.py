@@ -10,14 +10,8 @@ from kiteline_core.imaging import matching_kernels as kernels
 _CELL_PX = 32  # of the guided search; it changes its speed alone
 _TURN_BINS = 16  # of the histogram of rotations between the two views; 22.5 degrees each
 _TURN_BINS_KEPT = 3  # neighbours share a rotation between them
-
-
-@dataclass(frozen=True, slots=True)
-class MatchConfig:
-    """Thresholds of descriptor matching."""
-
-    max_hamming: int = 64  # bits of 256: unrelated descriptors differ in 128 +- 8, true matches in 20 to 60
-    ratio: float = 0.85  # of the best to the second-best distance: above it, the match is ambiguous
+_MAX_HAMMING = 64  # bits of 256: unrelated descriptors differ in 128 +- 8, true matches in 20 to 60
+_RATIO = 0.85  # of the best to the second-best distance: above it, the match is ambiguous
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,17 +28,17 @@ def words(descriptors: U8) -> U64:
     return np.ascontiguousarray(descriptors).view(np.uint64).reshape(len(descriptors), 4)
 
 
-def match(a: U8, angle_a: U8, b: U8, angle_b: U8, config: MatchConfig) -> Matches:
+def match(a: U8, angle_a: U8, b: U8, angle_b: U8) -> Matches:
     """Match descriptors (n,32) and (m,32) by brute force, one to one. Angles in 1/256 turns."""
     best, distance = np.empty(len(a), np.int32), np.empty(len(a), np.int32)
-    kernels.match_all(words(a), words(b), config.max_hamming, config.ratio, best, distance)
+    kernels.match_all(words(a), words(b), _MAX_HAMMING, _RATIO, best, distance)
     kernels.keep_common_rotation(best, angle_a, angle_b, _TURN_BINS, _TURN_BINS_KEPT)
     return _pairs(best, distance)
 
 
 def match_near(
     uv: F64, radius_px: F64, octave: F64, a: U8, uv2: F64, octave2: U8, b: U8, size: tuple[int, int],
-    octave_gap: float, config: MatchConfig,
+    octave_gap: float,
 ) -> Matches:  # fmt: skip
     """Match each predicted pixel uv (n,2) with measured ones uv2 (m,2) within radius_px (n,).
 
@@ -57,7 +51,7 @@ def match_near(
     best, distance = np.empty(len(a), np.int32), np.empty(len(a), np.int32)
     kernels.match_cells(
         uv, radius_px, octave, words(a), uv2, octave2, words(b), float(_CELL_PX), start, item,
-        octave_gap, config.max_hamming, config.ratio, best, distance,
+        octave_gap, _MAX_HAMMING, _RATIO, best, distance,
     )  # fmt: skip
     return _pairs(best, distance)
 

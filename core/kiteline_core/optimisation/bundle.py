@@ -29,7 +29,6 @@ class BundleConfig:
     stop: float = 1e-4  # relative gain in cost below which more trials have no visible effect
     chi2_mono: float = CHI2_2  # squared normalised residual of a pixel at the knee of Huber's cost: 95 %
     chi2_stereo: float = CHI2_3  # the same of a pixel with disparity
-    outlier: float = 1.0  # an outlier's squared residual exceeds the knee by this factor
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +115,7 @@ def bundle(problem: BundleProblem, config: BundleConfig) -> BundleResult:
         cost = solver.minimise(active, trials)
         squared = solver.squared_residuals()
         scale = float(np.median(squared[active != 0] / typical[active != 0])) if active.any() else 1.0
-        active[:] = squared <= config.outlier * limit * max(scale, 1.0)
+        active[:] = squared <= limit * max(scale, 1.0)
     offset, cov = solver.border_estimate(active)
     return BundleResult(
         unpack(solver.cameras), solver.points, active != 0, initial, cost, solver.trials, solver.operations, offset, cov

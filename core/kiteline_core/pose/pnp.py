@@ -9,16 +9,11 @@ from kiteline_core.geometry import se3
 from kiteline_core.pose import pnp_kernels as kernels
 from kiteline_core.pose.pose_kernels import optimise_pose
 
-
-@dataclass(frozen=True, slots=True)
-class RansacConfig:
-    """Number of draws, and inlier limits."""
-
-    draws: int = 300  # at most; finds a triple without outliers among 25 % inliers with 99 %
-    confidence: float = 0.99  # that one of the draws was free of outliers: then drawing ends
-    limit_px: float = 3.0  # error of an inlier at octave 0: three deviations of a corner's place
-    chi2: float = 9.21  # of the refinement: 99 % of a chi-square with 2 degrees of freedom
-    sigma_px: float = 1.0  # deviation of a detected corner at octave 0
+RANSAC_CONFIDENCE = 0.99  # that one of the draws was free of outliers: then drawing ends
+RANSAC_LIMIT_PX = 3.0  # px; error of an inlier at octave 0: three deviations of a corner's place
+RANSAC_DRAWS = 300  # at most; finds a triple without outliers among 25 % inliers with 99 %
+PIXEL_CHI2 = 9.21  # of the refinement: 99 % of a chi-square with 2 degrees of freedom
+CORNER_SIGMA_PX = 1.0  # px; deviation of a detected corner at octave 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,16 +25,12 @@ class PoseFit:
     inliers: int
 
 
-def solve_pnp(
-    points: F64, depth_ray: F64, observed: F64, octave: U8, camera: F64, seed: int,
-    config: RansacConfig | None = None,
-) -> PoseFit | None:  # fmt: skip
+def solve_pnp(points: F64, depth_ray: F64, observed: F64, octave: U8, camera: F64, seed: int) -> PoseFit | None:
     """Camera pose by P3P in RANSAC, then robust optimisation; None without enough inliers.
 
     points: (n,3) m. depth_ray: (n,3) m, one standard deviation along the ray. observed: (n,3) u, v, disparity px
     (< 0: none). octave: (n,). camera: (5,) fx, fy, cx, cy, bf. seed: determines the draws.
     """
-    config = config or RansacConfig()
     n = len(points)
     if n < 4:
         return None
@@ -47,12 +38,12 @@ def solve_pnp(
     T, inlier = np.eye(4), np.zeros(n, np.bool_)
     uv = np.ascontiguousarray(observed[:, :2])
     count = kernels.p3p_ransac(
-        points, uv, config.limit_px * scale, camera, config.draws, config.confidence, generator_state(seed), T, inlier
+        points, uv, RANSAC_LIMIT_PX * scale, camera, RANSAC_DRAWS, RANSAC_CONFIDENCE, generator_state(seed), T, inlier
     )
     if count < 4:
         return None
     inliers, _ = optimise_pose(
-        T, points, depth_ray, observed, config.sigma_px * scale, camera, 3, 4, config.chi2, inlier
+        T, points, depth_ray, observed, CORNER_SIGMA_PX * scale, camera, 3, 4, PIXEL_CHI2, inlier
     )
     if not np.isfinite(T).all():
         return None

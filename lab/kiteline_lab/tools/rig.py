@@ -18,8 +18,8 @@ from kiteline_agent.imaging import row_alignment
 from kiteline_agent.inertial.calibration.known_imu import KnownImuConfig
 from kiteline_agent.known_rig import KnownRigConfig, known_rig
 from kiteline_agent.runtime import rig_file
-from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.mapper import Mapper
+from kiteline_basestation.refinement.disparity_calibration import CALIBRATED_PX
 from kiteline_core.arrays import F64
 from kiteline_core.errors import KitelineError
 from kiteline_core.geometry import disparity_offset, se3
@@ -84,7 +84,7 @@ class KnownCameras:
         out = cls()
         out.cameras.update(mapper.map.cameras)
         out.disparity_px.update(mapper.map.disparity_offset_px)
-        sure_px = BaseConfig().disparity.calibrated_px  # a store says only whose deviation is smaller
+        sure_px = CALIBRATED_PX  # a store says only whose deviation is smaller
         out.sigma_px.update(dict.fromkeys(mapper.map.disparity_calibrated, sure_px) | mapper.map.disparity_sigma_px)
         out.rows_px.update(mapper.map.rows_px)
         out.rows_read.update(mapper.map.rows_read)

@@ -211,6 +211,17 @@ def test_dead_reckoning_from_an_unknown_speed_is_worse() -> None:
     np.testing.assert_allclose(sigma[1], np.repeat([5.0 * 0.3 + 0.09, 1.0 * 0.3 + 0.09], 3), rtol=1e-6)
 
 
+@pytest.mark.parametrize(("option", "axis"), [("unmeasured_accel_m_s2", 0), ("unmeasured_turn_rad_s2", 3)])
+def test_a_livelier_vehicle_is_less_certain_in_the_dark(option: str, axis: int) -> None:
+    sigma = []
+    for value in (2.0, 4.0):
+        _, covariance = begun(calibration_px=0.0, **{option: value})
+        covariance.begin_submap(np.eye(4))
+        covariance.dead_reckon(1.0, None)
+        sigma.append(np.sqrt(covariance.of_poses(PoseState(), np.eye(4))[0][axis, axis]))
+    assert sigma[1] > 1.5 * sigma[0]
+
+
 def test_how_likely_an_error_is_small() -> None:
     rng = np.random.default_rng(1)
     for sigma in ([0.1, 0.1, 0.1], [0.2, 0.02, 0.05], [0.01, 0.01, 0.01], [1.0, 1.0, 0.1]):

@@ -131,16 +131,20 @@ def test_tracker_is_chosen_by_option() -> None:
     assert agent_config("", tracker="ekf").tracker == "ekf"
 
 
-def _flow() -> tuple[CornerFlow, U8]:
+def _flow(config: EkfConfig | None = None) -> tuple[CornerFlow, U8]:
     """Corners of an image of squares."""
     rng = np.random.default_rng(0)
     image = np.kron(rng.integers(0, 256, (60, 80)), np.ones((4, 4))).astype(np.uint8)
     image = cv2.GaussianBlur(image, (5, 5), 1.0)
     camera = RectifiedCamera(320, 240, 200.0, 200.0, 159.5, 119.5, 0.1, False, np.eye(4))
-    flow = CornerFlow(camera, DetectorConfig(levels=1), AlignConfig(), EkfConfig())
+    flow = CornerFlow(camera, DetectorConfig(levels=1), AlignConfig(), config or EkfConfig())
     flow.replenish(build_pyramid(image, 3), np.eye(4))
     assert len(flow.ids) > 20
     return flow, image
+
+
+def test_no_more_corners_are_followed_than_is_asked() -> None:
+    assert len(_flow(EkfConfig(corners=24))[0].ids) == 24 < len(_flow()[0].ids)
 
 
 def test_corner_is_brought_back_to_its_template_or_dropped() -> None:

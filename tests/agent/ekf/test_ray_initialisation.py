@@ -4,6 +4,7 @@ from functools import cache
 
 import numpy as np
 
+from kiteline_agent.ekf.ekf_slam import _RESIDUAL_GATE
 from kiteline_agent.ekf.filter_state import FilterState
 from kiteline_agent.ekf.ray_initialisation import (
     Rays,
@@ -152,10 +153,10 @@ def test_errors_of_new_landmarks_are_as_their_covariance_says() -> None:
 def test_distance_that_rays_do_not_tell_and_rays_that_do_not_meet_are_known() -> None:
     model, rng = vehicle.VehicleModel(planar=True, turn_noise=0.001), np.random.default_rng(0)
     state, (track,) = _drawn(model, rng)
-    assert rays_meet(state, _rays(state, track), EkfConfig().residual_gate)
+    assert rays_meet(state, _rays(state, track), _RESIDUAL_GATE)
     assert 0.001 < distance_share(state, _rays(state, track)) < 0.1
     track.xy[1, 1] += 10.0 * _SIGMA
-    assert not rays_meet(state, _rays(state, track), EkfConfig().residual_gate)
+    assert not rays_meet(state, _rays(state, track), _RESIDUAL_GATE)
 
 
 def _direction_errors(wrong: int, noisy: bool) -> tuple[float, float, float]:

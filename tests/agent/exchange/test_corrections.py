@@ -29,7 +29,7 @@ def made(calibrate: Callable[[DisparityCalibration], list[str]] | None) -> Corre
     camera, config = RectifiedCamera(752, 480, 450.0, 450.0, 370.0, 240.0, 0.11, True, np.eye(4)), AgentConfig()
     local_map = LocalMap(camera, config.local_map)
     local_map.activate(FIRST)
-    cache = MapCache(camera, config.map_cache, config.matching, config.ransac, None)
+    cache = MapCache(camera, config.map_cache, None)
     return Corrections(local_map, cache, config.smoothing, calibrate)
 
 
@@ -172,7 +172,7 @@ SUBMAP = submap_id(3, 1, 0)
 @pytest.mark.parametrize("pace", [0.0, 0.5])
 def test_a_place_with_a_scale_stretches_the_way_but_not_the_arm(pace: float) -> None:
     config = AgentConfig()
-    window = MapCache(CAMERA, config.map_cache, config.matching, config.ransac, None)
+    window = MapCache(CAMERA, config.map_cache, None)
     local_map = LocalMap(CAMERA, config.local_map)
     base = Corrections(local_map, window, SmoothingConfig(max_m_s=pace, max_rad_s=pace, snap_m=0.3))
     T_m_c = se3.exp(np.array([2.0, 1.0, 0.3, 0.1, 0.4, -0.2]))

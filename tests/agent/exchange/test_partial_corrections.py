@@ -26,7 +26,7 @@ class _Flight:
 
     def __init__(self, keyframes: int) -> None:
         self.map = LocalMap(CAMERA, CONFIG.local_map)
-        cache = MapCache(CAMERA, CONFIG.map_cache, CONFIG.matching, CONFIG.ransac, None)
+        cache = MapCache(CAMERA, CONFIG.map_cache, None)
         self.corrections = Corrections(self.map, cache, CONFIG.smoothing)
         self.covariance = PoseCovariance(self.map, np.eye(4), CONFIG.covariance, has_body=False, has_depth=True)
         for k in range(keyframes):

@@ -117,9 +117,7 @@ def flown(rng: np.random.Generator) -> tuple[Corrections, LocalMap]:
             KeyframeHeader(keyframe_id(SUBMAP, k), k, NO_KEYFRAME, T_m_k, n), T_m_k,
             plain_landmarks(uv, 0.3), k,
         )  # fmt: skip
-    corrections = Corrections(
-        local_map, MapCache(camera, config.map_cache, config.matching, config.ransac, None), config.smoothing
-    )
+    corrections = Corrections(local_map, MapCache(camera, config.map_cache, None), config.smoothing)
     corrections.take([SubmapPlacement(SUBMAP, np.eye(4))], [])
     return corrections, local_map
 

@@ -70,7 +70,7 @@ def test_a_search_counts_the_keyframes_that_it_enters(recording: Path) -> None:
 def test_a_search_enters_a_few_keyframes_the_newest_first(recording: Path) -> None:
     source = open_source(str(recording))
     config = AgentConfig()
-    config = replace(config, relocalisation=replace(config.relocalisation, entered=1))
+    config = replace(config, relocalisation=replace(config.relocalisation, indexed_per_frame=1))
     agent = Agent(source.rig, None, config, Identity(AgentId(0), 0), NoBaseChannel(), shipped_vocabulary())
     relocaliser = agent._relocaliser
     for frame in [item for item in source if isinstance(item, Frame)][:12]:

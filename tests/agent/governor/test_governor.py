@@ -206,6 +206,13 @@ def test_effort_scales_what_the_user_has_chosen() -> None:
     assert governed(chosen, FULL).align.points == 120
     assert governed(chosen, CARRIED[-1]).align.points == round(120 * CARRIED[-1].points)
     assert governed(chosen, FULL).align.fine_from == 0
+    halved = replace(
+        chosen, pyramid=replace(chosen.pyramid, first=1), detector=replace(chosen.detector, first=1),
+        keyframe=replace(chosen.keyframe, rotation_rad=0.2),
+    )  # fmt: skip
+    assert governed(halved, FULL) == halved
+    turned_rad = governed(halved, ALONE[-1]).keyframe.rotation_rad
+    assert turned_rad == pytest.approx(0.2 * ALONE[-1].keyframes)
 
 
 @pytest.mark.parametrize(("every_s", "first"), [(3.0, 0), (1.0, 1)])
@@ -283,3 +290,18 @@ def test_the_first_search_costs_the_same_at_any_effort() -> None:
             cost_ns += 7_000_000
         spent.append(cost_ns)
     assert max(spent) > 7_000_000 and max(sum(spent[k - 19 : k + 1]) for k in range(60, 200)) <= 16_000_000
+
+
+@pytest.mark.parametrize("max_gap_s", [0.35, 0.15])
+def test_images_alone_are_tracked_after_the_longest_gap_while_the_budget_lasts(max_gap_s: float) -> None:
+    flight = Flight(0.12 * LOAD, dearer=1.3, carried=False)
+    flight.governor = Governor(GovernorConfig(cpu_percent=0.12 * LOAD, max_gap_s=max_gap_s))
+    flight.fly(600)
+    gaps = np.diff(np.flatnonzero(flight.tracked[200:])) * PERIOD_NS * 1e-9
+    assert np.median(gaps) == pytest.approx(max_gap_s)
+
+
+@pytest.mark.parametrize(("first_frame_ms", "full"), [(0.35, True), (35.0, False)])
+def test_what_frames_are_expected_to_cost_decides_the_first_effort(first_frame_ms: float, full: bool) -> None:
+    governor = Governor(GovernorConfig(cpu_percent=0.5 * LOAD, first_frame_ms=first_frame_ms))
+    assert (governor.frame(0, 0, carried=False).effort == FULL) == full

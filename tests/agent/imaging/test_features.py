@@ -47,6 +47,14 @@ def test_one_corner_a_free_cell_strongest_first() -> None:
     assert not free & {tuple(c) for c in (again.uv // config.cell_px).astype(int)}
 
 
+def test_a_noisier_camera_has_stronger_corners_by_stricter_thresholds() -> None:
+    pyramid, config = build_pyramid(blobs(1), 4), replace(DetectorConfig(), faint_below=1)
+    usual = detect(pyramid, np.zeros((0, 2)), config)
+    assert len(detect(pyramid, np.zeros((0, 2)), replace(config, fast_threshold=80)).uv) < 0.9 * len(usual.uv)
+    least = float(np.median(usual.score))
+    assert detect(pyramid, np.zeros((0, 2)), replace(config, min_score=least)).score.min() >= least
+
+
 def test_covered_parts_have_no_corners_and_the_rest_has_the_same() -> None:
     pyramid, config = build_pyramid(blobs(1), 4), DetectorConfig()
     h, w = pyramid[0].shape

@@ -163,8 +163,38 @@ def test_offsets_of_few_points_or_without_texture_count_for_nothing() -> None:
     assert off.apply() == 0.0
 
 
-def test_the_right_half_image_follows() -> None:
-    rectifier, _, right = flight(Lens.RADTAN, TURNED)
+@pytest.mark.parametrize("lens", [Lens.NONE, Lens.RADTAN])
+@pytest.mark.parametrize("pitch_rad", [0.015, -0.03])  # 6 and 13 rows
+def test_rows_that_are_known_to_a_pixel_are_measured_from_there(lens: Lens, pitch_rad: float) -> None:
+    turned = np.array([pitch_rad, 0.0, 0.0])
+    rectifier, left, right = flight(lens, turned)
+    off_px = float(np.round(np.median(expected(rectifier, UV, turned))))
+    rows = RowAlignment(rectifier, RowConfig())
+    assert rows.read_lower(off_px)
+    pyramids = build_pyramid(rectifier.left(left), LEVELS), build_pyramid(right, LEVELS)
+    disparity = np.full(len(UV), rectifier.camera.bf / DEPTH_M)
+    assert rows.add(*pyramids, UV, np.zeros(len(UV), np.uint8), disparity) > 0
+    rows.apply()  # also less than half a pixel
+    assert len(rows.take_events()) == 1
+    offset, found = measured(rectifier, left, right)
+    assert found.mean() > 0.7
+    assert np.sqrt(np.median(offset[found] ** 2)) < 0.15
+    assert np.abs(rows.at(UV) - expected(rectifier, UV + [disparity[0], 0.0], turned)).max() < 0.3
+    rows.add(*pyramids, UV, np.zeros(len(UV), np.uint8), disparity)
+    assert rows.apply() == 0.0
+
+
+def test_rows_that_are_off_by_less_than_a_pixel_need_no_search() -> None:
+    rectifier, _, _ = flight(Lens.RADTAN, TURNED)
+    grid = rectifier.right_grid
+    assert not RowAlignment(rectifier, RowConfig()).read_lower(0.9)
+    assert not RowAlignment(rectifier, replace(RowConfig(), on=False)).read_lower(9.0)
+    assert rectifier.right_grid is grid
+
+
+@pytest.mark.parametrize("lens", [Lens.NONE, Lens.RADTAN])
+def test_the_right_half_image_follows(lens: Lens) -> None:
+    rectifier, _, right = flight(lens, TURNED)
     half = build_pyramid(right, 2)[1]
     before = rectifier.halved(1, half).astype(np.float64)
     rectifier.set_right_rows(lambda uv: np.full(len(uv), 4.0))  # two rows of level 1

@@ -39,7 +39,7 @@ def test_the_accelerometer_alone_sets_the_body_upright() -> None:
 
 
 def test_without_an_imu_gravity_is_not_awaited() -> None:
-    aligner = GravityAligner(CAMERA, None, 0.035, 2.0)
+    aligner = GravityAligner(CAMERA, None)
     np.testing.assert_array_equal(aligner.R_l_o, np.eye(3))
     assert aligner.update(0, np.eye(4), np.eye(3), SubmapId(0), first=True) is None
     ahead = aligner.first_pose(None)[:3, :3]
@@ -48,7 +48,7 @@ def test_without_an_imu_gravity_is_not_awaited() -> None:
 
 def test_the_base_is_told_once_and_the_place_stays() -> None:
     knows = Knows()
-    aligner = GravityAligner(CAMERA, knows, 0.035, 2.0)
+    aligner = GravityAligner(CAMERA, knows)
     T_m_b = se3.from_rt(np.eye(3), np.array([1.0, 2.0, 3.0]))
     assert aligner.update(0, T_m_b, np.eye(3), SubmapId(0), first=True) is None
     assert aligner.R_l_o is None
@@ -70,12 +70,12 @@ def test_the_base_is_told_once_and_the_place_stays() -> None:
 
 def test_what_leans_hardly_is_left_and_patience_ends() -> None:
     knows = Knows()
-    hardly = GravityAligner(CAMERA, knows, 0.035, 2.0)
+    hardly = GravityAligner(CAMERA, knows)
     knows.up = se3.so3_exp(np.array([0.02, 0.0, 0.0]))
     assert hardly.update(0, np.eye(4), np.eye(3), SubmapId(0), first=True) is None
     assert abs(hardly.R_l_o[2, 1]) > 0.01  # the flight controller gets even this
     knows.up = None
-    patient = GravityAligner(CAMERA, knows, 0.035, 2.0)
+    patient = GravityAligner(CAMERA, knows)
     for t_s in (0.0, 1.0, 1.9):
         patient.update(int(t_s * 1e9), np.eye(4), np.eye(3), SubmapId(0), first=True)
         assert patient.R_l_o is None

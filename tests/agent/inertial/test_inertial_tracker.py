@@ -329,3 +329,9 @@ def test_a_new_map_after_a_blackout_needs_no_new_start() -> None:
             if k > 50:
                 assert apart_m(state, shift @ step.truth) < 0.01
     assert tracker.running and tracker.started == "motion"
+
+
+@pytest.mark.parametrize("limit", [{}, {"rest_gyro_rad_s": 1e-5}, {"rest_accel_m_s2": 1e-4}])
+def test_how_much_motors_may_shake_at_rest_is_an_option(limit: dict[str, float]) -> None:
+    tracker, _ = run(flight(20, rest_s=1.0), config=replace(InertialConfig(), **limit))
+    assert (tracker.started == "rest") == (not limit)

@@ -3,15 +3,13 @@
 import numpy as np
 import pytest
 
-from kiteline_agent.inertial.inertial_config import ScaleFilterConfig
 from kiteline_agent.inertial.preintegration import Samples
-from kiteline_agent.inertial.scale_filter import ScaleFilter
+from kiteline_agent.inertial.scale_filter import _IMAGE_RAD, _IMU_INFLATION, _SCALE_WALK, _START_SCALE, ScaleFilter
 from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry import se3
 
 CALIBRATION = ImuCalibration()
 GRAVITY = np.array([0.0, 0.0, -9.81])
-CONFIG = ScaleFilterConfig()
 HZ, EVERY, SECONDS, DEPTH_M = 200.0, 80, 16.0, 4.0
 CHI2_99_9_OF_24 = 51.2
 
@@ -27,16 +25,16 @@ def flown(seed: int, accel_noise: float, told: float) -> tuple[float, float, flo
             p[:, axis] += size * np.sin(w * t + phase)
             v[:, axis] += size * w * np.cos(w * t + phase)
             a[:, axis] -= size * w * w * np.sin(w * t + phase)
-    density = accel_noise * CONFIG.imu_inflation * CALIBRATION.accel_noise
+    density = accel_noise * _IMU_INFLATION * CALIBRATION.accel_noise
     walk = np.cumsum(0.01 / np.sqrt(HZ) * rng.standard_normal((len(t), 3)), axis=0)
     force = a - GRAVITY + 0.05 * rng.standard_normal(3) + walk + density * np.sqrt(HZ) * rng.standard_normal(a.shape)
     at = np.arange(0, len(t), EVERY)
-    drift = CONFIG.scale_walk * np.sqrt(EVERY / HZ) * rng.standard_normal(len(at))
-    units = np.exp(CONFIG.start_scale * rng.standard_normal() + np.cumsum(drift))  # of the map, in a metre
+    drift = _SCALE_WALK * np.sqrt(EVERY / HZ) * rng.standard_normal(len(at))
+    units = np.exp(_START_SCALE * rng.standard_normal() + np.cumsum(drift))  # of the map, in a metre
     steps = np.diff(p[at], axis=0) * units[1:, None]
     seen = np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])
-    seen = seen + CONFIG.image_rad * DEPTH_M * rng.standard_normal(seen.shape)
-    found = ScaleFilter(CONFIG, CALIBRATION, 9.81, np.zeros(3))
+    seen = seen + _IMAGE_RAD * DEPTH_M * rng.standard_normal(seen.shape)
+    found = ScaleFilter(CALIBRATION, 9.81, np.zeros(3))
     off = (0.05 * rng.standard_normal(3), 0.05 * rng.standard_normal(3))
     found.start(v[0] + off[0], GRAVITY + off[1], np.zeros(6), told)
     for k in range(len(at) - 1):

@@ -10,7 +10,7 @@ from kiteline_agent.inertial.preintegration import BiasPrior, Samples
 from kiteline_agent.inertial.sample_buffer import SampleBuffer
 from kiteline_agent.inertial_start_config import InertialBundleConfig
 from kiteline_agent.initialisation.corner_tracks import CornerObservations
-from kiteline_agent.initialisation.inertial_bundle import InertialBundle
+from kiteline_agent.initialisation.inertial_bundle import _MAX_RMS, InertialBundle
 from kiteline_agent.initialisation.inertial_window import WarmStart, WindowSolution, finished
 from kiteline_agent.initialisation.lens_correction import TERMS, moved
 from kiteline_agent.initialisation.window_kernels import add_observations
@@ -162,7 +162,7 @@ def test_noise_of_the_accelerometer_is_found_from_more_than_there_is(factor: flo
     noise, config = WindowNoise(accel=20.0), replace(CONFIG, sigma_px=0.5, huber=1.5)  # corners are as good as said
     for _ in range(3):
         found = InertialBundle(corners, shaken, CALIBRATION, T_B_C, FOCAL, 9.81, PRIOR, config, noise).solve()
-        noise = found.evidence.updated(noise, 6.0)
+        noise = found.evidence.updated(noise)
     assert 0.5 * factor < noise.accel < 2.0 * factor
     assert noise.gyro < 3.0
 
@@ -171,10 +171,10 @@ def test_noise_of_the_accelerometer_is_not_believed_below_its_least() -> None:
     """A window whose path follows the vibration leaves few errors to show it."""
     few = NoiseEvidence(chi2=np.array([1.0, 1.0, 1.0]), expected=np.array([30.0, 30.0, 3.0]))
     before = WindowNoise(1.0, 4.0, 1.0)
-    assert few.updated(before, 6.0).accel < 1.0
-    assert few.updated(before, 6.0, 3.0).accel == 3.0
+    assert few.updated(before).accel < 1.0
+    assert few.updated(before, 3.0).accel == 3.0
     many = NoiseEvidence(chi2=np.array([30.0, 40.0, 3.0]), expected=np.array([30.0, 30.0, 3.0]))
-    assert many.updated(before, 6.0, 3.0) == many.updated(before, 6.0)
+    assert many.updated(before, 3.0) == many.updated(before)
 
 
 def walking(corners: CornerObservations, truth: F64, share: float, seed: int) -> tuple[CornerObservations, Bool]:
@@ -211,7 +211,7 @@ def test_costs_with_and_without_walking_corners_can_be_compared() -> None:
     crowd, walks = walking(corners, truth, 0.3, 1)
     with_them, without = bundle(crowd, samples).solve(), bundle(crowd.part(np.flatnonzero(~walks)), samples).solve()
     observations = np.count_nonzero(corners.seen[:, walks])
-    each = CONFIG.huber * (CONFIG.max_rms - 0.5 * CONFIG.huber)
+    each = CONFIG.huber * (_MAX_RMS - 0.5 * CONFIG.huber)
     assert with_them.cost - without.cost == pytest.approx(observations * each, rel=0.2)  # some corners that stay, too
 
 

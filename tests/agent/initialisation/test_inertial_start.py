@@ -292,3 +292,11 @@ def test_frames_do_not_wait_for_ever() -> None:
         assert len(waiting) <= 64
     frame, imu = waiting.next()
     assert imu is not None and imu.t_ns[0] == 0 and imu.t_ns[-1] == frame.t_ns  # samples of all frames before
+
+
+def test_biases_of_the_imu_are_as_unknown_as_is_said() -> None:
+    config = AgentConfig()
+    bundle = replace(config.inertial_start.bundle, gyro_bias_rad_s=0.3, accel_bias_m_s2=0.5)
+    config = replace(config, inertial_start=replace(config.inertial_start, bundle=bundle))
+    start = InertialStart(CAMERA, CALIBRATION, config, Work())
+    assert start._default_prior().sigma.tolist() == [0.3] * 3 + [0.5] * 3

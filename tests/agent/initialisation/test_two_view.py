@@ -5,7 +5,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kiteline_agent.config import TwoViewConfig
 from kiteline_agent.initialisation import two_view_models
 from kiteline_agent.initialisation.two_view import TwoView, two_view
 from kiteline_core.arrays import F64
@@ -13,7 +12,6 @@ from kiteline_core.geometry import se3
 
 CAMERA = np.array([450.0, 455.0, 372.0, 238.0])
 SIZE = np.array([752.0, 480.0])
-CONFIG = TwoViewConfig()
 
 
 def scene(random: np.random.Generator, flat: bool, n: int = 260) -> F64:
@@ -55,7 +53,7 @@ def errors(result: TwoView, T_b_a: F64) -> tuple[float, float]:
 def test_clean_matches_give_the_motion_and_the_scene(flat: bool) -> None:
     T_b_a = motion()
     points, a, b = seen(flat, T_b_a)
-    result = two_view(a, b, CAMERA, CONFIG, 0)
+    result = two_view(a, b, CAMERA, 0)
     assert result.flat == flat
     assert max(errors(result, T_b_a)) < 1e-4
     scale = float(np.linalg.norm(T_b_a[:3, 3]))
@@ -68,7 +66,7 @@ def test_clean_matches_give_the_motion_and_the_scene(flat: bool) -> None:
 def test_noise_and_outliers_are_borne(flat: bool, seed: int) -> None:
     T_b_a = motion()
     _, a, b = seen(flat, T_b_a, noise_px=0.3, outliers=60, seed=seed)
-    result = two_view(a, b, CAMERA, CONFIG, seed)
+    result = two_view(a, b, CAMERA, seed)
     turned, aside = errors(result, T_b_a)
     assert turned < 0.01 and aside < 0.06
     assert np.count_nonzero(result.good[:60]) < 12
@@ -78,7 +76,7 @@ def test_noise_and_outliers_are_borne(flat: bool, seed: int) -> None:
 def test_forward_motion_leaves_out_points_without_parallax() -> None:
     T_b_a = se3.from_rt(np.eye(3), np.array([0.0, 0.0, -0.9]))
     points, a, b = seen(False, T_b_a, noise_px=0.2)
-    result = two_view(a, b, CAMERA, CONFIG, 0)
+    result = two_view(a, b, CAMERA, 0)
     assert result is not None and max(errors(result, T_b_a)) < 0.03
     near_axis = np.linalg.norm(points[:, :2] / points[:, 2:], axis=1) < 0.01
     assert not result.good[near_axis].any()
@@ -86,20 +84,20 @@ def test_forward_motion_leaves_out_points_without_parallax() -> None:
 
 def test_a_mere_turn_says_nothing() -> None:
     _, a, b = seen(False, se3.exp(np.array([0.0, 0.0, 0.0, 0.05, 0.1, 0.0])), noise_px=0.3)
-    assert two_view(a, b, CAMERA, CONFIG, 0) is None
+    assert two_view(a, b, CAMERA, 0) is None
 
 
 def test_no_motion_and_no_relation_say_nothing() -> None:
     random = np.random.default_rng(0)
     _, a, b = seen(False, np.eye(4), noise_px=0.2)
-    assert two_view(a, b, CAMERA, CONFIG, 0) is None
-    assert two_view(a, random.uniform([0.0, 0.0], SIZE, a.shape), CAMERA, CONFIG, 0) is None
-    assert two_view(a[:99], a[:99] + 5.0, CAMERA, CONFIG, 0) is None
+    assert two_view(a, b, CAMERA, 0) is None
+    assert two_view(a, random.uniform([0.0, 0.0], SIZE, a.shape), CAMERA, 0) is None
+    assert two_view(a[:99], a[:99] + 5.0, CAMERA, 0) is None
 
 
 def test_the_same_seed_gives_the_same_bits() -> None:
     _, a, b = seen(False, motion(), noise_px=0.5, outliers=80)
-    first, second = (two_view(a, b, CAMERA, CONFIG, 7) for _ in range(2))
+    first, second = (two_view(a, b, CAMERA, 7) for _ in range(2))
     assert first.T_b_a.tobytes() == second.T_b_a.tobytes() and first.points.tobytes() == second.points.tobytes()
 
 

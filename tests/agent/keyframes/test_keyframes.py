@@ -30,6 +30,31 @@ def test_bare_regions_need_a_keyframe_only_where_the_last_one_filled_them() -> N
     assert keyframe_need(replace(left, cover=0.30, reference_cover=0.42), CONFIG) is not None
 
 
+def test_a_camera_that_sees_less_needs_keyframes_after_smaller_turns() -> None:
+    turned = replace(USUAL, turned_rad=0.2)
+    assert keyframe_need(turned, CONFIG) is None
+    need = keyframe_need(turned, replace(CONFIG, rotation_rad=0.15))
+    assert need is not None and need.rule == "new direction"
+
+
+@pytest.mark.parametrize(("first_points", "min_depth_m", "begins"), [
+    (40, 0.25, True), (10_000, 0.25, False), (40, 100.0, False),
+])  # fmt: skip
+def test_a_map_begins_with_as_many_landmarks_as_is_asked_where_surfaces_are_looked_for(
+    recording: Path, first_points: int, min_depth_m: float, begins: bool
+) -> None:
+    wall, config = load(str(recording), frames=3), AgentConfig()
+    config = replace(
+        config,
+        local_map=replace(config.local_map, first_points=first_points),
+        stereo=replace(config.stereo, min_depth_m=min_depth_m),
+    )
+    agent = FlyingAgent(wall.rig, None, config, vocabulary=False)
+    for item in wall.items:
+        agent.step(item)
+    assert bool(agent.run.tracked) == begins
+
+
 def test_a_view_of_which_two_thirds_are_black_does_not_make_a_keyframe_of_every_second_frame(recording: Path) -> None:
     wall = load(str(recording))
 

@@ -1,6 +1,7 @@
 """The offset of disparities is found on board, by the parallax of landmarks."""
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -10,11 +11,12 @@ import pytest
 from kiteline_agent.config import AgentConfig, DisparityAlignmentConfig
 from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_agent.governor.cost_model import Work
+from kiteline_agent.local_map.disparity_alignment import _WORN_SHARE
 from kiteline_agent.mapping.right_camera import RightCamera
 from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraModel, CameraRig, Rectifier
-from kiteline_core.geometry.disparity_offset import TERMS, terms
+from kiteline_core.geometry.disparity_offset import GOOD_PX, TERMS, terms
 from kiteline_core.ids import AgentId
 from tests.agent.disparity_flights import AHEAD, CAMERA, NOTHING, SIDEWAYS, WORN, Flight, normalised
 
@@ -29,11 +31,26 @@ def test_the_offset_of_a_worn_rig_is_found_and_corrects_the_map(seed: int) -> No
     grid = terms(normalised(np.array([[x, y] for x in (60.0, 376.0, 690.0) for y in (60.0, 240.0, 420.0)])))
     left = np.sqrt(np.mean((grid @ (WORN - flight.map.disparity_offset)) ** 2))
     assert left < 0.3 * np.sqrt(np.mean((grid @ WORN) ** 2))
-    worn_rig = np.trace(before) / DisparityAlignmentConfig().worn_share
+    worn_rig = np.trace(before) / _WORN_SHARE
     assert np.trace(flight.alignment.expected_cov) < 0.08 * worn_rig
     off = flight.map.rho[0, :160] - 1.0 / flight.depth
     assert abs(np.median(off * CAMERA.bf)) < 0.15
     assert flight.alignment.take_events() and not flight.alignment.take_events()
+
+
+BENT = np.array([6.0, 0.4, 0.1, 5.5, 0.3])  # a right camera that is turned by 0.8 degrees
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_an_offset_beyond_any_wear_is_found_as_well(seed: int) -> None:
+    flight, worn = Flight(BENT, seed, SIDEWAYS), Flight(1.5 * WORN, seed, SIDEWAYS)
+    wear = np.trace(flight.alignment.cov)
+    flight.fly(80), worn.fly(80)
+    grid = terms(normalised(np.array([[x, y] for x in (60.0, 376.0, 690.0) for y in (60.0, 240.0, 420.0)])))
+    left = np.sqrt(np.mean((grid @ (BENT - flight.map.disparity_offset)) ** 2))
+    assert left < 0.06 * np.sqrt(np.mean((grid @ BENT) ** 2))
+    assert np.trace(np.linalg.inv(flight.alignment._prior)) == pytest.approx(64.0 * wear)
+    assert np.trace(np.linalg.inv(worn.alignment._prior)) == pytest.approx(wear)  # wear keeps its own prior
 
 
 def test_frames_that_are_skipped_do_not_make_pairs_rarer() -> None:
@@ -70,7 +87,7 @@ def test_a_true_rig_is_left_alone(seed: int) -> None:
 
 def test_rows_that_are_off_tell_of_a_worn_rig_before_it_moves() -> None:
     alignment = Flight(NOTHING, 0, SIDEWAYS).alignment
-    doubtful, prior, share = alignment.expected_cov, alignment.cov, DisparityAlignmentConfig().worn_share
+    doubtful, prior, share = alignment.expected_cov, alignment.cov, _WORN_SHARE
     assert alignment.rig_worn == pytest.approx(share)
     alignment.add_row_evidence(12.0)
     assert alignment.rig_worn > 0.999
@@ -160,7 +177,7 @@ def test_forward_motion_does_not_tell_of_a_rig_that_is_worn_a_little() -> None:
     flight = Flight(WORN, 1, AHEAD)
     assert flight.fly(60)  # as far off as good calibrations may be
     assert flight.alignment.is_good_offset and flight.alignment.applied_sigma_px is None
-    good_px = np.full(TERMS, DisparityAlignmentConfig().good_px)
+    good_px = np.full(TERMS, GOOD_PX)
     assert np.sqrt(np.mean((flight.map.disparity_offset / good_px) ** 2)) < 3.0
 
 
@@ -297,3 +314,13 @@ def test_it_is_deterministic() -> None:
         return flight.map.disparity_offset.tobytes() + flight.alignment.expected_cov.tobytes()
 
     assert found() == found()
+
+
+@pytest.mark.parametrize("on", [True, False])
+def test_it_may_be_left_to_the_base(on: bool) -> None:
+    lens = CameraModel(752, 480, 430.0, 430.0, 376.0, 240.0)
+    rectifier = Rectifier(CameraRig(lens, lens, np.eye(4), se3.from_rt(np.eye(3), np.array([0.11, 0.0, 0.0]))))
+    config = replace(AgentConfig(), disparities=DisparityAlignmentConfig(on=on))
+    flight = Flight(WORN, 0, SIDEWAYS)
+    right = RightCamera(AgentId(0), cast("Any", Camera()), flight.map, rectifier, config, NoBaseChannel(), Work())
+    assert (right.disparities is not None) == on

@@ -28,7 +28,7 @@ def flown(accel_error: F64, gap: int, seen: int) -> tuple[list[LossMotion], F64]
     accel_error: (3,) m/s^2, from the begin of the loss on.
     """
     tracker = InertialTracker(CAMERA, CALIBRATION, CONFIG)
-    estimator = LossMotionEstimator(tracker, CALIBRATION, CONFIG.loss_motion, CONFIG.gravity_m_s2)
+    estimator = LossMotionEstimator(tracker, CALIBRATION, CONFIG.gravity_m_s2)
     tracker._smoother.start(np.eye(4), VELOCITY, np.zeros(6), -UP, StartDeviations(1e-3, 1e-3, 0.01, 1e-4, 0.1, 5e-3))
     tracker._set_last(0, np.eye(4))
     told, off = [], np.zeros(3)
@@ -79,7 +79,7 @@ def test_a_loss_is_measured_once_and_not_from_too_few_frames() -> None:
 
 def test_without_dead_reckoning_there_is_no_motion() -> None:
     tracker = InertialTracker(CAMERA, CALIBRATION, CONFIG)
-    estimator = LossMotionEstimator(tracker, CALIBRATION, CONFIG.loss_motion, CONFIG.gravity_m_s2)
+    estimator = LossMotionEstimator(tracker, CALIBRATION, CONFIG.gravity_m_s2)
     assert estimator.begin(0, np.eye(4), np.eye(3)) is None
     assert estimator.update(10**9, np.eye(4)) is None
 

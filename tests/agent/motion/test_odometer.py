@@ -366,3 +366,24 @@ def test_where_the_map_lies_does_not_matter(move: F64) -> None:
     turn = np.eye(6)
     turn[:3, :3] = T[:3, :3]
     np.testing.assert_allclose(turn @ cov @ turn.T, other_cov, atol=1e-12)
+
+
+@pytest.mark.parametrize(("option", "value", "axis", "until_s"), [
+    ("floor_m_s", 0.2, 0, 5.0), ("floor_rad_s", 0.1, 3, 5.0), ("accel_m_s2", 4.0, 0, 3.1), ("turn_rad_s2", 8.0, 3, 3.1),
+])  # fmt: skip
+def test_dead_reckoning_is_as_uncertain_as_its_options_say(
+    option: str, value: float, axis: int, until_s: float
+) -> None:
+    """Errors of the samples; and motion once there are none."""
+    batch = odometry.chosen(driven(5.0, noise=0.05), slice(0, round(until_s * 1e9) // SAMPLE_NS))
+    usual = Flown(batch, 4.0, blind_from_s=3.0)
+    worse = Flown(batch, 4.0, blind_from_s=3.0, config=replace(OdometerConfig(), **{option: value}))
+    assert worse.cov[axis, axis] > 1.5 * usual.cov[axis, axis]
+
+
+@pytest.mark.parametrize(("tolerance_m_s", "used"), [(0.12, False), (1.0, True)])
+def test_a_noisy_odometer_is_used_where_that_is_tolerated(tolerance_m_s: float, used: bool) -> None:
+    batch = driven(4.0, noise=1.0)
+    batch = replace(batch, velocity_cov=1e-4 * batch.velocity_cov)  # more noise than it states
+    flown = Flown(batch, 4.0, config=OdometerConfig(tolerance_m_s=tolerance_m_s))
+    assert any(flown.trusted) == used

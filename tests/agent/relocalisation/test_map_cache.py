@@ -84,7 +84,7 @@ def world() -> World:
 
 def window(**limits: float) -> MapCache:
     config = AgentConfig()
-    return MapCache(CAMERA, replace(config.map_cache, **limits), config.matching, config.ransac, shipped_vocabulary())
+    return MapCache(CAMERA, replace(config.map_cache, **limits), shipped_vocabulary())
 
 
 def ring(world: World, box: MapCache, copies: int = 12, submap: SubmapId = HERE) -> None:

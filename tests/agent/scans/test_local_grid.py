@@ -173,9 +173,19 @@ def test_tiles_tell_nothing_of_what_lies_above_their_bands() -> None:
     assert np.isnan(found.distance_m[SECTORS // 2]) and np.isfinite(found.distance_m[0])
 
 
+def test_tiles_tell_nothing_while_own_scans_do_not_know_the_ground() -> None:
+    """A low box would be told to a vehicle that flies above it."""
+    grid, T = LocalGrid(LocalGridConfig()), vehicle(0.0, 0.0, 0.0)
+    low = {(c, r): GridTile(c, r, 0, CELL_M, np.ones((64, 64), np.int8)) for c in range(-5, 5) for r in range(-5, 5)}
+    assert around(low, T)[SECTORS // 2] < 0.5, "without scans all bands are told"
+    grid.add(replace(scan_at(0.0, 0.0, 0.0), height_m=None), EXACT)
+    found = grid.around(TURN @ T, T, low, BANDS_M)
+    assert np.isnan(found.distance_m[SECTORS // 2]) and np.isfinite(found.distance_m[0])
+
+
 def test_a_vertical_that_is_known_late_levels_earlier_scans() -> None:
     """A flight that begins in motion: tilted axes would let a level flight climb out of what it saw."""
-    grid, tilt = LocalGrid(LocalGridConfig()), se3.so3_exp(np.array([0.15, 0.0, 0.1]))
+    grid, tilt = LocalGrid(LocalGridConfig()), se3.so3_exp(np.array([0.04, 0.0, 0.03]))
     for k in range(40):
         scanned = scan_at(-1.5 + 0.1 * k, 0.0, 0.0)
         if k < 3:
@@ -183,7 +193,7 @@ def test_a_vertical_that_is_known_late_levels_earlier_scans() -> None:
             scanned = replace(scanned, scan=wrong)
         grid.add(scanned, EXACT)
     heights = [drawn.z_m for drawn in grid._scans]
-    assert np.ptp(heights) < 0.01
+    assert len(heights) == 40 and np.ptp(heights) < 0.01
     level = LocalGrid(LocalGridConfig())
     for k in range(40):
         level.add(scan_at(-1.5 + 0.1 * k, 0.0, 0.0), EXACT)
@@ -194,6 +204,20 @@ def test_a_vertical_that_is_known_late_levels_earlier_scans() -> None:
     assert np.isnan(found.distance_m).mean() < np.isnan(expected.distance_m).mean() + 0.05
     both = np.isfinite(found.distance_m) & np.isfinite(expected.distance_m)
     assert np.abs(found.distance_m - expected.distance_m)[both].max() < 0.15
+
+
+def test_scans_of_a_vertical_that_was_far_off_are_left_out() -> None:
+    """They took floor or ceiling for what stands at their height. Later ones of the same view are kept as before."""
+    grid, tilt = LocalGrid(LocalGridConfig()), se3.so3_exp(np.array([0.15, 0.0, 0.1]))
+    for k in range(3):
+        scanned = scan_at(0.05 * k, 0.0, 0.0)
+        near = replace(scanned.scan, up_c=tilt @ scanned.scan.up_c, clear_m=np.full(len(scanned.scan), 0.6))
+        grid.add(replace(scanned, scan=near, repeats=k > 0), EXACT)
+    for k in range(8):
+        grid.add(replace(scan_at(0.1, 0.0, 0.0), repeats=k > 0), EXACT)
+    assert len(grid._scans) == 1 + LocalGridConfig().repeats
+    found = grid.around(TURN @ vehicle(0.1, 0.0, 0.0), None, {}, BANDS_M)
+    assert found.distance_m[0] == pytest.approx(EAST - 0.1, abs=0.1)
 
 
 def test_what_was_clear_at_another_height_is_not_free_here() -> None:

@@ -6,20 +6,32 @@ import pytest
 from kiteline_agent.scans import local_grid_kernels as kernels
 
 
+def drawn(clear_m: list[float], clears: bool = True, times: int = 1) -> np.ndarray:
+    """Cells after scans of columns side by side, 0.02 rad each, the first along x."""
+    cells, marks, n = np.zeros((60, 60), np.int8), np.zeros((60, 60), np.int16), len(clear_m)
+    for number in range(1, times + 1):
+        kernels.draw_rays(
+            cells, marks, number, 1.025, 1.525, 0.0, 0.02 * np.arange(n), 0.02, np.array(clear_m), np.full(n, 10.0),
+            0.05, clears,
+        )  # fmt: skip
+    return cells
+
+
 @pytest.mark.parametrize("clears", [True, False])
 def test_rays_clear_what_they_pass_and_mark_what_they_hit(clears: bool) -> None:
-    cells, marks = np.zeros((60, 60), np.int8), np.zeros((60, 60), np.int16)
-    for number in (1, 2):
-        kernels.draw_rays(
-            cells, marks, number, 1.025, 1.525, 0.0, np.zeros(1), 0.02, np.array([1.2]), np.array([10.0]), 0.05, clears
-        )  # fmt: skip
-    expected = np.zeros((60, 60), np.int8)
+    cells, expected = drawn([1.2], clears, times=2), np.zeros((60, 60), np.int8)
     if clears:
         expected[30, 20:43] = 2 * kernels.MISS  # up to a cell and a half before the surface
-    expected[30, 44] = 2 * kernels.HIT
+    expected[30, 44] = 2 * kernels.LONE_HIT
     assert np.array_equal(cells[:, :43], expected[:, :43])
     assert np.array_equal(cells[:, 44:], expected[:, 44:])
     assert cells[30, 43] <= 0
+
+
+@pytest.mark.parametrize(("beside_m", "hit"), [(1.3, kernels.HIT), (1.5, kernels.LONE_HIT), (0.0, kernels.LONE_HIT)])
+def test_a_surface_that_two_columns_see_is_told_at_once_others_when_seen_twice(beside_m: float, hit: int) -> None:
+    assert drawn([1.2, beside_m])[30, 44] == hit
+    assert kernels.LONE_HIT < kernels.OCCUPIED <= min(kernels.HIT, 2 * kernels.LONE_HIT)
 
 
 @pytest.mark.parametrize(("gap_m", "near_m"), [(0.12, 0.4), (10.0, 0.0), (0.04, 0.0)])

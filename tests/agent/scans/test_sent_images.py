@@ -17,7 +17,6 @@ from kiteline_codec.channel import CodedChannel, RecordChannel, coded_channel
 from kiteline_codec.pacing.profiles import RADIO, WIFI, Profile
 from kiteline_codec.schema import Key, KeyframeScan, Record, ScanImages, messages
 from kiteline_core.frame import Frame
-from kiteline_core.ground.config import GroundConfig
 from kiteline_core.ground.disparity import DisparityCamera
 from kiteline_core.ground.ground_height import GroundHeight
 from kiteline_core.ground.image_codes import decode_pair
@@ -90,6 +89,15 @@ def test_images_are_sent_and_nothing_is_matched_on_board(recording: Path) -> Non
     assert [messages.encode(r) for r in again.images] == [messages.encode(r) for r in channel.images]
 
 
+def test_images_of_lower_quality_take_fewer_bytes(recording: Path) -> None:
+    sizes = []
+    for jpeg_quality in (90, 50):
+        channel, config = Heard(), by_base()
+        flown(recording, replace(config, scan=replace(config.scan, jpeg_quality=jpeg_quality)), channel)
+        sizes.append(sum(len(record.images) for record in channel.images))
+    assert sizes[1] < 0.6 * sizes[0]
+
+
 def test_while_images_do_not_arrive_the_agent_makes_its_scans(recording: Path) -> None:
     channel = Heard(busy=True)
     _, matched = flown(recording, by_base(), channel)
@@ -115,7 +123,7 @@ def test_the_base_draws_what_the_images_show_and_they_are_gone(recording: Path) 
     agent, frames = agent_of(recording, by_base(), channel)
     station = Station(BaseConfig(), open_end)
     station.join(AgentId(0))
-    known: GroundHeight[KeyframeScan] = GroundHeight(GroundConfig())
+    known: GroundHeight[KeyframeScan] = GroundHeight()
     known.start_at(BEGINNING)
     station.mapper.image_scans._ground_of = lambda record: known  # type: ignore[method-assign]
     done: tuple[JobDone, ...] = ()

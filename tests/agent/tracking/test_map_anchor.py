@@ -138,7 +138,7 @@ def test_an_evicted_keyframe_does_not_count() -> None:
 
 def corrected(local_map: LocalMap, moved: dict[int, F64], anchor: MapAnchor) -> bool:
     """Whether the map moves when the base sends these motions of keyframes."""
-    cache = MapCache(CAMERA, CONFIG.map_cache, CONFIG.matching, CONFIG.ransac, None)
+    cache = MapCache(CAMERA, CONFIG.map_cache, None)
     corrections = Corrections(local_map, cache, CONFIG.smoothing)
     return corrections.take([pose_record(local_map, k, motion) for k, motion in moved.items()], [], anchor)[0]
 
@@ -161,7 +161,7 @@ def test_corrections_wait_while_the_camera_hardly_moves() -> None:
 
 def test_what_waits_is_not_applied_by_a_step_without_records() -> None:
     local_map, track = scene()
-    cache = MapCache(CAMERA, CONFIG.map_cache, CONFIG.matching, CONFIG.ransac, None)
+    cache = MapCache(CAMERA, CONFIG.map_cache, None)
     corrections = Corrections(local_map, cache, CONFIG.smoothing)
     held = corrections.take(
         [pose_record(local_map, 2, sideways(3.0))], [], MapAnchor(local_map, track, CONFIG, inertial=False)

@@ -158,6 +158,17 @@ def test_a_thin_link_carries_the_best_landmarks_of_few_keyframes(make_flight: Ma
     assert len(later) <= 1
 
 
+def test_what_is_sent_depends_on_how_far_motion_is_predicted(make_flight: MakeFlight) -> None:
+    flight = make_flight(keyframes=60, turns=1.2, points=1500)
+    sent = []
+    for horizon_s in (0.1, 10.0):
+        base = Base(flight, local_keyframes=1, max_keyframes=3, horizon_s=horizon_s)
+        for n in range(20, 40):
+            base.plan(flight.keyframes[n])
+        sent.append([flight.keyframes.index(r.keyframe) for r in base.received if isinstance(r, CachedKeyframe)])
+    assert sent[0] != sent[1]
+
+
 def test_a_new_base_process_does_not_keep_the_cache_of_the_last_one(make_flight: MakeFlight) -> None:
     flight = make_flight(keyframes=60, turns=1.2, points=1500)
     base = Base(flight, local_keyframes=10)

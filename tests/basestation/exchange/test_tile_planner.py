@@ -7,7 +7,7 @@ import pytest
 
 from kiteline_basestation.config import BaseConfig, TileConfig
 from kiteline_basestation.exchange.agent_velocity import AgentVelocity
-from kiteline_basestation.exchange.tile_planner import TilePlanner
+from kiteline_basestation.exchange.tile_planner import _OVERHEAD_BYTES, TilePlanner
 from kiteline_basestation.grid.grid_updates import GridUpdates
 from kiteline_basestation.grid.tile_store import Place
 from kiteline_basestation.map.sparse_map import SparseMap
@@ -56,7 +56,7 @@ class Flight:
                 for record in b.receive(a.poll(self.now_ns), self.now_ns):
                     assert isinstance(record, GridTile)
                     self.tiles[record.column, record.row, record.storey] = record
-                    self.tile_bytes += messages.length(record) + TileConfig().overhead_bytes
+                    self.tile_bytes += messages.length(record) + _OVERHEAD_BYTES
             for key in self.agent.take_removed():
                 self.tiles.pop(GridTile.place(key), None)
             self.now_ns += S // 20
@@ -178,6 +178,15 @@ def test_places_without_a_tile_are_not_measured() -> None:
     flight.wait(10.0)
     touched = flight.updates.grid.touched
     assert 0 < len(looked) <= 10 * 2 * len(touched) and set(looked) <= {*touched}
+
+
+@pytest.mark.parametrize("horizon_s", [0.1, 6.0])
+def test_tiles_ahead_are_sent_the_sooner_the_farther_motion_is_predicted(horizon_s: float) -> None:
+    flight = Flight(TileConfig(horizon_s=horizon_s, max_tiles=4, keyframe_bytes=1e6, most_credit_bytes=1e6))
+    for k in range(12):
+        flight.fly(1.0 * k)
+    ahead_m = [3.2 * (column + 0.5) - 11.0 for column, _, _ in flight.tiles]
+    assert (np.mean(ahead_m) > 2.0) == (horizon_s > 1.0), ahead_m
 
 
 @pytest.mark.parametrize("z", [1000.0, -1000.0])

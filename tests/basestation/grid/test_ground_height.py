@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kiteline_basestation.config import GridConfig, GroundHeightConfig
+from kiteline_basestation.config import GridConfig
 from kiteline_basestation.grid import ground_kernels as kernels
 from kiteline_basestation.grid.ground_height import ground_heights
 from kiteline_basestation.grid.sparse_scan import GROUND, OBSTACLE, UNLABELLED, label, sparse_scan
@@ -22,7 +22,7 @@ def test_ground_is_the_floor_and_neither_a_table_nor_noise_below() -> None:
     table = np.column_stack([rng.uniform(1, 3, (500, 2)), rng.normal(0.7, 0.01, 500)])
     noise = np.column_stack([rng.uniform(0, 4, (30, 2)), rng.uniform(-2.0, -0.2, 30)])
     points = np.concatenate([floor, table, noise])
-    ground = ground_heights(GroundHeightConfig(), points, np.full(len(points), 1.2))
+    ground = ground_heights(points, np.full(len(points), 1.2))
     np.testing.assert_allclose(ground, 0.0, atol=0.06)
 
 

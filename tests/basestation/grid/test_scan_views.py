@@ -7,12 +7,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kiteline_basestation.grid.kept_scan import keep
-from kiteline_basestation.grid.scan_grid import ScanGrid
+from kiteline_basestation.grid.kept_scan import GAP_SIGMAS, keep
+from kiteline_basestation.grid.scan_grid import ScanGrid, ViewWeights
+from kiteline_basestation.grid.sectors import _OPEN_SIGMAS, _SURE_SIGMAS
 from kiteline_basestation.grid.tile_store import Place
 from kiteline_core.ground.column_scan import ColumnScan
 from tests.basestation.flat_rooms import HEIGHT_M, ROOM, box, camera, scan_of
 from tests.basestation.grid_scans import BF, CONFIG, at, kept
+
+WEIGHTS = ViewWeights()
 
 
 def bare(free_from_m: float, free_m: float) -> ColumnScan:
@@ -48,7 +51,7 @@ def test_each_cell_of_a_scan_is_freed_once() -> None:
         counted = 0
         for place in grid.places:
             odds = grid.log_odds(place)
-            views = config.log_free, config.log_free_sure, config.log_free_fair, config.log_free_far
+            views = WEIGHTS[1:]
             assert set(np.unique(odds)) <= {0, *(-view for view in views)}
             column, row = np.arange(64) + 64 * place.column, np.arange(64) + 64 * place.row
             dx, dy = (column[None, :] + 0.5) * 0.05 - x, (row[:, None] + 0.5) * 0.05 - y
@@ -91,7 +94,7 @@ def test_cells_over_which_the_nearest_rays_to_the_ground_pass_low_are_free_by_tw
     near, first = Place(0, 0, 0), 2.0 * (1.0 - CONFIG.bands_m[0] / HEIGHT_M)
     odds = grid.log_odds(near)[:, 1]
     columns = (np.arange(64) + 0.5) * 0.05
-    assert (odds[:, (columns > first + 0.05) & (columns < 1.95)] == -CONFIG.log_free_far).all()
+    assert (odds[:, (columns > first + 0.05) & (columns < 1.95)] == -WEIGHTS.free_far).all()
     assert not odds[:, columns < first - 0.05].any()
     assert grid.cells(near)[0][1, 38] == -1
     grid.put(1, seen, camera(0.01, 0.0, 0.3))
@@ -107,35 +110,16 @@ def test_a_far_view_frees_alone_what_lies_well_before_its_obstacle_and_two_what_
     row = np.concatenate([grid.log_odds(Place(0, 0, k))[0, 1] for k in range(2)])
     columns = (np.arange(128) + 0.5) * CONFIG.cell_m
     sigma_m = CONFIG.sigma_px / bf * 5.53**2
-    end = 5.53 - CONFIG.gap_sigmas * sigma_m
-    sure, fair = (end - n * sigma_m for n in (CONFIG.sure_sigmas, CONFIG.sure_sigmas - CONFIG.fair_sigmas))
+    end = 5.53 - GAP_SIGMAS * sigma_m
+    sure = end - _SURE_SIGMAS * sigma_m
     near = found.accurate_m(CONFIG)
     assert near + 0.2 < sure < end - 0.2
-    assert (row[(columns > near + 0.1) & (columns < sure - 0.1)] == -CONFIG.log_free_sure).all()
-    assert (row[(columns > sure + 0.06) & (columns < fair - 0.06)] == -CONFIG.log_free_fair).all()
-    assert (row[(columns > fair + 0.06) & (columns < end - 0.06)] == -CONFIG.log_free_far).all()
+    assert (row[(columns > near + 0.1) & (columns < sure - 0.1)] == -WEIGHTS.free_sure).all()
+    assert (row[(columns > sure + 0.1) & (columns < end - 0.1)] == -WEIGHTS.free_far).all()
     assert not (row[columns > end + 0.1] < 0).any()
     assert at(grid, 0.5 * (near + sure), 0.0) == 0 and at(grid, end - 0.15, 0.0) == -1
     grid.put(1, found, camera(0.02, 0.0, 0.0))
     assert at(grid, end - 0.15, 0.0) == 0
-
-
-def test_a_fair_view_frees_alone_where_no_sign_of_an_obstacle_is_near() -> None:
-    """What one view frees wrongly lies beside something that another one saw, nearly always."""
-    bf, end = 48.0, 5.0
-    ground = keep(CONFIG, bare(1.0, end), bf)
-    place = end - 0.5 * CONFIG.open_sigmas * CONFIG.sigma_px / bf * end**2
-    grid = ScanGrid(CONFIG)
-    grid.put(0, ground, camera(0.0, 0.0, 0.0))
-    assert at(grid, place, 0.0) == 0
-    nothing, one = np.zeros(70), np.arange(70) == 35
-    thing = replace(
-        bare(1.0, end), free_from_m=nothing, free_m=nothing, obstacle_m=np.where(one, place + 0.08, np.inf),
-        bands=one.astype(np.uint8),
-    )  # fmt: skip
-    grid.put(1, keep(CONFIG, thing, bf), camera(0.0, 0.0, 0.0))
-    assert at(grid, place + 0.08, 0.02) == -1, "one far view of an obstacle is a sign, no obstacle"
-    assert at(grid, place, 0.0) == -1 and at(grid, place, 0.6) == 0
 
 
 def test_a_far_view_of_ground_that_ends_before_no_obstacle_frees_alone_nearly_up_to_its_end() -> None:
@@ -145,10 +129,10 @@ def test_a_far_view_of_ground_that_ends_before_no_obstacle_frees_alone_nearly_up
     grid.put(0, found, camera(0.0, 0.0, 0.0))
     row = np.concatenate([grid.log_odds(Place(0, 0, k))[0, 1] for k in range(2)])
     columns = (np.arange(128) + 0.5) * CONFIG.cell_m
-    sure = end - CONFIG.open_sigmas * CONFIG.sigma_px / bf * end**2
-    assert (row[(columns > found.accurate_m(CONFIG) + 0.1) & (columns < sure - 0.06)] == -CONFIG.log_free_sure).all()
-    assert (row[(columns > sure + 0.06) & (columns < end - 0.06)] == -CONFIG.log_free_fair).all()
-    assert sure > end - CONFIG.sure_sigmas * CONFIG.sigma_px / bf * end**2 + 0.1
+    sure = end - _OPEN_SIGMAS * CONFIG.sigma_px / bf * end**2
+    assert (row[(columns > found.accurate_m(CONFIG) + 0.1) & (columns < sure - 0.06)] == -WEIGHTS.free_sure).all()
+    assert (row[(columns > sure + 0.06) & (columns < end - 0.06)] == -WEIGHTS.free_far).all()
+    assert sure > end - _SURE_SIGMAS * CONFIG.sigma_px / bf * end**2 + 0.1
 
 
 @given(st.floats(0.0, 1.2), st.floats(1.0, 2.2))
@@ -208,6 +192,12 @@ def test_overlong_and_far_rays_are_cut_and_unknown_ground_is_not_drawn() -> None
     assert keep(CONFIG, replace(scan, camera_height_m=np.nan), BF) is None
 
 
+def test_scans_are_drawn_as_far_as_is_asked() -> None:
+    for max_range_m in (2.0, 20.0):
+        found = keep(replace(CONFIG, max_range_m=max_range_m), scan_of(ROOM, -3.0, 2.5, 0.0), 1e4)
+        assert found is not None and (found.reach_m > 2.01) == (max_range_m > 2.0)
+
+
 def test_nothing_is_free_close_before_an_obstacle_that_is_too_far_to_be_drawn() -> None:
     """Its range is as uncertain as that of one that is drawn."""
     sigma_per_m2 = CONFIG.sigma_px / 20.0
@@ -221,5 +211,5 @@ def test_nothing_is_free_close_before_an_obstacle_that_is_too_far_to_be_drawn() 
         found = keep(CONFIG, scan, 20.0)
         obstacle, _, _, free, clear = found.ranges()
         assert np.isinf(obstacle).all()
-        until_m = min(limit_m, at_m - CONFIG.gap_sigmas * sigma_per_m2 * at_m**2)
+        until_m = min(limit_m, at_m - GAP_SIGMAS * sigma_per_m2 * at_m**2)
         assert free == pytest.approx(until_m, abs=0.01) and clear == pytest.approx(until_m, abs=0.01)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from kiteline_basestation.config import BaseConfig, GraphConfig, LoopConfig
+from kiteline_basestation.config import BaseConfig, GraphConfig
 from kiteline_basestation.inertial.level import Level, level_of, tilt_between
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.mapper import Mapper, MapperInput
@@ -70,12 +70,12 @@ def test_a_match_that_tilts_a_map_is_refused(degrees: float, kept: bool) -> None
     for yaw in (0.0, 1.0, 3.0):  # which gravity does not tell
         X = se3.from_rt(se3.so3_exp(yaw * UP), np.array([3.0, -1.0, 0.5]))
         edge = LoopEdge(new, old, se3.inverse(T_w_old) @ X @ T_w_new, 50, 3.0)
-        assert keeps_level(sparse_map, edge, LoopConfig()) is kept
-    assert keeps_level(sparse_map, replace(edge, scale=1.2), LoopConfig()) is kept
+        assert keeps_level(sparse_map, edge) is kept
+    assert keeps_level(sparse_map, replace(edge, scale=1.2)) is kept
     sparse_map.up = {k: (up, 0.2) for k, (up, _) in sparse_map.up.items()}
-    assert keeps_level(sparse_map, edge, LoopConfig()) is (degrees < 60.0)  # as uncertain as that
+    assert keeps_level(sparse_map, edge) is (degrees < 60.0)  # as uncertain as that
     sparse_map.up = {k: v for k, v in sparse_map.up.items() if k < keyframe_id(NEW, 0)}
-    assert keeps_level(sparse_map, edge, LoopConfig())  # one agent has no IMU
+    assert keeps_level(sparse_map, edge)  # one agent has no IMU
 
 
 def a_loop(tilted_rad: float, level: bool, scaled: bool) -> tuple[F64, F64]:

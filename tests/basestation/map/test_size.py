@@ -1,4 +1,4 @@
-"""Maps of any size: regions, memory, corrections of many keyframes, loops that many votes close."""
+"""Maps of any size: regions, memory, corrections of many keyframes, loops that many matches close."""
 
 import itertools
 import time

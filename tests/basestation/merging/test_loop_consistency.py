@@ -1,4 +1,4 @@
-"""Which matches agree on one correction, against plain similarities; which outvote the expected drift."""
+"""Which matches agree on one correction, against plain similarities; which show more than the expected drift."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -19,13 +19,13 @@ from kiteline_core.ids import NO_KEYFRAME, KeyframeId, keyframe_id, submap_id, s
 A, B = submap_id(0, 1, 0), submap_id(1, 1, 0)
 
 
-def agree(sparse_map: SparseMap, a: LoopMatch, b: LoopMatch, config: LoopConfig) -> bool:
+def agree(sparse_map: SparseMap, a: LoopMatch, b: LoopMatch) -> bool:
     """The reference: matrix by matrix."""
     Xa, Xb = correction_of(sparse_map, a), correction_of(sparse_map, b)
     same_submap = submap_of_keyframe(a.new) == submap_of_keyframe(b.new)
     if not same_submap:
         Xa = sim3.inverse(Xa)
-    if abs(np.log(sim3.scale_of(Xa) / sim3.scale_of(Xb))) > config.agree_scale:
+    if abs(np.log(sim3.scale_of(Xa) / sim3.scale_of(Xb))) > loop_consistency._AGREE_SCALE:
         return False
     T_w_a, T_w_b = sparse_map.world_pose(a.new), sparse_map.world_pose(b.new)
     assert T_w_a is not None and T_w_b is not None
@@ -34,12 +34,12 @@ def agree(sparse_map: SparseMap, a: LoopMatch, b: LoopMatch, config: LoopConfig)
     path = float(np.linalg.norm(T_w_a[:3, 3] - at)) if same_submap else 0.0
     depth = max(depth_of(sparse_map, a), depth_of(sparse_map, b))
     turn = se3.so3_log(sim3.rigid(sim3.inverse(Xa) @ Xb)[:3, :3])
-    limit = config.agree_m + config.agree_depth * depth + config.agree_path * path
-    return apart <= limit and float(np.linalg.norm(turn)) <= config.agree_rad
+    limit = loop_consistency._AGREE_M + loop_consistency._AGREE_DEPTH * depth + loop_consistency._AGREE_PATH * path
+    return apart <= limit and float(np.linalg.norm(turn)) <= loop_consistency._AGREE_RAD
 
 
 def test_those_agree_that_imply_one_correction() -> None:
-    rng, config, counted = np.random.default_rng(0), LoopConfig(), []
+    rng, counted = np.random.default_rng(0), []
     for unit in (1.0, 0.6):
         sparse_map = SparseMap()
         for submap in (A, B):
@@ -68,8 +68,8 @@ def test_those_agree_that_imply_one_correction() -> None:
         matches += [match(keyframe_id(B, k), keyframe_id(A, 11 - k), sim3.inverse(X)) for k in range(12)]
         for last in range(len(matches)):
             listed = [*matches[:last], *matches[last + 1 :], matches[last]]
-            expected = [m for m in listed if agree(sparse_map, m, matches[last], config)]
-            assert [(m.new, m.old) for m in agreeing(sparse_map, listed, config)] == [(m.new, m.old) for m in expected]
+            expected = [m for m in listed if agree(sparse_map, m, matches[last])]
+            assert [(m.new, m.old) for m in agreeing(sparse_map, listed)] == [(m.new, m.old) for m in expected]
             assert expected[-1] is matches[last]
             counted.append(len(expected))
     assert min(counted) < 6 < max(counted) < 24  # some agree, some do not
@@ -103,18 +103,18 @@ def weighed(sparse_map: SparseMap, matches: Sequence[LoopMatch], words: Any) -> 
     return [detector._weigh(match) for match in matches]
 
 
-def test_keyframes_along_a_path_outvote_the_expected_drift(drifted: Any, words: Any) -> None:
+def test_keyframes_along_a_path_show_more_than_the_expected_drift(drifted: Any, words: Any) -> None:
     sparse_map, matches = drifted([0.5 * n for n in range(12)])
     found = weighed(sparse_map, matches, words)
     assert found[:-1] == [None] * 11 and isinstance(found[-1], LoopClosure)
 
 
-def test_keyframes_that_go_to_and_fro_are_one_vote(drifted: Any, words: Any) -> None:
+def test_keyframes_that_go_to_and_fro_are_one_match(drifted: Any, words: Any) -> None:
     sparse_map, matches = drifted([0.5 * (n % 3) for n in range(20)])
     assert weighed(sparse_map, matches, words) == [None] * 20
 
 
-def test_keyframes_that_see_two_places_are_no_votes(drifted: Any, words: Any) -> None:
+def test_keyframes_that_see_two_places_do_not_agree(drifted: Any, words: Any) -> None:
     sparse_map, matches = drifted([0.5 * n for n in range(12)])
     away = se3.from_rt(np.eye(3), np.array([0.0, 0.0, 2.0]))
     elsewhere = [replace(m, old=keyframe_id(A, 0), T_old_new=away @ m.T_old_new) for m in matches]

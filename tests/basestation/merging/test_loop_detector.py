@@ -82,11 +82,13 @@ def test_loop_is_closed_while_keyframes_arrive(around: Any, late: int) -> None:
         assert np.allclose(last[keyframe], mapper.map.pose(keyframe), atol=1e-9)
 
 
-@pytest.mark.parametrize(("votes", "most_drift", "closed"), [(6, 1000.0, True), (1000, 1000.0, False), (6, 1.0, False)])
-def test_many_votes_close_a_loop_that_drifted_more_than_expected(
-    around: Any, words: Any, votes: int, most_drift: float, closed: bool
+@pytest.mark.parametrize(
+    ("matches", "most_drift", "closed"), [(6, 1000.0, True), (1000, 1000.0, False), (6, 1.0, False)]
+)
+def test_many_matches_close_a_loop_that_drifted_more_than_expected(
+    around: Any, words: Any, matches: int, most_drift: float, closed: bool
 ) -> None:
-    strict = replace(BaseConfig().loops, drift_m=0.001, drift_path=0.0, drift_votes=votes, most_drift=most_drift)
+    strict = replace(BaseConfig().loops, drift_m=0.001, drift_path=0.0, drift_matches=matches, most_drift=most_drift)
     flight, blind = around(-1)[:2]
     detector = LoopDetector(strict, blind.map, words)
     closures = []
@@ -100,6 +102,19 @@ def test_many_votes_close_a_loop_that_drifted_more_than_expected(
     for edge in (match.edge for closure in closures for match in closure.matches):
         error = se3.inverse(true[edge.old]) @ true[edge.new] @ se3.inverse(edge.T_old_new)
         assert np.linalg.norm(error[:3, 3]) < 0.1
+
+
+@pytest.mark.parametrize(
+    "demand", [{}, {"min_inliers_all": 10_000}, {"min_inliers_loop": 10_000}, {"min_matched_share": 1.1}]
+)
+def test_how_much_a_loop_has_to_show_is_an_option(around: Any, words: Any, demand: dict[str, float]) -> None:
+    flight, blind = around(-1)[:2]
+    detector = LoopDetector(replace(BaseConfig().loops, drift_m=10.0, **demand), blind.map, words)  # type: ignore[arg-type]
+    closed = False
+    for keyframe in flight.keyframes:
+        detector.add(keyframe)
+        closed |= isinstance(detector.query(keyframe), LoopClosure)
+    assert closed == (not demand)
 
 
 def test_loop_without_drift_is_counted_and_the_same_flight_gives_the_same_map(

@@ -6,7 +6,7 @@ import pytest
 
 from kiteline_core.arrays import F32, U8
 from kiteline_core.geometry.cameras import RectifiedCamera
-from kiteline_core.ground.brightness import Brightness, falloff
+from kiteline_core.ground.brightness import Brightness, _median, falloff
 from kiteline_core.ground.config import GroundConfig
 from kiteline_core.ground.disparity import DisparityCamera, DisparityStripes
 
@@ -82,3 +82,9 @@ def test_bright_corners_are_not_saturated() -> None:
     bright = np.round(245.0 * np.maximum(darker, 0.9) * np.linspace(0.9, 1.0, W)).astype(np.uint8)
     left, _ = Brightness(0.0, POWER).evened((bright, bright), FALLOFF)
     assert (left >= 255).mean() < 0.01
+
+
+@pytest.mark.parametrize("n", [1, 2, 7, 200])
+def test_median_is_that_of_numpy(n: int) -> None:
+    values = np.random.default_rng(n).normal(0.0, 1.0, n)
+    assert _median(values) == np.median(values)

@@ -1,11 +1,12 @@
 """The height of the ground over a flight: boxes and tables that look like a floor, ramps, and what is withdrawn."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from kiteline_core.geometry import se3
 from kiteline_core.ground.column_scan import ColumnScan
-from kiteline_core.ground.config import GroundConfig
 from kiteline_core.ground.ground_height import GroundHeight, Seen, Verdict, without_ground
 
 UP_C = np.array([0.0, -1.0, 0.0])
@@ -37,7 +38,7 @@ def fly(ground: GroundHeight[int], *views: Seen, first: int = 0) -> list[Verdict
 
 
 def test_a_floor_is_believed_once_two_places_agree() -> None:
-    ground: GroundHeight[int] = GroundHeight(GroundConfig())
+    ground: GroundHeight[int] = GroundHeight()
     one, same_place, two = fly(ground, *(seen(x, 1.2, 0.0, 0.1) for x in (0.0, 0.02, 0.5)))
     assert not one.believed and not same_place.believed
     assert two.believed == [0, 1, 2]
@@ -47,7 +48,7 @@ def test_a_floor_is_believed_once_two_places_agree() -> None:
 
 
 def test_a_box_top_is_never_believed_however_often_it_is_seen() -> None:
-    ground: GroundHeight[int] = GroundHeight(GroundConfig())
+    ground: GroundHeight[int] = GroundHeight()
     small = [seen(0.02 * k, 1.6, 0.9, 0.85, far_m=1.7) for k in range(30)]
     assert not any(v.believed for v in fly(ground, *small))
     wide_above_lower_points = [seen(0.1 * k, 1.6, 0.9, 0.2) for k in range(30)]
@@ -56,7 +57,7 @@ def test_a_box_top_is_never_believed_however_often_it_is_seen() -> None:
 
 
 def test_the_floor_beside_a_box_is_believed_and_the_box_is_not() -> None:
-    ground: GroundHeight[int] = GroundHeight(GroundConfig())
+    ground: GroundHeight[int] = GroundHeight()
     views = [seen(0.3 * k, 1.6, 0.9 if k % 2 else 0.0, 0.1) for k in range(8)]
     believed = [tag for v in fly(ground, *views) for tag in v.believed]
     assert believed and not any(tag % 2 for tag in believed)
@@ -64,7 +65,7 @@ def test_the_floor_beside_a_box_is_believed_and_the_box_is_not() -> None:
 
 
 def test_scans_of_a_large_table_are_withdrawn_when_something_lower_is_seen() -> None:
-    ground: GroundHeight[int] = GroundHeight(GroundConfig())
+    ground: GroundHeight[int] = GroundHeight()
     table = fly(ground, *(seen(0.2 * k, 1.6, 0.8, None) for k in range(6)))
     assert [tag for v in table for tag in v.believed] == list(range(6))
     first, second = fly(ground, *(seen(x, 1.6, None, 0.1) for x in (1.2, 1.4)), first=6)
@@ -78,15 +79,28 @@ def test_scans_of_a_large_table_are_withdrawn_when_something_lower_is_seen() -> 
 
 def test_a_box_top_is_not_believed_with_a_floor_that_is_a_little_lower_elsewhere() -> None:
     """Ground may climb that much on the way, but points lower than the box were seen right beside it."""
-    ground: GroundHeight[int] = GroundHeight(GroundConfig())
+    ground: GroundHeight[int] = GroundHeight()
     box = seen(0.0, 1.6, 0.22, None)
     beside = [seen(x, 1.6, None, -0.1) for x in (0.1, 0.2)]
     floor = [seen(x, 1.6, 0.0, None) for x in (2.0, 2.3)]
     assert [tag for v in fly(ground, box, *beside, *floor) for tag in v.believed] == [3, 4]
 
 
+def test_scans_of_another_vertical_are_withdrawn_and_the_height_is_sought_again() -> None:
+    """A flight that begins in motion knows its vertical after a second; before, a level camera seems to look down."""
+    ground: GroundHeight[int] = GroundHeight()
+    tilted = np.array([0.0, -np.cos(0.1), np.sin(0.1)])
+    views = (seen(0.5 * k, 1.2, 0.0, 0.1) for k in range(3))
+    wrong = [view._replace(scan=replace(view.scan, up_c=tilted)) for view in views]
+    assert sorted(tag for v in fly(ground, *wrong) for tag in v.believed) == [0, 1, 2]
+    first, second, third = fly(ground, *(seen(1.5 + 0.5 * k, 1.2, 0.0, 0.1) for k in range(3)), first=3)
+    assert sorted(first.withdrawn) == [0, 1, 2] and not first.believed
+    assert not second.believed and third.believed == [4, 5]
+    assert expected(ground, 3.0, 1.2) == pytest.approx(1.2)
+
+
 def test_a_single_wrong_point_below_the_floor_changes_nothing() -> None:
-    ground: GroundHeight[int] = GroundHeight(GroundConfig())
+    ground: GroundHeight[int] = GroundHeight()
     views = [seen(0.2 * k, 1.2, 0.0, -2.0 if k == 5 else 0.1) for k in range(12)]
     verdicts = fly(ground, *views)
     assert not any(v.withdrawn for v in verdicts)
@@ -94,7 +108,7 @@ def test_a_single_wrong_point_below_the_floor_changes_nothing() -> None:
 
 
 def test_a_road_uphill_is_not_withdrawn() -> None:
-    ground: GroundHeight[int] = GroundHeight(GroundConfig())
+    ground: GroundHeight[int] = GroundHeight()
     views = [seen(2.0 * k, 1.65 + 0.16 * k, 0.16 * k, 0.16 * k, far_m=15.0) for k in range(40)]
     verdicts = fly(ground, *views)
     assert not any(v.withdrawn for v in verdicts)
@@ -102,7 +116,7 @@ def test_a_road_uphill_is_not_withdrawn() -> None:
 
 
 def test_the_height_is_unknown_after_a_long_way_without_a_view_of_the_ground() -> None:
-    ground: GroundHeight[int] = GroundHeight(GroundConfig())
+    ground: GroundHeight[int] = GroundHeight()
     ground.start_at((T_W_O @ [0.0, 0.0, 0.0, 1.0])[:3])
     fly(ground, *(seen(0.3 * k, 1.2, None, 0.3) for k in range(20)))
     assert expected(ground, 6.0, 1.2) == pytest.approx(1.2)
@@ -118,7 +132,7 @@ def test_a_scan_without_ground_keeps_its_line_of_sight_alone() -> None:
 
 def test_ground_that_is_seen_a_little_lower_again_and_again_takes_the_place_of_the_first() -> None:
     """A height that was too large by less than what refutes it does not stay."""
-    ground: GroundHeight[int] = GroundHeight(GroundConfig())
+    ground: GroundHeight[int] = GroundHeight()
     fly(ground, *(seen(x, 1.6, 0.2, 0.05) for x in (0.0, 0.3)))
     assert expected(ground, 0.3, 1.6) == pytest.approx(1.4)
     once = fly(ground, seen(0.4, 1.6, 0.0, 0.05), first=2)
@@ -129,7 +143,7 @@ def test_ground_that_is_seen_a_little_lower_again_and_again_takes_the_place_of_t
 
 
 def test_a_box_beside_the_way_does_not_lift_the_ground() -> None:
-    ground: GroundHeight[int] = GroundHeight(GroundConfig())
+    ground: GroundHeight[int] = GroundHeight()
     fly(ground, *(seen(x, 1.6, 0.0, 0.05) for x in (0.0, 0.3)))
     boxes = fly(ground, *(seen(0.4 + 0.1 * k, 1.6, 0.2, 0.1) for k in range(6)), first=2)
     assert not any(v.believed for v in boxes)

@@ -1,6 +1,7 @@
 """Ground segmentation of ideal and spoilt disparity images: level and banked cameras, ramps, walls, plain floors."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ground.column_scan import ColumnScan, level_rotation
 from kiteline_core.ground.config import GroundConfig
-from kiteline_core.ground.disparity import DisparityStripes, unlocked
+from kiteline_core.ground.disparity import DisparityCamera, DisparityStripes, unlocked
 from kiteline_core.ground.label_kernels import GROUND, OBSTACLE, UNKNOWN
 from kiteline_core.ground.segmentation import ExpectedGround, GroundSegmenter, _near_height
 
@@ -325,3 +326,34 @@ def test_the_height_of_ground_hangs_on_many_of_its_pixels() -> None:
     n = np.array([5.0, 100.0, 120.0, 150.0, 150.0, 150.0])
     heights = np.array([0.8, 1.5, 1.5, 1.5, 1.5, 1.5])
     assert _near_height(n, d, heights * d) == pytest.approx(1.5)
+
+
+def test_ground_is_looked_for_as_far_below_the_camera_as_is_asked() -> None:
+    def floor(_o: np.ndarray, r: np.ndarray) -> np.ndarray:
+        return np.where(r[..., 2] < -1e-6, -5.0 / np.minimum(r[..., 2], -1e-6), np.inf)
+
+    heights = []
+    for largest_height_m in (8.0, 3.0):
+        segmenter = GroundSegmenter(CAMERA, GroundConfig(largest_height_m=largest_height_m))
+        _, disparity = view(up(pitch_deg=35.0), floor)
+        heights.append(segmenter.segment(disparity, None, up(pitch_deg=35.0)).scan.camera_height_m)
+    assert heights[0] == pytest.approx(5.0, abs=0.2) and np.isnan(heights[1])
+
+
+def test_depth_cameras_have_an_error_of_their_own() -> None:
+    camera = replace(CAMERA, stereo=False)
+    sigma_px = [GroundSegmenter(camera, GroundConfig(depth_sigma=s)).sigma_px for s in (0.003, 0.006)]
+    assert sigma_px[1] == pytest.approx(2.0 * sigma_px[0])
+    assert GroundSegmenter(CAMERA, GroundConfig(depth_sigma=0.006)).sigma_px == GroundConfig().sigma_px
+
+
+@pytest.mark.parametrize(("disparities", "found"), [(32, False), (48, True)])
+def test_surfaces_are_measured_as_near_as_disparities_are_searched(disparities: int, found: bool) -> None:
+    rng = np.random.default_rng(3)
+    texture = np.repeat(rng.integers(0, 255, (480, 376)), 2, axis=1).astype(np.uint8)
+    camera = DisparityCamera.of(CAMERA)
+    stripes = DisparityStripes(camera, GroundConfig(disparities=disparities))
+    half = texture[::2, ::2][:240, :376]
+    disparity = stripes.measure(half, np.roll(half, -40, axis=1))
+    near = disparity[:, 60:-60]
+    assert (np.mean(np.abs(near - 40.0) < 0.5) > 0.5) == found

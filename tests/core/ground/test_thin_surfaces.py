@@ -80,10 +80,10 @@ def test_the_kernel_agrees_with_numpy() -> None:
     rng = np.random.default_rng(3)
     disparity = np.where(rng.random(left.shape) < 0.1, rng.uniform(0.5, 30.0, left.shape), WALL_PX).astype(np.float32)
     disparity[rng.random(left.shape) < 0.2] = 0.0
-    expected, rows = corrected(left, right, disparity), np.empty((4, left.shape[1]), np.int32)
+    expected, rows = corrected(left, right, disparity), np.empty((4, left.shape[1]), np.int16)
     best, least, lowest, difference = rows
     changed = correct_thin_surfaces(
-        left, right, MOST_PX, disparity, np.empty(left.shape[1], np.float32), best, least, lowest, difference,
+        left, right, MOST_PX, disparity, np.empty((2, left.shape[1]), np.float32), best, least, lowest, difference,
         np.empty(left.size, np.int32), np.empty(left.size, np.float32),
     )  # fmt: skip
     assert changed > 100 and np.any(expected == 0.0)

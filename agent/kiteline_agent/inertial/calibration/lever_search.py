@@ -1,7 +1,5 @@
 """Where the camera is beside the IMU, from accelerations in turns: for a lever arm that is off by centimetres."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from kiteline_core.arrays import F64
@@ -9,26 +7,19 @@ from kiteline_core.arrays import F64
 _LEVER, _GRAVITY, _BIAS = slice(0, 3), slice(3, 6), slice(6, 9)
 _LEAST_FREE = 3.0  # equations more than unknowns
 _PULL = 1e-6  # of the bias towards zero, which is not told from gravity where nothing turns
-
-
-@dataclass(frozen=True, slots=True)
-class LeverSearchConfig:
-    """How much better a found lever arm must explain the accelerations."""
-
-    memory_s: float = 12.0  # of accelerations, time constant: flights turn now and then
-    least_m: float = 0.04  # smaller errors cost less than the search may err by
-    lever_sigma_m: float = 0.2  # of a lever arm as told: along an axis about which alone it turns it stays so
-    error_m_s: float = 0.005  # of a change of velocity, by images and IMU
-    most_m: float = 1.0  # larger ones are no lever arm of a drone
-    explained: float = 0.5  # of the squared errors that a found lever arm must explain
-    significance: float = 60.0  # squared errors that it explains, over the mean square of what it leaves
+_MEMORY_S = 12.0  # s; time constant of the accelerations: flights turn now and then
+_LEAST_M = 0.04  # m; smaller errors cost less than the search may err by
+_LEVER_SIGMA_M = 0.2  # m; of a lever arm as told: along an axis about which alone it turns it stays so
+_ERROR_M_S = 0.005  # m/s; of a change of velocity, by images and IMU
+_MOST_M = 1.0  # m; larger ones are no lever arm of a drone
+_EXPLAINED = 0.5  # share of the squared errors that a found lever arm must explain
+_SIGNIFICANCE = 60.0  # squared errors that it explains, over the mean square of what it leaves
 
 
 class LeverSearch:
     """Least squares over [change of the lever arm (3) m, gravity (3) in the map, bias (3)]; older ones count less."""
 
-    def __init__(self, config: LeverSearchConfig) -> None:
-        self._config = config
+    def __init__(self) -> None:
         self.clear()
 
     def clear(self) -> None:
@@ -48,24 +39,24 @@ class LeverSearch:
         one before.
         """
         j = np.concatenate([by_lever, by_gravity_s * np.eye(3), by_bias], axis=1)
-        kept = float(np.exp(-dt_s / self._config.memory_s))
+        kept = float(np.exp(-dt_s / _MEMORY_S))
         self._h, self._g = kept * self._h + j.T @ j, kept * self._g + j.T @ error
         self._square = kept * self._square + float(error @ error)
         self._count = kept * self._count + 3.0
 
     def find(self) -> F64 | None:
         """Change (3,) of the lever arm, camera in the body, m, if it explains far more than none does."""
-        config, free = self._config, self._count - 9.0
+        free = self._count - 9.0
         if free < _LEAST_FREE:
             return None
         pull = np.full(9, _PULL)
-        pull[_LEVER] = (config.error_m_s / config.lever_sigma_m) ** 2
+        pull[_LEVER] = (_ERROR_M_S / _LEVER_SIGMA_M) ** 2
         h, others = self._h + np.diag(pull), slice(3, 9)
         x = np.linalg.solve(h, self._g)
         left = max(self._square - float(x @ self._g), 0.0)
         given = self._square - float(self._g[others] @ np.linalg.solve(h[others, others], self._g[others]))
         size, explained = float(np.linalg.norm(x[_LEVER])), given - left
-        if not config.least_m < size < config.most_m or explained < config.explained * given:
+        if not _LEAST_M < size < _MOST_M or explained < _EXPLAINED * given:
             return None
-        is_clear = explained > config.significance * max(left / free, config.error_m_s**2)
+        is_clear = explained > _SIGNIFICANCE * max(left / free, _ERROR_M_S**2)
         return np.asarray(x[_LEVER], np.float64) if is_clear else None

@@ -17,32 +17,26 @@ _LONGEST = 2.5  # times the window: a longer one lacks frames
 _FITS = 3  # each with the weights that the one before gave
 _UNKNOWNS = 8.0  # rotation, scale, bias and time offset
 _TAIL = 2.0  # times the median residual, from which a window weighs less
-
-
-@dataclass(frozen=True, slots=True)
-class MountingSearchConfig:
-    """When a calibration is searched, and how much better a found one must explain the turns."""
-
-    suspicion: float = 1e-3  # squared errors over squared turns from which it is searched; sound rigs reach 5e-4
-    window_s: float = 0.09  # over which turns are compared: short beside changes of the rate
-    memory_s: float = 3.0  # of turns; samples are kept for as long
-    least_s: float = 0.5  # of turns that are compared
-    every_s: float = 0.24  # between the first two searches
-    backoff: float = 1.4  # by which the time to the next search grows with each that finds nothing
-    seldom_s: float = 5.0  # longest time between two searches: a rig that is worn badly stays in doubt
-    most_offset_s: float = 0.15  # either way; drivers that stamp at arrival are late by less
-    step_s: float = 0.01  # of the grid of offsets: turns change slower
-    rotation_sigma_rad: float = 0.1  # of a mounting about an axis: an axis about which nothing turned stays as told
-    scale_sigma: float = 0.02  # of the gyro's scale: what little turns leave open is the time offset first
-    turn_sigma_rad: float = 2e-4  # least error of a turn by images over a window
-    explained: float = 0.5  # of the squared errors that a found calibration must explain
-    significance: float = 60.0  # squared errors that it explains, over the mean square of what it leaves
-    least_rotation_rad: float = 0.025  # smaller ones are left to the filters
-    least_scale: float = 0.02  # likewise of the gyro's scale
-    least_change_s: float = 0.015  # likewise of the time offset
-    restart_s: float = 0.04  # change of the time offset from which velocity and vertical are found anew
-    most_rotation_rad: float = 0.4  # of a mounting; beyond it axes were confused, and nothing else of it is right
-    most_scale: float = 0.08  # of the gyro's scale, either way: beyond it the unit is another one, or the clock
+SUSPICION = 1e-3  # squared errors over squared turns from which it is searched; sound rigs reach 5e-4
+_WINDOW_S = 0.09  # s over which turns are compared: short beside changes of the rate
+_MEMORY_S = 3.0  # s of turns; samples are kept for as long
+_LEAST_S = 0.5  # s of turns that are compared, at least
+_EVERY_S = 0.24  # s between the first two searches
+_BACKOFF = 1.4  # by which the time to the next search grows with each that finds nothing
+_SELDOM_S = 5.0  # s; longest time between two searches: a rig that is worn badly stays in doubt
+_MOST_OFFSET_S = 0.15  # s, either way: drivers that stamp at arrival are late by less
+_ROTATION_SIGMA_RAD = 0.1  # rad; of a mounting about an axis: one about which nothing turned stays as told
+_SCALE_SIGMA = 0.02  # of the gyro's scale: what little turns leave open is the time offset first
+_TURN_SIGMA_RAD = 2e-4  # rad; least error of a turn by images over a window
+_EXPLAINED = 0.5  # share of the squared errors that a found calibration must explain
+LEAST_ROTATION_RAD = 0.025  # rad; smaller rotations are left to the filters
+_LEAST_SCALE = 0.02  # of the gyro; smaller changes of its scale are left to the filters
+LEAST_CHANGE_S = 0.015  # s; smaller changes of the time offset are left to the filters
+RESTART_S = 0.04  # s; change of the time offset from which velocity and vertical are found anew
+_MOST_ROTATION_RAD = 0.4  # rad; beyond it axes were confused, and nothing else of a mounting is right
+_MOST_SCALE = 0.08  # of the gyro's scale, either way: beyond it the unit is another one, or the clock
+_STEP_S = 0.01  # s of the grid of offsets: turns change slower
+_SIGNIFICANCE = 60.0  # squared errors that it explains, over the mean square of what it leaves
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,10 +66,9 @@ class Mounting:
 class MountingSearch:
     """Call `add` with each rotation by images, then `find`."""
 
-    def __init__(self, config: MountingSearchConfig) -> None:
-        self._config = config
+    def __init__(self) -> None:
         self._frames = list[tuple[int, F64]]()  # stamps and R_m_b (3,3)
-        self._next_ns, self._wait_s = 0, config.every_s  # time of the next search, and from it to the one after
+        self._next_ns, self._wait_s = 0, _EVERY_S  # time of the next search, and from it to the one after
         self.has_searched = False  # in turns that last long enough
 
     def clear(self) -> None:
@@ -89,31 +82,31 @@ class MountingSearch:
     def add(self, t_ns: int, R_m_b: F64) -> None:
         """Append the rotation R_m_b (3,3) of a frame by images."""
         self._frames.append((t_ns, R_m_b))
-        while self._frames[0][0] < t_ns - self._config.memory_s * 1e9:
+        while self._frames[0][0] < t_ns - _MEMORY_S * 1e9:
             del self._frames[0]
 
     def find(self, buffer: SampleBuffer, matrix: F64, offset_s: float) -> Mounting | None:
         """The mounting, if it explains the turns far better than the gyro's present matrix (3,3) and offset do."""
-        config, t_ns = self._config, self._frames[-1][0]
+        t_ns = self._frames[-1][0]
         if t_ns < self._next_ns:
             return None
         windows, last = list[tuple[int, int, F64]](), self._frames[0]
         for t_ns, R_m_b in self._frames:
             duration_s = (t_ns - last[0]) * 1e-9
-            if duration_s >= config.window_s:
-                if duration_s < _LONGEST * config.window_s:
+            if duration_s >= _WINDOW_S:
+                if duration_s < _LONGEST * _WINDOW_S:
                     windows.append((last[0], t_ns, se3.so3_log(last[1].T @ R_m_b)))
                 last = t_ns, R_m_b
         if not windows:
             return None
         begin, end, turns = (np.array(column) for column in zip(*windows, strict=True))
         compared = _Turns(begin, end, turns, *buffer.samples())
-        compared.keep_inside(config.most_offset_s)
-        if float(compared.dt_s.sum()) < config.least_s:
+        compared.keep_inside(_MOST_OFFSET_S)
+        if float(compared.dt_s.sum()) < _LEAST_S:
             return None
-        found, self.has_searched = _found(config, compared, matrix, offset_s), True
+        found, self.has_searched = _found(compared, matrix, offset_s), True
         self._next_ns = self._frames[-1][0] + round(1e9 * self._wait_s)
-        self._wait_s = config.every_s if found is not None else min(config.backoff * self._wait_s, config.seldom_s)
+        self._wait_s = _EVERY_S if found is not None else min(_BACKOFF * self._wait_s, _SELDOM_S)
         return found
 
 
@@ -142,22 +135,22 @@ class _Turns:
         return np.stack(columns, axis=-1)
 
 
-def _found(config: MountingSearchConfig, turns: _Turns, matrix: F64, offset_s: float) -> Mounting | None:
-    steps = round(config.most_offset_s / config.step_s)
-    offsets = np.asarray(config.step_s * np.arange(-steps, steps + 1), np.float64)
+def _found(turns: _Turns, matrix: F64, offset_s: float) -> Mounting | None:
+    steps = round(_MOST_OFFSET_S / _STEP_S)
+    offsets = np.asarray(_STEP_S * np.arange(-steps, steps + 1), np.float64)
     by_gyro, weight, cost = turns.by_gyro(offsets), np.ones(len(turns.dt_s)), np.empty(0)
     for _ in range(_FITS):
-        _, cost, left = _fit(config, turns, by_gyro, weight)
-        size = np.maximum(np.linalg.norm(left[np.argmin(cost)], axis=1), config.turn_sigma_rad)
+        _, cost, left = _fit(turns, by_gyro, weight)
+        size = np.maximum(np.linalg.norm(left[np.argmin(cost)], axis=1), _TURN_SIGMA_RAD)
         weight = np.minimum(1.0, _TAIL * np.median(size) / size) ** 2
     both_s, only_s = _least(offsets, cost), _least(offsets, _cost(turns, by_gyro, matrix, weight))
     if both_s is None or only_s is None:
         return None
     by_gyro = turns.by_gyro(np.array([both_s[0], only_s[0], offset_s]))
-    fitted, cost, _ = _fit(config, turns, by_gyro, weight)
+    fitted, cost, _ = _fit(turns, by_gyro, weight)
     by_offset, given = _cost(turns, by_gyro[1:], matrix, weight)
-    noise = max(float(cost[0]) / max(3.0 * float(weight.sum()) - _UNKNOWNS, 1.0), config.turn_sigma_rad**2)
-    clear = config.significance * noise
+    noise = max(float(cost[0]) / max(3.0 * float(weight.sum()) - _UNKNOWNS, 1.0), _TURN_SIGMA_RAD**2)
+    clear = _SIGNIFICANCE * noise
     # The fewest changes that explain the turns: where little turned, a rotation could pass for an offset.
     k, axes, (found_s, sigma) = 0, fitted[0], both_s
     if by_offset < cost[0] + clear:
@@ -165,21 +158,21 @@ def _found(config: MountingSearchConfig, turns: _Turns, matrix: F64, offset_s: f
     elif cost[2] < cost[0] + clear:
         k, axes, found_s = 2, fitted[2], offset_s
     explained = given - (by_offset if k == 1 else float(cost[k]))
-    if explained < max(config.explained * given, clear) or not _differs(config, axes, matrix, found_s - offset_s):
+    if explained < max(_EXPLAINED * given, clear) or not _differs(axes, matrix, found_s - offset_s):
         return None
     rest, share = turns.by_images - by_gyro[k] @ axes.T, weight * turns.dt_s
     bias = -share @ rest / float(share @ turns.dt_s)
     return Mounting(axes, found_s, sigma * float(np.sqrt(noise)), bias)
 
 
-def _differs(config: MountingSearchConfig, axes: F64, matrix: F64, later_s: float) -> bool:
+def _differs(axes: F64, matrix: F64, later_s: float) -> bool:
     """True if axes (3,3) and a time offset are those of a rig, but not of the given one."""
     change = np.asarray(np.linalg.solve(matrix, axes), np.float64)
     turn, scale = (_angle_rad(change), _angle_rad(axes)), (_scale(change), _scale(axes))
-    if turn[1] > config.most_rotation_rad or abs(scale[1] - 1.0) > config.most_scale:
+    if turn[1] > _MOST_ROTATION_RAD or abs(scale[1] - 1.0) > _MOST_SCALE:
         return False
-    changed = turn[0] > config.least_rotation_rad or abs(scale[0] - 1.0) > config.least_scale
-    return changed or abs(later_s) > config.least_change_s
+    changed = turn[0] > LEAST_ROTATION_RAD or abs(scale[0] - 1.0) > _LEAST_SCALE
+    return changed or abs(later_s) > LEAST_CHANGE_S
 
 
 def _scale(axes: F64) -> float:
@@ -210,13 +203,13 @@ def _cost(turns: _Turns, by_gyro: F64, axes: F64, weight: F64) -> F64:
     return np.asarray(np.sum(left**2, axis=2) @ weight)
 
 
-def _fit(config: MountingSearchConfig, turns: _Turns, by_gyro: F64, weight: F64) -> tuple[F64, F64, F64]:
+def _fit(turns: _Turns, by_gyro: F64, weight: F64) -> tuple[F64, F64, F64]:
     """Scaled rotations (k,3,3) of by_gyro (k,n,3) onto the turns by images, apart from a bias. weight: (n,).
 
     Also their squared errors (k,), with those of the prior, which is no scale and no rotation; and the errors (k,n,3).
     """
-    pull = 0.5 * (config.turn_sigma_rad / config.rotation_sigma_rad) ** 2
-    stiff = (config.turn_sigma_rad / config.scale_sigma) ** 2
+    pull = 0.5 * (_TURN_SIGMA_RAD / _ROTATION_SIGMA_RAD) ** 2
+    stiff = (_TURN_SIGMA_RAD / _SCALE_SIGMA) ** 2
     seen, by_gyro = (_without_bias(vectors, turns.dt_s, weight) for vectors in (turns.by_images, by_gyro))
     moment = (weight * seen.T) @ by_gyro + pull * np.eye(3)
     rotation = _rotation(moment)

@@ -4,18 +4,20 @@ Filters beside the smoother, at a few updates a second: these values change slow
 the filters contradict that significantly; then their estimates correct the samples.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from kiteline_agent.inertial.calibration import mounting_search
 from kiteline_agent.inertial.calibration.accel_calibration import AccelCalibration
 from kiteline_agent.inertial.calibration.axes_report import axes_report, correction_event, measured_rotation, turned_rad
 from kiteline_agent.inertial.calibration.disagreement import Disagreement
 from kiteline_agent.inertial.calibration.gyro_calibration import GyroCalibration
 from kiteline_agent.inertial.calibration.known_imu import KnownImuConfig, is_plausible, known_axes
-from kiteline_agent.inertial.calibration.lever_search import LeverSearch, LeverSearchConfig
-from kiteline_agent.inertial.calibration.mounting_search import Mounting, MountingSearch, MountingSearchConfig
+from kiteline_agent.inertial.calibration.lengths_check import LengthsCheck
+from kiteline_agent.inertial.calibration.lever_search import LeverSearch
+from kiteline_agent.inertial.calibration.mounting_search import Mounting, MountingSearch
 from kiteline_agent.inertial.calibration.pose_chain import PoseChain, SampledMotion
 from kiteline_agent.inertial.calibration.turn_scatter import added_variance
 from kiteline_agent.inertial.calibration.window import Window
@@ -32,35 +34,33 @@ _TURNS_COMPARED = 1.5, 0.03, 0.03, 0.4
 _FORCES_COMPARED = 3.0, 0.3, 0.25, 1.0
 _CORRECT = "used from now on, correct the calibration (T_BS, time offset)"
 _KEPT = 0.25  # share of a window's added variance that the next has at least: the map that was dragged is still seen
+_TURN_WINDOW_S = 0.25  # s over which rotations are compared
+_MOVE_WINDOW_S = 0.6  # s of two windows over which velocities are compared: vibration averages out
+_TURN_SIGMA_RAD = 4e-4  # rad; error of a rotation by images over a window
+_POSITION_SIGMA_M = 7e-4  # m; error of a position by images, as it changes over windows, at least
+_SCALE_SIGMA = 0.015  # relative; of lengths by the images
+_SIGNIFICANT_WINDOWS = 2  # of turns, in a row, before axes are applied: people who walk by turn one window
+_APPLY_S = 0.5  # s; time constant with which applied axes follow
+_OFFSET_SIGNIFICANCE = 3.0  # deviations from the configured offset below which it stays: most rigs have none
+_OFFSET_RATE = 0.05  # s/s; how fast the applied offset follows
+_KEPT_OFFSET_SIGMA_S = 3e-4  # s; of the time offset between two flights: another exposure
+_REFUTED = 5.0  # log likelihood of an unknown IMU over that of earlier flights, from which those are dropped
+_OFFSET_TRUSTED_S = 3e-3  # s; deviation below which the offset is applied
 
 
 @dataclass(frozen=True, slots=True)
 class SelfCalibrationConfig:
     """Errors of the calibration before the flight, errors of poses by images, and when an estimate is applied."""
 
-    turn_window_s: float = 0.25  # over which rotations are compared
-    move_window_s: float = 0.6  # of two windows over which velocities are compared: vibration averages out
-    turn_sigma_rad: float = 4e-4  # error of a rotation by images over a window
-    position_sigma_m: float = 7e-4  # error of a position by images, as it changes over windows, at least
-    position_rad: float = 2.3e-4  # the same over the depth that the images see: a tenth of a pixel
+    position_rad: float = 2.3e-4  # error of a position by images, over the depth that they see: a tenth of a pixel
     sensor_scale_sigma: float = 0.01  # of the scales of gyro and accelerometer; data sheets give 1 to 3 %
     misalignment_sigma: float = 0.007  # rad; by which a sensing axis leans to another; data sheets give 0.5 to 1 degree
-    scale_sigma: float = 0.015  # relative, of lengths by the images
     significance: float = 25.0  # squared deviations of 9 axes from a true rig, above which they are applied
-    significant_windows: int = 2  # of turns, in a row: people who walk by turn one window
-    apply_s: float = 0.5  # time constant with which applied axes follow
     offset_s: float = 0.0  # camera stamp + offset = IMU time, if a calibration gives it
     offset_sigma_s: float = 0.02  # cameras without a trigger line
-    offset_trusted_s: float = 3e-3  # deviation below which the offset is applied
-    offset_significance: float = 3.0  # deviations from the configured offset below which it stays: most rigs have none
-    offset_rate: float = 0.05  # s/s, how fast the applied offset follows
     kept_axes_sigma: float = 1e-3  # of axes between two flights: temperature, and what images are off by in both
-    kept_offset_sigma_s: float = 3e-4  # of the time offset between two flights: another exposure
-    refuted: float = 5.0  # log likelihood of an unknown IMU over that of earlier flights, from which those are dropped
     apply_axes: bool = True  # False: axes are only estimated
     apply_offset: bool = True  # False: only the configured offset is used
-    mounting: MountingSearchConfig = field(default_factory=MountingSearchConfig)
-    lever: LeverSearchConfig = field(default_factory=LeverSearchConfig)
 
     @property
     def axes_sigma(self) -> F64:
@@ -97,9 +97,10 @@ class SelfCalibration:
         self.gyro, self.accel = self._unknown_gyro(), self._unknown_accel()
         self._unprimed_gyro: GyroCalibration | None = None  # a second estimate, without what earlier flights found
         self._earlier = KnownImuConfig()  # what earlier flights found
-        self._turns = PoseChain(config.turn_window_s)
-        self._moves = PoseChain(config.move_window_s)
-        self._mounting, self._lever = MountingSearch(config.mounting), LeverSearch(config.lever)
+        self._turns = PoseChain(_TURN_WINDOW_S)
+        self._moves = PoseChain(_MOVE_WINDOW_S)
+        self._mounting, self._lever = MountingSearch(), LeverSearch()
+        self._lengths = LengthsCheck(_SCALE_SIGMA)
         self._given_axes, self._given_offset_s = np.eye(3), config.offset_s  # with which the filters began
         self._lever_m = np.zeros(3)  # origin of the body, as the calibration places it, in the IMU
         self.restarted = False  # True after an `update` that found a calibration: what was integrated before is void
@@ -125,7 +126,7 @@ class SelfCalibration:
     def _unknown_accel(self) -> AccelCalibration:
         c = self._config
         return AccelCalibration(
-            c.axes_sigma, c.scale_sigma, self._calibration.accel_walk, self._gravity_m_s2,
+            c.axes_sigma, _SCALE_SIGMA, self._calibration.accel_walk, self._gravity_m_s2,
             Disagreement(*_FORCES_COMPARED),
         )  # fmt: skip
 
@@ -137,11 +138,11 @@ class SelfCalibration:
             offset_s, offset_sigma_s = known.offset_s
             self.gyro.begin_with(
                 np.reshape(known.gyro, (3, 3)), np.hypot(known.gyro_sigma, config.kept_axes_sigma),
-                offset_s, float(np.hypot(offset_sigma_s, config.kept_offset_sigma_s)),
+                offset_s, float(np.hypot(offset_sigma_s, _KEPT_OFFSET_SIGMA_S)),
             )  # fmt: skip
             self._given_axes, self._given_offset_s = self.gyro.matrix, offset_s
             self._follow_offset(np.inf)
-            self._gyro_windows = config.significant_windows  # they were, in flight
+            self._gyro_windows = _SIGNIFICANT_WINDOWS  # they were, in flight
             self._test_gyro()
         if known.accel:
             sigma = np.hypot(known.accel_sigma, config.kept_axes_sigma)
@@ -209,9 +210,8 @@ class SelfCalibration:
 
     def clear(self) -> None:
         """Begin new windows after an image loss."""
-        self._turns.clear()
-        self._moves.clear()
-        self._mounting.clear()
+        for windows in (self._turns, self._moves, self._mounting):
+            windows.clear()
         self._before = None
 
     def begin_map(self) -> None:
@@ -239,14 +239,14 @@ class SelfCalibration:
         if isinstance(turn, SampledMotion):
             offset_s, density = self.gyro.offset_s, float(self._density(turn)[0])
             added = added_variance(
-                turn, buffer, self.gyro.matrix, self.gyro.bias, self._config.turn_sigma_rad, density
+                turn, buffer, self.gyro.matrix, self.gyro.bias, _TURN_SIGMA_RAD, density
             )  # fmt: skip
             self._added = added = max(added, _KEPT * self._added)
-            self._unsteady = max(self._unsteady, 1.0 + added / self._config.turn_sigma_rad**2)
+            self._unsteady = max(self._unsteady, 1.0 + added / _TURN_SIGMA_RAD**2)
             for gyro in (self.gyro, self._unprimed_gyro):
                 if gyro is not None:
                     window = self._integrate(turn, gyro)
-                    variance = self._config.turn_sigma_rad**2 + added + density**2 * window.duration_s
+                    variance = _TURN_SIGMA_RAD**2 + added + density**2 * window.duration_s
                     gyro.add(window, turn.T_m_b0[:3, :3].T @ turn.T_m_b1[:3, :3], variance, offset_s)
             self._drop_refuted_prior()
             self._test_gyro()
@@ -271,7 +271,7 @@ class SelfCalibration:
     def _drop_refuted_prior(self) -> None:
         """Drop what earlier flights found if rotations are likelier without it. Applied axes follow the new ones."""
         unprimed = self._unprimed_gyro
-        if unprimed is not None and unprimed.log_likelihood - self.gyro.log_likelihood > self._config.refuted:
+        if unprimed is not None and unprimed.log_likelihood - self.gyro.log_likelihood > _REFUTED:
             self.gyro, self._unprimed_gyro, self._earlier = unprimed, None, KnownImuConfig()
             self._given_axes, self._given_offset_s = np.eye(3), self._config.offset_s
             accel, self.accel = self.accel, self._unknown_accel()
@@ -283,7 +283,7 @@ class SelfCalibration:
         config = self._config
         self.camera_rotation_rad = turned_rad(self.gyro.matrix, self.gyro.axes_cov, config.misalignment_sigma)
         self._gyro_windows = self._gyro_windows + 1 if self.gyro.significance() > config.significance else 0
-        if config.apply_axes and not self._corrects_gyro and self._gyro_windows >= config.significant_windows:
+        if config.apply_axes and not self._corrects_gyro and self._gyro_windows >= _SIGNIFICANT_WINDOWS:
             self._corrects_gyro = True
             self._events.append(correction_event("gyro", self.gyro.matrix))
 
@@ -294,14 +294,16 @@ class SelfCalibration:
         if may and self.accel.significance() > config.significance:
             self._corrects_accel = True
             self._events.append(correction_event("accelerometer", self.accel.matrix))
+        if self._metric:
+            self._events += self._lengths.note(*self.accel.scale)
 
     def _search_mounting(self, buffer: SampleBuffer) -> None:
         """Begin anew with another mounting and time offset where these explain turns that the present ones do not."""
-        gyro, limits = self.gyro, self._config.mounting
+        gyro = self.gyro
         axes_off = float(np.abs(gyro.matrix - self._given_axes).max())
-        doubted = self._gyro_windows > 0 and axes_off > 0.5 * limits.least_rotation_rad
-        doubted |= abs(gyro.offset_s - self._given_offset_s) > limits.least_change_s
-        doubted |= gyro.disagreement.share > limits.suspicion
+        doubted = self._gyro_windows > 0 and axes_off > 0.5 * mounting_search.LEAST_ROTATION_RAD
+        doubted |= abs(gyro.offset_s - self._given_offset_s) > mounting_search.LEAST_CHANGE_S
+        doubted |= gyro.disagreement.share > mounting_search.SUSPICION
         if not (doubted and self._searches):
             return
         found = self._mounting.find(buffer, self._given_axes, self._given_offset_s)
@@ -312,10 +314,9 @@ class SelfCalibration:
 
     def _begin_with_mounting(self, found: Mounting) -> None:
         """Begin the gyro's filter anew; after more than a small change of the time offset all that is inertial, too."""
-        least = self._config.mounting
         change_rad = float(np.linalg.norm(se3.so3_log(found.rotation @ self._accel_matrix.T)))
-        self.turned = change_rad > least.least_rotation_rad
-        jumps = abs(found.offset_s - self.offset_s) > least.restart_s
+        self.turned = change_rad > mounting_search.LEAST_ROTATION_RAD
+        jumps = abs(found.offset_s - self.offset_s) > mounting_search.RESTART_S
         jumps |= not np.array_equal(found.axes, self._given_axes)
         self.gyro, self._unprimed_gyro = self._unknown_gyro(), None
         self.gyro.begin_with(found.axes, self._config.axes_sigma.reshape(3, 3), found.offset_s, found.sigma_s)
@@ -350,18 +351,18 @@ class SelfCalibration:
     def _follow_offset(self, dt_s: float) -> None:
         """Move the applied time offset towards the estimate, once that is significant."""
         config = self._config
-        if not config.apply_offset or self.gyro.offset_sigma_s >= config.offset_trusted_s:
+        if not config.apply_offset or self.gyro.offset_sigma_s >= _OFFSET_TRUSTED_S:
             return
         step = self.gyro.offset_s - self.offset_s
         sigma = self.gyro.offset_sigma_s * max(self.gyro.excess, 1.0) ** 0.5
-        self._corrects_offset |= abs(step) > config.offset_significance * sigma
+        self._corrects_offset |= abs(step) > _OFFSET_SIGNIFICANCE * sigma
         if self._corrects_offset:
-            self.offset_s += float(np.clip(step, -config.offset_rate * dt_s, config.offset_rate * dt_s))
+            self.offset_s += float(np.clip(step, -_OFFSET_RATE * dt_s, _OFFSET_RATE * dt_s))
 
     def _follow_axes(self, buffer: SampleBuffer, dt_s: float) -> F64:
         """Move the applied axes towards the estimates. Returns the change (3,) of the accelerometer bias, m/s^2."""
         change = np.zeros(3)
-        share = 1.0 - float(np.exp(-dt_s / self._config.apply_s))
+        share = 1.0 - float(np.exp(-dt_s / _APPLY_S))
         if self._corrects_gyro:
             self._gyro_matrix = self._gyro_matrix + share * (self.gyro.matrix - self._gyro_matrix)
         if self._corrects_accel:
@@ -372,7 +373,7 @@ class SelfCalibration:
 
     def _add_move(self, link: SampledMotion) -> None:
         config = self._config
-        position_m = max(config.position_sigma_m, config.position_rad * self._depth_m)
+        position_m = max(_POSITION_SIGMA_M, config.position_rad * self._depth_m)
         now = _Move(self._integrate(link, self.gyro), link, float(self._density(link)[1]), position_m, self._unsteady)
         before, self._before, self._unsteady, self._depth_m = self._before, now, 1.0, 0.0
         if before is None:
@@ -381,7 +382,7 @@ class SelfCalibration:
         t0, t1 = before.window.duration_s, now.window.duration_s
         images = position_m**2 * (1 / t0**2 + (1 / t0 + 1 / t1) ** 2 + 1 / t1**2)
         imu = (t0 * before.density**2 + t1 * now.density**2) / 3.0
-        tilt = (self._gravity_m_s2 * config.turn_sigma_rad) ** 2 * 0.5 * (t0**2 + t1**2)
+        tilt = (self._gravity_m_s2 * _TURN_SIGMA_RAD) ** 2 * 0.5 * (t0**2 + t1**2)
         variance = images + imu + tilt + (unsteady - 1.0) * (images + tilt)
         poses = before.link.T_m_b0, link.T_m_b0, link.T_m_b1
         self.accel.add((before.window, now.window), poses, self._p_b_c, variance, self._lever)

@@ -40,6 +40,7 @@ class KeyframeScan(Record):
     KIND = 11
     ID = IdOf.KEYFRAME
     PRIORITY = Priority.LANDMARKS
+    URGENCY = Priority.GRID
     PARTS = 16
     FIRST_PARTS = 2  # a hundred bytes each: later, a link that is full for a whole flight would not carry one
 

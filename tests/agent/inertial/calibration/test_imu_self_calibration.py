@@ -7,7 +7,11 @@ import pytest
 
 from kiteline_agent.inertial.calibration.gyro_calibration import GyroCalibration
 from kiteline_agent.inertial.calibration.known_imu import KnownImuConfig
-from kiteline_agent.inertial.calibration.self_calibration import SelfCalibration, SelfCalibrationConfig
+from kiteline_agent.inertial.calibration.self_calibration import (
+    _OFFSET_TRUSTED_S,
+    SelfCalibration,
+    SelfCalibrationConfig,
+)
 from kiteline_agent.inertial.calibration.window import Window
 from kiteline_agent.inertial.preintegration import Samples, preintegrate
 from kiteline_agent.inertial.sample_buffer import SampleBuffer
@@ -180,7 +184,14 @@ def test_without_motion_nothing_is_learned() -> None:
     assert calibration.offset_s == 0.0
     assert np.abs(calibration.gyro.matrix - np.eye(3)).max() < 0.2 * config.misalignment_sigma
     assert (np.sqrt(np.diag(calibration.gyro.axes_cov)) / config.axes_sigma).min() > 0.9
-    assert calibration.gyro.offset_sigma_s > config.offset_trusted_s  # gyro noise looks like some motion
+    assert calibration.gyro.offset_sigma_s > _OFFSET_TRUSTED_S  # gyro noise looks like some motion
+
+
+def test_a_flight_begins_with_the_deviations_of_the_data_sheet() -> None:
+    config = SelfCalibrationConfig(sensor_scale_sigma=0.03, misalignment_sigma=0.02)
+    gyro = SelfCalibration(CALIBRATION, config, P_B_C, 9.81).gyro
+    sigma = np.sqrt(np.diag(gyro.axes_cov)).reshape(3, 3)
+    np.testing.assert_allclose(sigma, np.where(np.eye(3) > 0.0, 0.03, 0.02))
 
 
 def test_a_map_that_is_moved_changes_nothing() -> None:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from kiteline_agent.inertial.calibration.lever_search import LeverSearch, LeverSearchConfig
+from kiteline_agent.inertial.calibration.lever_search import LeverSearch
 from kiteline_agent.inertial.calibration.self_calibration import SelfCalibration, SelfCalibrationConfig
 from kiteline_agent.inertial.preintegration import Samples
 from kiteline_core.arrays import F64
@@ -101,7 +101,7 @@ def test_the_next_flight_begins_with_a_found_mounting() -> None:
 def test_a_lever_search_in_a_map_that_is_turned_goes_on() -> None:
     rng = np.random.default_rng(3)
     lever_m, gravity, bias = np.array([0.2, -0.1, 0.3]), np.array([0.1, 0.2, -9.8]), np.array([0.05, -0.02, 0.1])
-    search, R = LeverSearch(LeverSearchConfig()), np.eye(3)
+    search, R = LeverSearch(), np.eye(3)
     for k in range(16):
         if k == 8:
             turn = se3.so3_exp(np.array([0.4, -0.3, 1.0]))
