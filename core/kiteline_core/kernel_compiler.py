@@ -1,32 +1,34 @@
-"""Shortcuts through numba's compiler: kernels that compute the same, in two thirds of the time.
+"""Shortcuts through numba's compiler: kernels that compute the same, compiled in half of the time.
 
 They reach into numba, so a version that they were not tried with compiles without them. Their tests compare results.
 """
 
-import contextlib
-import fcntl
-import os
 from typing import Any
 
 import llvmlite.binding as llvm
 import llvmlite.binding.ffi
 import numba
-from numba.core import caching, ir, typed_passes, types, untyped_passes
+from numba.core import caching, ir, postproc, transforms, typed_passes, types, untyped_passes
+from numba.core.base import BaseContext
 from numba.core.codegen import JITCodeLibrary, JITCPUCodegen
 from numba.core.compiler import CompilerBase
 from numba.core.compiler_machinery import PassManager
 from numba.core.dispatcher import Dispatcher
 from numba.core.lowering import Lower
-from numba.core.runtime.nrt import rtsys
 from numba.core.targetconfig import ConfigStack
 from numba.core.types.functions import BaseFunction
 from numba.np import arrayobj
+
+from kiteline_core import kernel_files, kernel_lowering
 
 TRIED = ("0.68.",)  # beginnings of numba's versions
 
 
 class KernelCompiler(CompilerBase):
-    """The compiler without the passes for closures, array expressions and literal arguments, which no kernel has."""
+    """The compiler without the passes for closures, array expressions and literal arguments, which no kernel has.
+
+    Without the listing of types, too: it holds on to the whole source tree, and is printed into the cache.
+    """
 
     def define_pipelines(self) -> list[Any]:
         """Return the one pipeline, from byte code to machine code."""
@@ -35,8 +37,7 @@ class KernelCompiler(CompilerBase):
             untyped_passes.TranslateByteCode, untyped_passes.FixupArgs, untyped_passes.IRProcessing,
             untyped_passes.GenericRewrites, untyped_passes.ReconstructSSA,
             typed_passes.NopythonTypeInference, typed_passes.PreLowerStripPhis,
-            typed_passes.IRLegalization, typed_passes.AnnotateTypes, typed_passes.NativeLowering,
-            typed_passes.NoPythonBackend,
+            typed_passes.IRLegalization, typed_passes.NativeLowering, typed_passes.NoPythonBackend,
         ):  # fmt: skip
             passes.add_pass(step, step.__name__)
         passes.finalize()
@@ -51,6 +52,14 @@ class KernelLibrary(JITCodeLibrary):
     """
 
     is_linked_only = False
+
+    def add_ir_module(self, ir_module: Any) -> None:
+        """Take a function's code, and take apart its description, which refers to itself: no garbage collection."""
+        super().add_ir_module(ir_module)  # type: ignore[no-untyped-call]
+        for function in ir_module.functions:
+            for block in function.blocks:
+                block.instructions.clear()
+            function.blocks.clear()
 
     def _optimize_functions(self, ll_module: Any) -> None:
         ll_module.data_layout = self._codegen._data_layout
@@ -91,14 +100,12 @@ class KernelLibrary(JITCodeLibrary):
 
 
 _lower = typed_passes.NativeLowering.run_pass
+_post_process = postproc.PostProcessor.run
+_abi_size = BaseContext.get_abi_sizeof
+_sizes: dict[str, int] = {}
 _set_env = JITCPUCodegen.set_env
 _call_type = types.Dispatcher.get_call_type
 _resolve = BaseFunction.get_call_type
-_fix_index = arrayobj.fix_integer_index
-_enable_caching = Dispatcher.enable_caching
-_save_overload = caching.Cache.save_overload
-_arguments = Lower.extract_function_arguments
-_lowering = [False]  # whether the code that is being generated is a kernel's, innermost last
 
 
 def lower(self: Any, state: Any) -> Any:
@@ -106,59 +113,29 @@ def lower(self: Any, state: Any) -> Any:
     if state.library is None:
         state.library = state.targetctx.codegen().create_library(state.func_id.func_qualname)
         state.library.enable_object_caching()
-    flags = state.flags
-    if flags.no_cpython_wrapper and (flags.no_cfunc_wrapper or state.func_id.modname.startswith("numba.")):
+    flags, is_numbas = state.flags, state.func_id.modname.startswith("numba.")
+    if flags.no_cpython_wrapper and (flags.no_cfunc_wrapper or is_numbas):
         flags.no_cfunc_wrapper = True
         state.library.is_linked_only = True
-    _lowering.append(isinstance(state.pipeline, KernelCompiler) and not state.func_id.modname.startswith("numba."))
-    try:
+    with kernel_lowering.code_of(isinstance(state.pipeline, KernelCompiler) and not is_numbas, state):
         return _lower(self, state)  # type: ignore[no-untyped-call]
-    finally:
-        _lowering.pop()
 
 
-def borrowed_arguments(self: Any) -> Any:
-    """Take a kernel's arrays without an owner: their caller holds them, so that no view of them need be counted.
-
-    Counting takes a locked instruction at each view, and stands in the way of other optimisations. A function that
-    returns an array counts, since its caller may give up the array that the result is a view of.
-    """
-    arguments = _arguments(self)  # type: ignore[no-untyped-call]
-    if _lowering[-1] and _holds_numbers(self.fndesc.restype):
-        kinds = self.fndesc.argtypes
-        self.fnargs = [_without_owner(self.context, self.builder, *one) for one in zip(kinds, arguments, strict=True)]
-    return self.fnargs
+def post_process(self: Any, emit_dels: bool = False, extend_lifetimes: bool = False) -> None:
+    """Find the variables' lifetimes where they are used: in the last run, which ends variables, and in generators."""
+    if emit_dels or self.func_ir.is_generator:
+        _post_process(self, emit_dels, extend_lifetimes)
+        return
+    self.func_ir.blocks = transforms.canonicalize_cfg(self.func_ir.blocks)  # type: ignore[no-untyped-call]
+    self.func_ir.variable_lifetime = postproc.VariableLifetime(self.func_ir.blocks)  # type: ignore[no-untyped-call]
 
 
-def _is_tuple(kind: Any) -> bool:
-    return isinstance(kind, types.BaseTuple)
-
-
-def _holds_numbers(kind: Any) -> bool:
-    if _is_tuple(kind):
-        return all(map(_holds_numbers, kind.types))
-    return isinstance(kind, (types.Number, types.Boolean, types.NoneType))
-
-
-def _without_owner(context: Any, builder: Any, kind: Any, value: Any) -> Any:
-    if _is_tuple(kind):
-        for i, part in enumerate(kind.types):
-            inner = _without_owner(context, builder, part, builder.extract_value(value, i))
-            value = builder.insert_value(value, inner, i)
-    elif isinstance(kind, types.Array):
-        field = context.data_model_manager[kind].get_field_position("meminfo")
-        value = builder.insert_value(value, value.type.elements[field](None), field)
-    return value
-
-
-def plain_index(context: Any, builder: Any, kind: Any, index: Any, size: Any) -> Any:
-    """Take a kernel's index as it is: no kernel counts from the end of an array by a negative one.
-
-    The choice at each access stands in the way of vectors. With NUMBA_BOUNDSCHECK=1 a negative index raises IndexError.
-    """
-    if not _lowering[-1]:
-        return _fix_index(context, builder, kind, index, size)  # type: ignore[no-untyped-call]
-    return context.cast(builder, index, kind, types.intp if kind.signed else types.uintp)
+def abi_size(self: Any, kind: Any) -> int:
+    """Return the bytes of a type of LLVM; numba has a module parsed for each variable."""
+    name = str(kind)
+    if name not in _sizes:
+        _sizes[name] = _abi_size(self, kind)  # type: ignore[no-untyped-call]
+    return _sizes[name]
 
 
 def set_env(self: Any, env_name: str, env: Any) -> None:
@@ -190,53 +167,6 @@ def call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
     if self.dispatcher._compiler.pipeline_class is KernelCompiler:
         args = tuple(types.unliteral(one) for one in args)  # type: ignore[no-untyped-call]
     return _call_type(self, context, args, kws)
-
-
-def save(self: Any, key: Any, data: Any) -> None:
-    """Write a compiled function to the cache, one process at a time and the index last.
-
-    numba reads the index, adds to it and writes the code after it. Two processes that compile a function for different
-    types at once would lose one of them, or find the code of one under the types of the other.
-    """
-    with contextlib.ExitStack() as stack:
-        with contextlib.suppress(OSError):  # a file system without locks
-            folder = os.open(self._cache_path, os.O_RDONLY)
-            stack.callback(os.close, folder)
-            fcntl.flock(folder, fcntl.LOCK_EX)
-        overloads = self._load_index()
-        free = (name for k in range(1, len(overloads) + 2) if (name := self._data_name(k)) not in overloads.values())
-        name = overloads.get(key) or next(free)
-        self._save_data(name, data)
-        self._save_index({**overloads, key: name})
-
-
-unkept: list[str] = []  # why compiled code of this process is not in the cache, if it is not
-
-
-def enable_caching(self: Any) -> None:
-    """Keep compiled code on disk, if there is a folder that takes it; numba would refuse to make the function."""
-    try:
-        _enable_caching(self)
-    except RuntimeError as error:
-        unkept.append(str(error))
-
-
-def load_overload(self: Any, signature: Any, context: Any) -> Any:
-    """Load compiled code from the cache, or return None.
-
-    numba first loads what only a compilation needs, scipy among it where it is installed: half a second of CPU and
-    25 MiB in each process. A compilation loads that by itself.
-    """
-    rtsys.initialize(context)  # memory management, which compiled code refers to
-    return self._load_overload(signature, context)
-
-
-def save_overload(self: Any, signature: Any, data: Any) -> None:
-    """Keep compiled code, if the disk takes it. It is in memory in either case: numba would not let it run."""
-    try:
-        _save_overload(self, signature, data)  # type: ignore[no-untyped-call]
-    except OSError as error:
-        unkept.append(error.strerror or str(error))
 
 
 _OTHER, _VARIABLE, _INSTRUCTION, _SEQUENCE, _MAPPING = range(5)
@@ -276,13 +206,18 @@ def install() -> dict[str, Any]:
         (typed_passes.NativeLowering, "run_pass", lower),
         (JITCPUCodegen, "_library_class", KernelLibrary),
         (JITCPUCodegen, "set_env", set_env),
-        (arrayobj, "fix_integer_index", plain_index),
-        (Lower, "extract_function_arguments", borrowed_arguments),
+        (postproc.PostProcessor, "run", post_process),
+        (BaseContext, "get_abi_sizeof", abi_size),
         (ir.Inst, "_rec_list_vars", variables_in),
-        (caching.IndexDataCacheFile, "save", save),
-        (caching.Cache, "load_overload", load_overload),
-        (caching.Cache, "save_overload", save_overload),
-        (Dispatcher, "enable_caching", enable_caching),
+        (arrayobj, "fix_integer_index", kernel_lowering.plain_index),
+        (Lower, "extract_function_arguments", kernel_lowering.borrowed_arguments),
+        (Lower, "lower_getitem", kernel_lowering.get_item),
+        (Lower, "lower_setitem", kernel_lowering.set_item),
+        (Lower, "delvar", kernel_lowering.delete_variable),
+        (caching.IndexDataCacheFile, "save", kernel_files.save),
+        (caching.Cache, "load_overload", kernel_files.load_overload),
+        (caching.Cache, "save_overload", kernel_files.save_overload),
+        (Dispatcher, "enable_caching", kernel_files.enable_caching),
     ):
         setattr(owner, name, value)
     llvmlite.binding.ffi.lib._lock._cblist.clear()  # events of each call of LLVM, to which nothing listens

@@ -17,7 +17,7 @@ from numba.core.registry import cpu_target
 from numba.core.types.functions import BaseFunction
 from numba.np import arrayobj
 
-from kiteline_core import kernel_compiler
+from kiteline_core import kernel_compiler, kernel_lowering
 from kiteline_core.imaging.matching_kernels import fill_cells
 from kiteline_core.kernel_compiler import KernelCompiler, install, remembered_call_type
 from kiteline_core.pose.pnp_kernels import p3p
@@ -52,8 +52,12 @@ def _code(options: dict[str, Any]) -> str:
 
 
 def test_the_short_pipeline_makes_the_same_code(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(arrayobj, "fix_integer_index", kernel_compiler._fix_index)
-    monkeypatch.setattr(Lower, "extract_function_arguments", kernel_compiler._arguments)
+    monkeypatch.setattr(arrayobj, "fix_integer_index", kernel_lowering._fix_index)
+    for name, usual in (
+        ("extract_function_arguments", kernel_lowering._arguments), ("delvar", kernel_lowering._delete_variable),
+        ("lower_getitem", kernel_lowering._get_item), ("lower_setitem", kernel_lowering._set_item),
+    ):  # fmt: skip
+        monkeypatch.setattr(Lower, name, usual)
     assert _code({"pipeline_class": KernelCompiler}) == _code({})
 
 
@@ -103,6 +107,61 @@ def test_views_of_a_kernels_arguments_are_not_counted() -> None:
         (code,) = compiled.inspect_llvm().values()
         counted.append(code.count("call void @NRT_incref"))
     assert counted[1] < counted[0]
+
+
+def _sum_of_rows(levels: Any, rows: Any) -> float:
+    total = 0.0
+    for i in range(rows.shape[0]):
+        line = levels[rows[i] % 2][rows[i]]
+        for value in line[1:]:
+            total += value
+    return total
+
+
+def _sum_of_some(levels: Any, rows: Any) -> float:
+    total = 0.0
+    for i in range(rows.shape[0]):
+        some = levels[0][rows[i]]
+        total += some[some > 3.0].sum()
+    return total
+
+
+@pytest.mark.parametrize(("function", "counts"), [(_sum_of_rows, False), (_sum_of_some, True)])
+def test_only_a_kernel_that_makes_an_array_counts(function: Any, counts: bool) -> None:
+    if not numba.__version__.startswith(kernel_compiler.TRIED):
+        pytest.skip("compiles as numba does")
+    levels, rows = (np.arange(40.0).reshape(10, 4), np.ones((10, 4))), np.array([3, 4, 9, 1, 0, 2])
+    compiled: Any = numba.njit(nogil=True, no_cfunc_wrapper=True, pipeline_class=KernelCompiler)(function)
+    held = [sys.getrefcount(one) for one in (*levels, rows)]
+    assert compiled(levels, rows) == function(levels, rows)
+    assert [sys.getrefcount(one) for one in (*levels, rows)] == held
+    (code,) = compiled.inspect_llvm().values()
+    own = code.partition("define ")[2].partition("\n}")[0]  # without the wrapper that Python calls
+    assert ("NRT_" in own) == counts
+
+
+def _mixed_elements(bits: Any, codes: Any, columns: Any, pair: Any, out: Any) -> float:
+    row, k, total = codes[1], np.uint8(2), 0.0
+    for i in range(bits.shape[0]):
+        if bits[i] and pair[1][i, 1] > 0:
+            total += row[k] + codes[np.int32(i % 2), k] * columns[i, 0] + columns[0][i]
+        out[i, 1, k] = codes[0, i] + 300
+        out[i, 0] = row[i]
+        bits[i] = not bits[i]
+    return total
+
+
+def test_elements_of_all_kinds_are_read_and_written() -> None:
+    """Of rows, of arrays that are not contiguous, by small and unsigned indices, converted to another type."""
+    results = []
+    for options in (None, {}, {"pipeline_class": KernelCompiler}):
+        codes = np.arange(8, dtype=np.uint16).reshape(2, 4)
+        bits, out = np.array([True, False, True]), np.zeros((3, 2, 4), np.float32)
+        pair = codes.astype(np.int8), np.ones((3, 2), np.int16)
+        function: Any = _mixed_elements if options is None else numba.njit(**options)(_mixed_elements)
+        total = function(bits, codes, np.linspace(0.0, 1.0, 9).reshape(3, 3).T, pair, out)
+        results.append([total, *bits, *out.ravel()])
+    assert results[0] == results[1] == results[2]
 
 
 @numba.njit(nogil=True, no_cfunc_wrapper=True, no_cpython_wrapper=True, pipeline_class=KernelCompiler)

@@ -137,9 +137,10 @@ class Inbox:
 
     def held(self, key: Key) -> tuple[int, bytes] | None:
         """Version and code of a value, None when there is none."""
-        if self._is_archived(key) and self._packed:
-            return self._archive.peek(key.id, key.kind, key.part)
-        return self._fetched(key)
+        value = self._values.get(key)
+        if value is not None or not self._is_archived(key):
+            return value
+        return self._archive.peek(key.id, key.kind, key.part) if self._packed else self._fetched(key)
 
     def _is_archived(self, key: Key) -> bool:
         """True if the values of the key's id are in the archive: all of them, or none."""
@@ -147,10 +148,12 @@ class Inbox:
 
     def _fetched(self, key: Key) -> tuple[int, bytes] | None:
         """Version and code of a value, which is not in the archive then."""
-        if self._is_archived(key):
+        value = self._values.get(key)
+        if value is None and self._is_archived(key):
             self._fetch(key.id)
             self._make_room(key.id)
-        return self._values.get(key)
+            return self._values.get(key)
+        return value
 
     def codes(self) -> dict[Key, bytes]:
         """The codes of all values."""

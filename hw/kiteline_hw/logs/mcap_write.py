@@ -17,6 +17,9 @@ _MAGIC = b"\x89MCAP0\r\n"
 _MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time
 _CHUNK = struct.Struct("<BQQQQIIQ")  # opcode, length, first and last time, size, CRC-32, no compression, size
 _INDEX = struct.Struct("<BQHI")  # opcode, length, channel, length of the rows
+_CHUNK_INDEX = struct.Struct("<BQQQQQI")  # opcode, length, first and last time, place and bytes of chunk, of offsets
+_OFFSET = struct.Struct("<HQ")  # channel, place of its index
+_SIZES = struct.Struct("<QIQQ")  # bytes of all indices, no compression, size, size
 _RECORD_BYTES = 9  # opcode and length
 
 
@@ -176,13 +179,13 @@ class McapWriter:
                 self._append(_packed(record))
             raise
         self._chunks += 1
-        self._chunk_index += _packed(
-            records.ChunkIndex(
-                chunk_length=len(head) + size, chunk_start_offset=begin, compression="", compressed_size=size,
-                message_end_time=last, message_index_length=at - begin - len(head) - size,
-                message_index_offsets=offsets, message_start_time=first, uncompressed_size=size,
-            )
+        chunk = len(head) + size
+        self._chunk_index += _CHUNK_INDEX.pack(
+            Opcode.CHUNK_INDEX, _CHUNK_INDEX.size + _OFFSET.size * len(offsets) + _SIZES.size - _RECORD_BYTES,
+            first, last, begin, chunk, _OFFSET.size * len(offsets),
         )  # fmt: skip
+        self._chunk_index += b"".join(map(_OFFSET.pack, offsets, offsets.values()))
+        self._chunk_index += _SIZES.pack(at - begin - chunk, 0, size, size)
 
     def _put_head(self, data: bytes) -> None:
         self._waiting += data

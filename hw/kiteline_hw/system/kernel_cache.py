@@ -99,9 +99,9 @@ def _say(line: str) -> None:
 
 def mark() -> bool:
     """Record that the kernels of all loaded modules are compiled. False if this process could not keep them all."""
-    from kiteline_core import kernel_compiler
+    from kiteline_core import kernel_files
 
-    if kernel_compiler.unkept:
+    if kernel_files.unkept:
         return False
     with contextlib.suppress(OSError, ValueError):
         for folder, lines in _needed().items():
