@@ -369,6 +369,10 @@ class MapView:
         """The root submap of the map that a submap belongs to."""
         return self.root_submaps.get(submap, submap)
 
+    def map_of(self, slot: int) -> SubmapId:
+        """The map that the keyframe of a keypoint belongs to."""
+        return self.map_id(submap_of_keyframe(KeyframeId(int(self.keyframes.id[self.keypoints.row[slot]]))))
+
     def submaps_of_map(self, submap: SubmapId) -> list[SubmapId]:
         """All submaps of the map that a submap belongs to, in order of id."""
         map_id = self.map_id(submap)

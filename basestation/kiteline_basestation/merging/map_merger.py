@@ -230,6 +230,8 @@ class MapMerger:
         self._edges = [e for e in self._edges if gone.isdisjoint(map(submap_of_keyframe, (e.new, e.old)))]
         self._requery = [k for k in self._requery if submap_of_keyframe(k) not in submaps]
         self.merges = [m for m in self.merges if m.map_id not in submaps and m.into not in submaps]
+        for merge in self.merges:
+            merge.forget(gone)
 
     def undo(self, merge: MapMerge) -> MergeResult:
         """Separate a merged map again: move it back, and unfuse its landmarks from those of the other map."""
@@ -237,7 +239,7 @@ class MapMerger:
         at, split = self.merges.index(merge), frozenset(merge.moved)
         self.merges.remove(merge)
         for later in self.merges[at:]:  # they no longer hold what is apart from now on
-            later.moved = {submap: S_w_m for submap, S_w_m in later.moved.items() if submap not in split}
+            later.forget(split)
         self.undone += 1
         self._corrections.cancel_pending(merge.into)
         self._edges = [
@@ -301,12 +303,9 @@ class MapMerger:
 
     def _close(self, closure: LoopClosure, keyframe: KeyframeId) -> MergeResult:
         """Apply an accepted closure: merge the maps if there are two, and request a pose graph or a full bundle."""
-        result = NOTHING
-        if closure.newer == closure.older:
-            self.loops += self._is_return(keyframe)
-        else:
-            result = self._merge(closure)
-        map_id = closure.older
+        is_loop, map_id = closure.newer == closure.older, closure.older
+        self.loops += is_loop and self._is_return(keyframe)
+        result = NOTHING if is_loop else self._merge(closure)
         self._edges.extend(match.edge for match in closure.matches)
         self._unfused.setdefault(map_id, []).extend(closure.matches)
         self._corrections.cancel_pending(map_id)
@@ -352,13 +351,15 @@ class MapMerger:
 
     def _fuse_matches(self, map_id: SubmapId) -> None:
         """Fuse the landmarks of verified matches, then match landmarks around the new keyframes of these matches."""
-        table = self._map.keypoints
+        table, config = self._map.keypoints, self._config.landmark_matching
         matches = self._unfused.pop(map_id, [])
         fused: list[tuple[int, int]] = []
         for match in matches:
             slots = slot_pairs(self._map, match.new_landmarks, match.old_landmarks)
             for a, b in zip(slots[0].tolist(), slots[1].tolist()):
                 a, b = int(table.root[a]), int(table.root[b])
+                if {self._map.map_of(a), self._map.map_of(b)} != {map_id}:
+                    continue  # a match names the roots of its time: of a map that was split off since
                 if a != b and landmark_matching.fuse_landmarks(self._map, a, b, self._publisher):
                     fused.append((a, b))
         if fused and self.merges and self.merges[-1].into == map_id:
@@ -370,9 +371,7 @@ class MapMerger:
             for keyframe in [match.new, *around[:MAX_NEIGHBOURS]]:
                 if keyframe not in seen:
                     seen.add(keyframe)
-                    landmark_matching.match_landmarks(
-                        self._map, keyframe, self._config.landmark_matching, self._publisher
-                    )
+                    landmark_matching.match_landmarks(self._map, keyframe, config, self._publisher)
 
     # -- full bundles --------------------------------------------------------------------------------------------------
 

@@ -1,6 +1,6 @@
 """Merges of maps, and what a step of the map merger changed."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -30,6 +30,10 @@ class MapMerge:
     into: SubmapId
     moved: dict[SubmapId, F64]
     fused: I64 = field(default_factory=_no_pairs)
+
+    def forget(self, submaps: Collection[SubmapId]) -> None:
+        """Submaps are deleted, or no part of the merged map any more."""
+        self.moved = {submap: S_w_m for submap, S_w_m in self.moved.items() if submap not in submaps}
 
 
 def is_contradicted(

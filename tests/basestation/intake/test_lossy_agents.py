@@ -47,7 +47,8 @@ def _order(mapper: Mapper, draw: Random, number: int) -> Command:
 
 @settings(max_examples=12, deadline=None)
 @given(seed=st.integers(0, 1 << 20), lost=st.sampled_from([0.0, 0.05, 0.2]))
-@example(seed=721, lost=0.05)
+@example(seed=721, lost=0.05)  # a merge is undone that a later one held
+@example(seed=32, lost=0.0)  # a map is split off whose landmarks an unfused match names
 def test_the_base_goes_on(flights: Callable[[], list[Any]], words: Any, seed: int, lost: float) -> None:
     draw, mapper, jobs = Random(seed), Mapper(WITHOUT_GRID, words), LockstepJobs()
     waiting: list[tuple[AgentId, list[Record]]] = []
