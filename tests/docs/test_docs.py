@@ -134,3 +134,12 @@ def test_every_glossary_entry_is_a_sentence_with_its_place_in_the_code() -> None
             assert re.search(rf"^class {name}\b", (ROOT / named[1]).read_text(), re.MULTILINE), (
                 f"{name} is not in {named[1]}"
             )
+
+
+def test_each_bar_that_is_not_met_is_explained() -> None:
+    """A benchmark with such a bar is named on their page, and no other one is."""
+    unmet = set(
+        re.findall(r"\| `kiteline bench (\S+)` \| \*\*\d+ of \d+\*\* \|", (ROOT / "docs/results.md").read_text())
+    )
+    page = (ROOT / "docs/explanation/unmet-bars.md").read_text()
+    assert set(re.findall(r"`kiteline bench (\S+)`", page)) == unmet
