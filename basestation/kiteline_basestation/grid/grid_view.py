@@ -177,11 +177,11 @@ def grid_files(grid: ScanGrid, stem: str = "grid") -> dict[str, bytes]:
 
 def _binary(grid: ScanGrid) -> Callable[[Place], I8]:
     """Cells of a tile, occupied where any scan saw an obstacle, else free where any saw ground (Segfloor, 5.6)."""
-    config, any_view = replace(grid.config, hole_neighbours=9), CellRules(1, 1, 1)
-    hit = grid.redrawn(config, ViewWeights(free=0, free_sure=0, free_far=0), any_view)
+    config, any_view = replace(grid.config, hole_neighbours=9), CellRules(1, 1, 1, 1)
+    hit = grid.redrawn(config, ViewWeights(free=0, free_sure=0, free_fair=0, free_far=0), any_view)
     only_seen = (0.0, *config.bands_m[1:])
     seen = grid.redrawn(
-        replace(config, bands_m=only_seen), ViewWeights(0, 1, 1, 1), any_view._replace(occupied_from=_NEVER)
+        replace(config, bands_m=only_seen), ViewWeights(0, 1, 1, 1, 1), any_view._replace(occupied_from=_NEVER)
     )
 
     def cells_of(place: Place) -> I8:

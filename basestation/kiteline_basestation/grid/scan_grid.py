@@ -61,6 +61,7 @@ class ViewWeights(NamedTuple):
     hit: int = 12  # of a near view of an obstacle (p = 0.59); in inverse proportion to the range
     free: int = 6  # of a near view of free space (p = 0.45): half, as an edge is seen beside itself
     free_sure: int = 4  # the same of a far view well before what it sees
+    free_fair: int = 3  # of a far view less far before it
     free_far: int = 2  # of a far view elsewhere (box and wall may be one surface), and before seen ground
 
 
@@ -69,6 +70,7 @@ class CellRules(NamedTuple):
 
     occupied_from: int = 9  # one near view, two far ones
     free_from: int = 4  # below minus this: one sure view, two far ones
+    free_clear: int = 3  # the same with no sign of an obstacle within two cells: one fair view
     free_beside: int = 10  # the same beside an occupied cell: a near view and a sure one, as one may lie a cell off
 
 
@@ -239,7 +241,8 @@ class ScanGrid:
             kernels.draw_free(
                 sectors.x, sectors.y, sectors.first_rad, sectors.step_rad, sectors.begin, sectors.start, sectors.end,
                 sectors.low, sectors.under, sectors.clear, sectors.camera_band, sectors.accurate, sectors.sure,
-                self._weights[1:], hits, sign, slots, spare, used,
+                sectors.fair, self._weights[1:], hits,
+                sign, slots, spare, used,
                 self._store.pool, touched,
             )  # fmt: skip
             for r, c in np.argwhere(touched).tolist():

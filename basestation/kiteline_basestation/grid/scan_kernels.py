@@ -151,7 +151,7 @@ def _freed(
 @njit
 def draw_free(
     x: float, y: float, first_rad: float, step_rad: float, begins: F64, starts: F64, ends: F64, lows: F64, under: U8,
-    clears: F64, camera_band: int, nears: F64, sures: F64, weights: tuple[int, int, int],
+    clears: F64, camera_band: int, nears: F64, sures: F64, fairs: F64, weights: tuple[int, int, int, int],
     hits: U16, sign: int, slots: I32, spare: I32, used: I64, pool: I16, touched: U8,
 ) -> None:  # fmt: skip
     """Take evidence of free space from the cells of each column's sector; each cell belongs to one column.
@@ -160,7 +160,7 @@ def draw_free(
     ground was seen. ends: (n,3) up to where all bands are free, at a column's lower edge, in its middle and at its
     upper edge; lows: (n,) up to where the bands `under` (n,) are free too. clears: (n,) up to where the line of sight
     is clear, which frees camera_band (-1: none). weights: of seen ground up to nears (n,); beyond, up to sures (n,);
-    and elsewhere, as where rays are low but no ground was seen: a pit may lie there.
+    beyond that up to fairs (n,); and elsewhere, as where rays are low but no ground was seen: a pit may lie there.
     Marked cells keep the bands of their obstacles.
     """
     rows, columns = hits.shape
@@ -171,7 +171,7 @@ def draw_free(
         if reach <= 0.0:
             continue
         begin2, start2, low2, clear2, near2 = begins[i] ** 2, starts[i] ** 2, low * low, clear * clear, nears[i] ** 2
-        sure2 = max(sures[i] ** 2, start2)
+        sure2, fair2 = max(sures[i] ** 2, start2), max(fairs[i] ** 2, start2)
         a0, a1 = first_rad + i * step_rad, first_rad + (i + 1) * step_rad
         edges = np.cos(a0), np.sin(a0), np.cos(a1), np.sin(a1)
         bottom = max(0, int(np.floor(y + min(0.0, reach * edges[1], reach * edges[3]) - 1.0)))
@@ -197,7 +197,8 @@ def draw_free(
                 if tile != column >> _SHIFT:
                     slot, tile = _tile(row, column, slots, spare, used), column >> _SHIFT
                     touched[row >> _SHIFT, tile] = 1
-                value = weights[2] if distance2 > sure2 or (ground and distance2 < start2) else weights[1]
+                value = weights[2] if distance2 > sure2 else weights[1]
+                value = weights[3] if distance2 > fair2 or (ground and distance2 < start2) else value
                 value = weights[0] if start2 <= distance2 <= near2 else value
                 _take(pool, slot, row, column, bands, -sign * value)
 
@@ -226,18 +227,21 @@ def _state(pool: I16, slots: I32, row: int, column: int, bands: int, occupied_fr
 
 @njit
 def read_states(
-    slots: I32, pool: I16, bands: int, occupied_from: int, free_from: int, free_beside: int, hole: int, opening: int,
-    cells: I8,
+    slots: I32, pool: I16, bands: int, occupied_from: int, free_from: int, free_clear: int, free_beside: int, hole: int,
+    opening: int, cells: I8,
 ) -> int:  # fmt: skip
     """States of the cells (64,64) of a tile: -1 unknown, 0 free, else the mask of occupied bands.
 
     slots: (3,3) of the tile and those around it. bands: mask of those that count. occupied_from, free_from: log-odds
-    from which a band is occupied, and minus which all bands must not exceed for the cell to be free. free_beside: the
-    same beside an occupied cell.
+    from which a band is occupied, and minus which all bands must not exceed for the cell to be free. free_clear: the
+    same where no cell of the five by five around has positive log-odds; free_beside: beside an occupied cell.
     hole: neighbours that must be free, none being occupied, for an unknown cell without sign of an obstacle to be free.
     opening: 1 keeps free only what lies in a square of three by three free cells. Returns the number of known cells.
     """
-    margin = 4  # read around the tile: a square reaches two cells far, holes in it one more, and all have neighbours
+    margin = (
+        6  # what is read around the tile: a square reaches two cells far, holes in it one more, all have neighbours,
+        # and those have signs two cells away
+    )
     wide = SIDE + 2 * margin
     states, odds = np.empty((wide, wide), np.int8), np.empty((wide, wide), np.int32)
     for row in range(wide):
@@ -245,16 +249,21 @@ def read_states(
             mask, most = _state(pool, slots, row - margin, column - margin, bands, occupied_from)
             states[row, column] = mask if mask else 0 if most <= -free_from else -1
             odds[row, column] = most
-    for row in range(1, wide - 1):
-        for column in range(1, wide - 1):
+    for row in range(2, wide - 2):
+        for column in range(2, wide - 2):
+            if states[row, column] == -1 and odds[row, column] <= -free_clear:
+                if odds[row - 2 : row + 3, column - 2 : column + 3].max() <= 0:
+                    states[row, column] = 0
+    for row in range(3, wide - 3):
+        for column in range(3, wide - 3):
             if states[row, column] == 0 and odds[row, column] > -free_beside:
                 for r in range(row - 1, row + 2):
                     for c in range(column - 1, column + 2):
                         if states[r, c] > 0:
                             states[row, column] = -1
     held = states.copy()
-    for row in range(2, wide - 2):
-        for column in range(2, wide - 2):
+    for row in range(4, wide - 4):
+        for column in range(4, wide - 4):
             if held[row, column] == -1 and odds[row, column] <= 0:
                 free = 0
                 for r in range(row - 1, row + 2):
@@ -265,8 +274,8 @@ def read_states(
     known = 0
     if opening:
         kept = np.zeros((wide, wide), np.uint8)
-        for row in range(3, wide - 3):
-            for column in range(3, wide - 3):
+        for row in range(5, wide - 5):
+            for column in range(5, wide - 5):
                 whole = True
                 for r in range(row - 1, row + 2):
                     for c in range(column - 1, column + 2):

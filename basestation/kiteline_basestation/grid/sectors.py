@@ -15,6 +15,7 @@ _STEEPEST = 4.0  # tangent of the angle under which a surface is seen that goes 
 _MOST = 0.5  # of an inverse range, by which it changes from column to column of one surface, at most
 _SURE_SIGMAS = 2.0  # standard deviations beyond GAP_SIGMAS from which on a far view is well before what it sees
 _OPEN_SIGMAS = 1.0  # the same before a scan's end without an obstacle, which lies two before the last ground
+_FAIR_SIGMAS = 1.0  # fewer of them from which on it is less far before: 0.3 % are wrong with no sign near
 
 
 class Sectors(NamedTuple):
@@ -23,8 +24,9 @@ class Sectors(NamedTuple):
     obstacle: (n,3) nearest obstacle at the lower edge, in the middle and at the upper edge, inf without. bands: (n,) of
     it; weight: (n,) of a hit. begin, start: (n,) from where rays to the nearest seen ground are low, from where the
     ground was seen. end: (n,3) up to where all bands are free; under: (n,) bands that are free from there up to `low`
-    (n,). clear: (n,) up to where camera_band is free, -1 none. accurate, sure: (n,) up to where a view counts in full,
-    and up to where it frees cells alone, as what it sees is well behind; 0 in columns at the sides of the view.
+    (n,). clear: (n,) up to where camera_band is free, -1 none. accurate: (n,) up to where a view counts in full; sure,
+    fair: (n,) up to where it frees cells alone, as what it sees is well behind, and up to where it does with no sign of
+    an obstacle near. All three are 0 in columns at the sides of the view.
     """
 
     x: float
@@ -43,6 +45,7 @@ class Sectors(NamedTuple):
     camera_band: int
     accurate: F64
     sure: F64
+    fair: F64
 
     def box(self) -> tuple[int, int, int, int]:
         """First row and column, and those after the last, of the tiles around the sectors."""
@@ -78,21 +81,23 @@ def sectors_of(config: GridConfig, scan: KeptScan, lattice: Lattice, hit: int) -
     accurate_m = scan.accurate_m(config)
     last_m = np.where(bands > 0, near_m, ranges[3])
     margin = np.where(bands > 0, _SURE_SIGMAS, _OPEN_SIGMAS)
-    sure = np.maximum(end.min(1) - margin * scan.sigma_per_m2 * last_m**2 * unit, 0.0)
+    deviation = scan.sigma_per_m2 * last_m**2 * unit
+    sure = np.maximum(end.min(1) - margin * deviation, 0.0)
+    fair = np.maximum(end.min(1) - (margin - _FAIR_SIGMAS) * deviation, 0.0)
     weight = np.clip(np.rint(hit * accurate_m / np.maximum(near_m, accurate_m)), 1, 127).astype(np.int64)
     camera_band = int(np.searchsorted(config.bands_m, scan.height_m, side="right")) - 1
     accurate = np.full(scan.columns, accurate_m / config.cell_m)
     begin = _begin(config, scan, start, free, behind)
     # What stands at the image's side is not seen whole, and matching is worst there: such a view frees no cell alone.
     for side in (slice(0, config.side_columns), slice(max(scan.columns - config.side_columns, 0), None)):
-        accurate[side] = sure[side] = 0.0
+        accurate[side] = sure[side] = fair[side] = 0.0
         begin[side] = start[side]
     x, y = position_cells(lattice)
     return Sectors(
         x, y, scan.heading_rad(config, lattice) + scan.first_rad, scan.step, obstacle, bands, weight,
         begin, start, end, np.where(under > 0, free, 0.0), under,
         np.minimum(clear, before.min(1)), camera_band if 0 <= camera_band < BANDS else -1,
-        accurate, sure,
+        accurate, sure, fair,
     )  # fmt: skip
 
 

@@ -242,7 +242,7 @@ def test_hits_are_marked_as_in_the_reference_and_leave_no_trace(seed: int) -> No
 
 def freed(
     x: float, y: float, first: float, step: float, columns: dict[str, F64], camera_band: int,
-    weights: tuple[int, int, int], hits: U16,
+    weights: tuple[int, int, int, int], hits: U16,
 ) -> I64:  # fmt: skip
     """What `draw_free` takes from the planes (4,rows,columns): each cell asked for its column and its range."""
     rows, cells = np.indices(hits.shape)
@@ -270,7 +270,8 @@ def freed(
     bands = np.where(place < n, bands & ~hits.astype(int), 0)
     seen = columns["start"][i] <= distance
     sure = distance <= np.maximum(columns["sure"][i], columns["start"][i])
-    value = np.where(sure & (seen | ~ground), weights[1], weights[2])
+    fair = distance <= np.maximum(columns["fair"][i], columns["start"][i])
+    value = np.where(fair & (seen | ~ground), np.where(sure, weights[1], weights[2]), weights[3])
     value = np.where(seen & (distance <= columns["near"][i]), weights[0], value)
     out = np.zeros((4, *hits.shape), np.int64)
     out[0] = np.where(bands == 7, value, 0)
@@ -293,18 +294,19 @@ def test_free_space_is_drawn_as_in_the_reference(seed: int) -> None:
         "under": rng.integers(0, 2, n).astype(np.uint8), "clear": rng.uniform(-1.0, 100.0, n),
         "sure": rng.uniform(0.0, 80.0, n), "near": rng.uniform(10.0, 60.0, n) * (rng.random(n) < 0.9),
     }  # fmt: skip
+    columns["fair"] = columns["sure"] + rng.uniform(0.0, 20.0, n)
     hits = np.where(rng.random((192, 192)) < 0.02, rng.integers(1, 8, (192, 192)), 0).astype(np.uint16)
     slots, pool = np.full((3, 3), -1, np.int32), np.zeros((9, 4, 64, 64), np.int16)
     touched, used = np.zeros((3, 3), np.uint8), np.zeros(1, np.int64)
     kernels.draw_free(
         x, y, first, step, columns["begin"], columns["start"], ends, columns["low"], columns["under"],
-        columns["clear"], camera_band, columns["near"], columns["sure"], (3, 2, 1),
+        columns["clear"], camera_band, columns["near"], columns["sure"], columns["fair"], (4, 3, 2, 1),
         hits, 1, slots, np.arange(9, dtype=np.int32), used, pool, touched,
     )  # fmt: skip
     whole = np.zeros((4, 192, 192), np.int64)
     for r, c in np.argwhere(slots >= 0):
         whole[:, r * 64 : r * 64 + 64, c * 64 : c * 64 + 64] = pool[slots[r, c]]
-    wanted = freed(x, y, first, step, columns, camera_band, (3, 2, 1), hits)
+    wanted = freed(x, y, first, step, columns, camera_band, (4, 3, 2, 1), hits)
     assert np.array_equal(-whole, wanted)
     assert np.array_equal(touched > 0, wanted.any(0).reshape(3, 64, 3, 64).any((1, 3)))
 
@@ -332,7 +334,10 @@ def test_states_are_read_as_in_the_reference(seed: int, opening: bool) -> None:
     for r, c in np.argwhere(slots >= 0):
         whole[:, r * 64 : r * 64 + 64, c * 64 : c * 64 + 64] = pool[slots[r, c]][:1] + pool[slots[r, c]][1:]
     mask = sum((whole[b] >= 6).astype(int) << b for b in range(3))
-    free = (whole <= -2).all(axis=0)
+    free = (whole <= -3).all(axis=0)
+    square = [(r, c) for r in range(-2, 3) for c in range(-2, 3)]
+    clear = ~np.any([np.roll((whole > 0).any(axis=0), s, (0, 1)) for s in square], axis=0)
+    free |= clear & (whole <= -2).all(axis=0)
     shifts = [(r, c) for r in (-1, 0, 1) for c in (-1, 0, 1)]
     beside = np.any([np.roll(mask > 0, s, (0, 1)) for s in shifts], axis=0)
     free &= ~beside | (whole <= -4).all(axis=0)
@@ -344,6 +349,6 @@ def test_states_are_read_as_in_the_reference(seed: int, opening: bool) -> None:
         free &= np.any([np.roll(eroded, s, (0, 1)) for s in shifts], axis=0)
     expected = np.where(mask > 0, mask, np.where(free, 0, -1))[64:128, 64:128]
     cells = np.empty((64, 64), np.int8)
-    known = kernels.read_states(slots, pool, kernels.ALL, 6, 2, 4, 6, int(opening), cells)
+    known = kernels.read_states(slots, pool, kernels.ALL, 6, 3, 2, 4, 6, int(opening), cells)
     assert np.array_equal(cells, expected)
     assert known == np.count_nonzero(expected >= 0)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from kiteline_basestation.grid.kept_scan import GAP_SIGMAS, keep
 from kiteline_basestation.grid.scan_grid import ScanGrid, ViewWeights
-from kiteline_basestation.grid.sectors import _OPEN_SIGMAS, _SURE_SIGMAS
+from kiteline_basestation.grid.sectors import _FAIR_SIGMAS, _OPEN_SIGMAS, _SURE_SIGMAS
 from kiteline_basestation.grid.tile_store import Place
 from kiteline_core.ground.column_scan import ColumnScan
 from tests.basestation.flat_rooms import HEIGHT_M, ROOM, box, camera, scan_of
@@ -111,15 +111,34 @@ def test_a_far_view_frees_alone_what_lies_well_before_its_obstacle_and_two_what_
     columns = (np.arange(128) + 0.5) * CONFIG.cell_m
     sigma_m = CONFIG.sigma_px / bf * 5.53**2
     end = 5.53 - GAP_SIGMAS * sigma_m
-    sure = end - _SURE_SIGMAS * sigma_m
+    sure, fair = (end - n * sigma_m for n in (_SURE_SIGMAS, _SURE_SIGMAS - _FAIR_SIGMAS))
     near = found.accurate_m(CONFIG)
     assert near + 0.2 < sure < end - 0.2
     assert (row[(columns > near + 0.1) & (columns < sure - 0.1)] == -WEIGHTS.free_sure).all()
-    assert (row[(columns > sure + 0.1) & (columns < end - 0.1)] == -WEIGHTS.free_far).all()
+    assert (row[(columns > sure + 0.06) & (columns < fair - 0.06)] == -WEIGHTS.free_fair).all()
+    assert (row[(columns > fair + 0.06) & (columns < end - 0.06)] == -WEIGHTS.free_far).all()
     assert not (row[columns > end + 0.1] < 0).any()
     assert at(grid, 0.5 * (near + sure), 0.0) == 0 and at(grid, end - 0.15, 0.0) == -1
     grid.put(1, found, camera(0.02, 0.0, 0.0))
     assert at(grid, end - 0.15, 0.0) == 0
+
+
+def test_a_fair_view_frees_alone_where_no_sign_of_an_obstacle_is_near() -> None:
+    """What one view frees wrongly lies beside something that another one saw, nearly always."""
+    bf, end = 48.0, 5.0
+    ground = keep(CONFIG, bare(1.0, end), bf)
+    place = end - 0.5 * _OPEN_SIGMAS * CONFIG.sigma_px / bf * end**2
+    grid = ScanGrid(CONFIG)
+    grid.put(0, ground, camera(0.0, 0.0, 0.0))
+    assert at(grid, place, 0.0) == 0
+    nothing, one = np.zeros(70), np.arange(70) == 35
+    thing = replace(
+        bare(1.0, end), free_from_m=nothing, free_m=nothing, obstacle_m=np.where(one, place + 0.08, np.inf),
+        bands=one.astype(np.uint8),
+    )  # fmt: skip
+    grid.put(1, keep(CONFIG, thing, bf), camera(0.0, 0.0, 0.0))
+    assert at(grid, place + 0.08, 0.02) == -1, "one far view of an obstacle is a sign, no obstacle"
+    assert at(grid, place, 0.0) == -1 and at(grid, place, 0.6) == 0
 
 
 def test_a_far_view_of_ground_that_ends_before_no_obstacle_frees_alone_nearly_up_to_its_end() -> None:
@@ -131,7 +150,7 @@ def test_a_far_view_of_ground_that_ends_before_no_obstacle_frees_alone_nearly_up
     columns = (np.arange(128) + 0.5) * CONFIG.cell_m
     sure = end - _OPEN_SIGMAS * CONFIG.sigma_px / bf * end**2
     assert (row[(columns > found.accurate_m(CONFIG) + 0.1) & (columns < sure - 0.06)] == -WEIGHTS.free_sure).all()
-    assert (row[(columns > sure + 0.06) & (columns < end - 0.06)] == -WEIGHTS.free_far).all()
+    assert (row[(columns > sure + 0.06) & (columns < end - 0.06)] == -WEIGHTS.free_fair).all()
     assert sure > end - _SURE_SIGMAS * CONFIG.sigma_px / bf * end**2 + 0.1
 
 
