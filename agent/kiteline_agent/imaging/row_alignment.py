@@ -33,6 +33,7 @@ _WORN_SLOPE_PX = 0.3  # px where x is 1; of the slope along x: the mount is twis
 _WORN_TURN_PX = 0.6  # px where x y is 1; of x y: it is turned about y by 0.07 degrees
 _ITERATIONS = 10  # Gauss-Newton steps; it converges in 4 from 1 px
 _LEAST_PX = 1.0  # px; rows that are off by less are measured along them
+_BENT = "read there from now on; the mount is bent or the calibration is of another rig: calibrate again"
 _SHOWN_SHARE = 0.7  # share of worn rigs whose rows are off; focal lengths do not move them
 
 
@@ -136,9 +137,10 @@ class RowAlignment:
         sigma = float(np.sqrt(np.mean(np.einsum("ni,in->n", at, np.linalg.solve(self._information, at.T)))))
         if not self._rough and (rms < _MIN_CHANGE_PX or rms < _MIN_SIGNIFICANCE * sigma):
             return 0.0
-        self._rough = False
         self._read_at(estimate)
-        self._events.append(f"rows of the right image are {estimate[0]:+.2f} px off in the middle")
+        said = f"rows of the right image are {estimate[0]:+.2f} px off in the middle"
+        self._events.append(f"images: {said}: {_BENT}" if self._rough else said)
+        self._rough = False
         return rms
 
     @property

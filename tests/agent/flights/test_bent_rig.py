@@ -28,7 +28,7 @@ def test_a_rig_whose_rows_are_off_by_pixels_flies_from_the_first_frame(room_flig
     outputs = [agent.step(StepInput(frame, None), frame.t_ns) for frame in flight.frames]
     poses = [output.estimate for output in outputs]
     assert all(pose is not None and pose.tracked for pose in poses)
-    assert any("rows of the right image are" in event for event in outputs[0].events)
+    assert any("images: rows of the right image are" in event for event in outputs[0].events)
     camera = np.array([pose.T_o_b for pose in poses if pose is not None]) @ rig.T_b_c
     truth = flight.truth @ rig.T_b_c
     aligned = truth[0] @ se3.inverse(camera[0]) @ camera
@@ -45,7 +45,7 @@ def test_a_right_camera_that_is_bent_in_flight_is_read_at_its_new_rows(room_flig
         output = agent.step(StepInput(replace(frame, right=right), None), frame.t_ns)
         assert output.estimate is not None
         poses.append(output.estimate.T_o_b)
-        said += [number for event in output.events if event.startswith("rows of the right image are +4")]
+        said += [number for event in output.events if event.startswith("images: rows of the right image are +4")]
     assert len(said) == 1
     assert bent_at < said[0] < bent_at + 20, "at the next keyframe, before the map has left the view"
     camera, truth = np.array(poses) @ flight.rig.T_b_c, flight.truth @ flight.rig.T_b_c
