@@ -202,7 +202,7 @@ class RowAlignment:
 
     def _read_at(self, rows_px: F64) -> None:
         self.applied_px = rows_px
-        self._rectifier.set_right_rows(lambda uv: np.asarray(terms(self._normalised(uv)) @ rows_px))
+        self._rectifier.set_right_rows(self.at)
 
     def _normalised(self, uv: F64) -> F64:
         camera = self._rectifier.camera
