@@ -124,6 +124,7 @@ class PublishConfig:
     pose_rad: float = 0.0002  # rad; a tenth of a pixel at 500 px of focal length
     depth_px: float = 0.1  # px; of projection or disparity, the largest of a keyframe's landmarks
     batch_s: float = 2.0  # s that a thin link takes to carry a batch of corrections, about; the next one waits so long
+    batch_gap_s: float = 0.6  # s between two batches at least, for cameras that measure depth: more often gains nothing
     batch_values: int = 1000  # values of a batch: a loop over a large map moves all its keyframes
     step_values: int = 100  # values of a batch, and as many others, coded in one step, in 15 ms; the next steps go on
     batch_wait_s: float = 10.0  # s after which nobody listens: no batch is waited for, nothing planned for the agent

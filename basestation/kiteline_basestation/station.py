@@ -91,8 +91,10 @@ class Station:
             self._track(agent, False, records)
         imports = tuple((order.agent, self._imported(order)) for order in orders if isinstance(order, Import))
         commands = tuple(order for order in orders if isinstance(order, Command))
-        rooms = [(agent, self._batches[agent].room_bytes(end, now_ns)) for agent, end in sorted(self.channels.items())]
-        limits = tuple((agent, room) for agent, room in rooms if room is not None)
+        limits = tuple(
+            (agent, room) for agent, end in sorted(self.channels.items())
+            if (room := self._room_bytes(agent, end, now_ns)) is not None
+        )  # fmt: skip
         given = MapperInput(tuple(arrivals), tuple(done), commands, limits, imports)
         output = self.mapper.step(given, now_ns)
         for agent, keyframes in self.mapper.take_confirmed().items():
@@ -142,6 +144,11 @@ class Station:
             for record in records:
                 if record.KIND not in PASSING_KINDS:
                     self.changed[agent, own, messages.key(record)] = None
+
+    def _room_bytes(self, agent: AgentId, channel: RecordChannel, now_ns: int) -> int | None:
+        """Bytes of corrections that may be shared with an agent now; None without a limit."""
+        gap_s = self._publish.batch_gap_s if self.mapper.map.measures_distances(agent) else 0.0
+        return self._batches[agent].room_bytes(channel, now_ns, gap_s)
 
     def _imported(self, order: Import) -> tuple[Record, ...]:
         """The records of an import that are not here yet."""

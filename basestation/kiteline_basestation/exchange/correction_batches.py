@@ -1,4 +1,4 @@
-"""Corrections for one agent in batches: the next one is made when the one before has arrived.
+"""Corrections for one agent in batches: the next one is made when the one before has arrived, or a moment later.
 
 What changes meanwhile waits at the base, at its newest value. So a batch is never overtaken by the next one, and the
 agent can wait for all of it. On a thin link a batch is as large as the link carries in a few seconds; a large one is
@@ -40,13 +40,15 @@ class CorrectionBatches:
         self._closed = 0  # number of the newest batch whose record was made
         self._overdue = False  # the newest batch does not arrive: later values join it, and wait for no other ones
 
-    def room_bytes(self, channel: RecordChannel, now_ns: int) -> int | None:
-        """Bytes of corrections that may be shared now: 0 while a batch is on its way, None without a limit."""
+    def room_bytes(self, channel: RecordChannel, now_ns: int, gap_s: float = 0.0) -> int | None:
+        """Bytes of corrections that may be shared now: 0 while a batch is on its way, and for gap_s after it was made;
+        None without a limit.
+        """
         arrived = channel.arrived(self._key) and self._all_arrived(channel)
         self._overdue = not arrived and now_ns - self._made_ns >= self._config.batch_wait_s * 1e9
         if self._overdue:
             return None  # the agent is out of reach: the values go to the store, and to the agent when it returns
-        if not arrived:
+        if not arrived or (now_ns - self._made_ns < gap_s * 1e9 and not self._open):
             return 0
         rate = channel.rate_bytes_s()
         return None if rate is None else round(rate * self._config.batch_s)

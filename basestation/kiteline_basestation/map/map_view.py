@@ -335,7 +335,10 @@ class MapView:
 
     def is_ranged(self, submap: SubmapId) -> bool:
         """True if images of a submap measure distances, or may."""
-        agent = agent_of_submap(submap)
+        return self.measures_distances(agent_of_submap(submap))
+
+    def measures_distances(self, agent: AgentId) -> bool:
+        """True if the images of an agent do, or may: no frame of a single camera has told otherwise."""
         camera = self.cameras.get(agent)
         return camera is None or camera.stereo or agent in self.measures_depth
 

@@ -72,6 +72,15 @@ def test_the_next_batch_waits_until_the_last_value_of_this_one_has_arrived() -> 
     assert numbers(batches.numbered([pose(2)], SECOND_NS)) == [2, 2]
 
 
+def test_the_next_batch_is_not_made_at_once_on_a_fast_link() -> None:
+    link, batches = Link(), CorrectionBatches(AGENT, PublishConfig())
+    assert batches.room_bytes(link, SECOND_NS, 0.5) is None
+    batches.numbered([pose(1)], SECOND_NS)
+    assert batches.room_bytes(link, SECOND_NS + SECOND_NS // 2 - 1, 0.5) == 0
+    assert batches.room_bytes(link, SECOND_NS + SECOND_NS // 2, 0.5) is None
+    assert batches.room_bytes(link, SECOND_NS, 0.0) is None
+
+
 @pytest.mark.parametrize("late", [0, 250, 499])
 def test_a_step_looks_for_one_missing_value_of_a_batch_not_for_all(late: int) -> None:
     """Of a large map, a batch holds hundreds of values, and steps are many while it is on its way."""
