@@ -31,7 +31,7 @@ _PRIOR_PX = 0.9  # px; standard deviation of a constant offset of a worn rig: bo
 _PRIOR_SLOPE_RAD = 1.1e-3  # rad; the same of the other terms: a right camera that is turned by 0.06 degrees
 _BENT, _BENT_LOG_ODDS = 8.0, -4.0  # times these of a mount that was bent by a degree; one worn rig in fifty is
 _LEAST_CHANGE_PX = 0.04  # px, rms over the image; of a later change that is applied
-_ROWS_SURE = 0.99  # probability of a worn rig by rows alone, above which it is applied in any motion
+_ROWS_SURE = 0.99  # probability of a worn rig by rows alone, above which its offset is applied in any motion
 _INFLATION = 2.0  # factor on variances: templates and lens errors are common to neighbouring points
 _ITERATIONS = 3  # Gauss-Newton steps; two converge from a scale that is off by a tenth
 _REFUTED = 5.0  # log likelihood without earlier flights over that with them, from which those are dropped
@@ -40,6 +40,7 @@ _MIN_SIDEWAYS = 0.2  # share of the motion across the optical axis below which e
 _FORWARD_SHARE = 1.0 / 9.0  # of the information about a worn rig that is believed then: errors were three deviations
 _FORWARD_KEYFRAMES = 12  # that tell something of their own then; more of them repeat errors of lens and tracks
 _FORWARD_GOOD_KEYFRAMES = 3  # the same of a good calibration's offset, which is no larger than these errors are
+_FORWARD_TOLD = 6  # keyframes from which on that offset is applied, be it likelier than the expected one or not
 _PAIR_EVERY_S = 0.18  # s between two pairs, at most: slow cameras, and frames that the governor skips
 _PARALLAX_GROWTH = 1.2  # of the parallax between two pairs of the same keyframe
 _WORN_SHARE = 0.2  # probability of a worn rig before the flight
@@ -281,11 +282,12 @@ class DisparityAlignment:
         difference = cov @ beyond
         self._good_estimate = self.expected_px + difference
         is_larger = self._rms_px(np.outer(difference, difference)) > self._rms_px(cov)
-        self._good_is_known = bool(is_larger and _log_evidence(h, beyond, self._good) > 0.0)
+        is_likelier = bool(is_larger and _log_evidence(h, beyond, self._good) > 0.0)
+        # In forward motion, where little counts, a small offset stays below its deviation however often it was told.
+        self._good_is_known = is_likelier or (self._keyframes >= _FORWARD_TOLD and not self._moves_sideways())
 
     def _is_sure(self) -> bool:
         """True if the rig is worn though pairs tell less whose landmarks fit badly: some may be on people who walk.
-
         In forward motion, where disparities tell little, the rows of the right image count as well.
         """
         rows = 0.0 if self._moves_sideways() else self._row_evidence
@@ -310,8 +312,12 @@ class DisparityAlignment:
 
     def _own_share(self, most: int) -> float:
         """Share of the pairs' information, if in forward motion no more than so many keyframes tell on their own."""
-        keyframes = self._evicted + int(np.count_nonzero(self._score))
-        return 1.0 if self._moves_sideways() else min(1.0, most / max(keyframes, 1))
+        return 1.0 if self._moves_sideways() else min(1.0, most / max(self._keyframes, 1))
+
+    @property
+    def _keyframes(self) -> int:
+        """Number of keyframes that told something."""
+        return self._evicted + int(np.count_nonzero(self._score))
 
     def _believed_share(self) -> float:
         """Share of the pairs' information that counts where a worn rig is told from a good one."""
@@ -329,10 +335,6 @@ class DisparityAlignment:
         moved = self._evicted_moved + self._moved.sum(0)
         return bool(moved[:2].sum() >= _MIN_SIDEWAYS * moved.sum())
 
-    def _rows_are_worn(self) -> bool:
-        """True if the right camera's rows alone show a worn rig: then the estimated offset of disparities is taken."""
-        return _probability(self._prior_log_odds + self._row_evidence) >= _ROWS_SURE
-
     def _expected_cov(self) -> F64:
         """(5,5) px^2: mean square of what the map's offset is off by, beside the error of a good calibration."""
         offset = self._map.disparity_offset
@@ -344,7 +346,7 @@ class DisparityAlignment:
         """Change the offset of the map's disparities, unless the base's estimate is more certain."""
         if self._base_sigma_px is not None and self._base_sigma_px <= self.sigma_px:
             return None
-        tells = self._moves_sideways() or self._rows_are_worn()
+        tells = self._moves_sideways() or _probability(self._prior_log_odds + self._row_evidence) >= _ROWS_SURE
         if (tells and self.applied) or ((tells or self._nothing_better_known()) and self._is_sure()):
             return self._apply_worn()
         # Forward motion hardly tells a worn rig from a good one: until then the good one's offset is the better guess.
