@@ -193,6 +193,23 @@ def test_an_offset_that_a_good_calibration_may_have_is_reduced(seed: int, way: F
     assert left < share * np.sqrt(np.mean((grid @ off) ** 2))
 
 
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_small_offset_is_applied_once_several_keyframes_told_it_ahead(seed: int) -> None:
+    """Forward motion leads to what is far away, where hundredths of a pixel are percents of the depth."""
+    off = np.array([0.05, 0.0, 0.0, 0.0, 0.0])
+    changed = {}
+    for name, way in (("ahead", AHEAD), ("sideways", SIDEWAYS)):
+        flight = Flight(off, seed, way)
+        changed[name] = [len(flight.fly(40))]
+        for n in range(8):  # further keyframes that see the same
+            flight.alignment._begin(0)
+            flight.alignment._keyframe[0] = -1 - n
+            changed[name].append(len(flight.fly(40)))
+        if name == "ahead":
+            assert flight.alignment.is_good_offset and abs(flight.map.disparity_offset[0] - off[0]) < 0.02
+    assert changed["ahead"] == [0, 0, 0, 0, 0, 1, 0, 0, 0] and not any(changed["sideways"])
+
+
 def test_a_good_calibration_s_offset_begins_at_what_the_base_tells() -> None:
     off = np.array([-0.15, -0.1, 0.1, -0.15, 0.0])
     flight = Flight(off, 0, AHEAD)
