@@ -56,8 +56,12 @@ class KeyframeMaker:
         least = ctx.config.local_map.first_points
         if _with_depth(points) >= least:
             return points
-        few = len(points.uv) < least
-        self.fault = Fault.CORNERS if few else Fault.DEPTH if ctx.images.right is None else Fault.PAIR
+        if len(points.uv) < least:
+            self.fault = Fault.CORNERS
+        elif ctx.images.right is None:
+            self.fault = Fault.DEPTH
+        else:
+            self.fault = Fault.PAIR
         return None
 
     def points_beside(self, ctx: FrameContext, track: Track) -> NewPoints:
