@@ -194,9 +194,12 @@ def _pose(points_m: F64, view: View, camera: int, v: F64, lens: Lens) -> tuple[F
         return best
     for turn, shift in zip(turns, shifts):
         rotation, t = np.asarray(turn, np.float64).ravel(), np.asarray(shift, np.float64).ravel()
-        if not (np.isfinite(rotation).all() and np.isfinite(t).all()) or t[2] <= 0:
+        if not (np.isfinite(rotation).all() and np.isfinite(t).all()):
             continue
-        T = se3.from_rt(R_m_c.T @ se3.so3_exp(rotation), R_m_c.T @ t)
+        T_m_board = se3.from_rt(se3.so3_exp(rotation), t)
+        if se3.transform(T_m_board, points[front])[:, 2].min() <= 0:
+            continue  # seen corners lie ahead; the board's origin need not
+        T = se3.from_rt(R_m_c.T, np.zeros(3)) @ T_m_board
         error = float(np.median(np.linalg.norm(project(lens, v, se3.transform(T, points)) - corners.px, axis=1)))
         if error < best[1]:
             best = T, error

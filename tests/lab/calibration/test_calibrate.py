@@ -6,7 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from kiteline_core.frame import Frame
@@ -100,6 +100,7 @@ def test_derivatives_and_rays_of_a_lens(camera: CameraModel) -> None:
 
 @settings(max_examples=4, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(st.sampled_from([RADTAN, FISHEYE]), st.integers(0, 1000), st.floats(0.0, 0.3))
+@example(FISHEYE, 117, 0.1)  # a steep board beside the camera, whose origin lies behind what is seen
 def test_a_camera_is_found_by_its_corners(camera: CameraModel, seed: int, noise_px: float) -> None:
     views = exact_views(camera, None, 30, seed, noise_px)
     result = calibrate(BOARD.points_m, views, [(camera.width, camera.height)], camera.lens, 4)
