@@ -162,7 +162,6 @@ class CovarianceConfig:
     unknown_rate_rad_s: float = 1.0  # rad/s: the same for the rotation
     good_m: float = 0.2  # m: error up to which a pose counts as good
     good_rad: float = 0.1745  # rad: the same for the rotation, 10 degrees
-    flagged_below: int = 50  # percent: quality below which a pose must not be relied on, as likely wrong as good
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,7 +26,7 @@ from kiteline_agent.covariance.calibration_error_kernels import (
 from kiteline_agent.covariance.calibration_evidence import CalibrationEvidence
 from kiteline_agent.covariance.evaluation_schedule import EvaluationSchedule
 from kiteline_agent.covariance.odometry_drift import covariance_by_map
-from kiteline_agent.covariance.pose_quality import probability_good
+from kiteline_agent.covariance.pose_quality import LOST_BELOW, probability_good
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.tracking.pose_state import PoseState
 from kiteline_agent.tracking.track import Track
@@ -380,7 +380,7 @@ class PoseCovariance:
         c = self._config
         counted = _MANY_INLIERS if inliers is None else inliers
         trust = min(max((counted - _FEW_INLIERS) / (_MANY_INLIERS - _FEW_INLIERS), 0.0), 1.0)
-        most = 100 if self._doubtful_s == 0.0 else c.flagged_below - 1
+        most = 100 if self._doubtful_s == 0.0 else LOST_BELOW - 1
         return min(max(1, round(100.0 * trust * probability_good(cov, c.good_m, c.good_rad))), most)
 
 

@@ -4,6 +4,11 @@ import math
 
 from kiteline_core.arrays import F64
 
+# Quality, in percent, below which a pose is not to be relied on. Between 50 and this many are off by more than the
+# limits; hardly a good one is there.
+FLAGGED_BELOW = 75
+LOST_BELOW = 50  # the same below which one by dead reckoning is none: it is as likely wrong as good
+
 
 def probability_good(cov: F64, good_m: float, good_rad: float) -> float:
     """Probability that an error of covariance cov (6,6) is within both limits, taken as independent.

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from kiteline_agent.covariance.pose_quality import LOST_BELOW
 from kiteline_agent.exchange.corrections import Corrections
 from kiteline_agent.mapping.camera_state import CameraState
 from kiteline_agent.mapping.loss_stage import FrameOutcome
@@ -41,7 +42,7 @@ class PoseReport:
             cov_m if tracked and self._knows_place() else cov_o, outcome.inliers or None
         )
         carried = camera.submaps.any and camera.motion.measures_motion
-        if not tracked and (initialising or not carried or quality < ctx.config.covariance.flagged_below):
+        if not tracked and (initialising or not carried or quality < LOST_BELOW):
             quality = -1
         keyframe, T_k_c = camera.reference.keyframe, camera.reference.T_k_c
         if keyframe != NO_KEYFRAME:

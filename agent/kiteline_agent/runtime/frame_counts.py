@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol
 
+from kiteline_agent.covariance.pose_quality import FLAGGED_BELOW
 from kiteline_agent.runtime.frame_reader import SAMPLES
 from kiteline_agent.step import Estimate, PredictedPose
 from kiteline_core.arrays import F64
@@ -16,12 +17,13 @@ from kiteline_core.ids import SubmapId, keyframe_id, submap_of_keyframe
 class FrameCounts:
     """frames = tracked + lost + dropped.
 
-    bridged: tracked, by dead reckoning. initialising: lost, before a map of known scale. predicted: dropped, with a
-    predicted pose.
+    bridged: tracked, by dead reckoning. flagged: tracked, with a quality that is not to be relied on. initialising:
+    lost, before a map of known scale. predicted: dropped, with a predicted pose.
     """
 
     tracked: int = 0
     bridged: int = 0
+    flagged: int = 0
     lost: int = 0
     initialising: int = 0
     dropped: int = 0
@@ -48,6 +50,7 @@ class FrameCounts:
         else:
             self.tracked += 1
             self.bridged += estimate.bridged
+            self.flagged += estimate.quality < FLAGGED_BELOW
         if estimate is not None and estimate.keyframe >= 0:
             submap = submap_of_keyframe(estimate.keyframe)
             newest = self._newest.get(submap, keyframe_id(submap, 0) - 1)
@@ -63,6 +66,7 @@ class FrameCounts:
             "frames": self.frames,
             "tracked": self.tracked,
             "bridged": self.bridged,
+            "flagged": self.flagged,
             "lost": self.lost,
             "initialising": self.initialising,
             "dropped": self.dropped,

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from kiteline_agent.config import AgentConfig
+from kiteline_agent.covariance.pose_quality import FLAGGED_BELOW
 from kiteline_bench.harness.bars import Bar, Bench, at_most, is_true
 from kiteline_bench.harness.faults import FAULTS_IN_MID_FLIGHT, changed, wall
 from kiteline_bench.harness.result import AgentRun, PoseError
@@ -43,7 +44,7 @@ class Counts:
         """Count a flight."""
         limits = AgentConfig().covariance
         for error in errors:
-            flagged = error.estimate.quality < limits.flagged_below
+            flagged = error.estimate.quality < FLAGGED_BELOW
             if error.position_m > limits.good_m or error.rotation_rad > limits.good_rad:
                 self.bad, self.bad_flagged = self.bad + 1, self.bad_flagged + flagged
             else:

@@ -9,7 +9,7 @@ import pytest
 from kiteline_agent.config import CovarianceConfig
 from kiteline_agent.covariance import calibration_error_kernels as certainty_kernels
 from kiteline_agent.covariance.pose_covariance import PoseCovariance, adjoint
-from kiteline_agent.covariance.pose_quality import probability_good
+from kiteline_agent.covariance.pose_quality import LOST_BELOW, probability_good
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.tracking.pose_state import PoseState
 from kiteline_agent.tracking.track import Track
@@ -275,7 +275,7 @@ def test_low_quality_after_a_far_relocalisation_lasts_as_long_at_any_frame_rate(
     covariance._far_relocalisation = True
     covariance.confirm_relocalisation()
     frames, sure = 0, 1e-8 * np.eye(6)
-    while covariance.quality(sure, 100) < CovarianceConfig().flagged_below and frames < 100:
+    while covariance.quality(sure, 100) < LOST_BELOW and frames < 100:
         covariance.update(track, 1.0 / rate_hz)
         frames += 1
     assert frames == rate_hz  # one second

@@ -12,6 +12,7 @@ import pytest
 
 from kiteline_agent.agent import Agent
 from kiteline_agent.config import AgentConfig, LocalMapConfig
+from kiteline_agent.covariance.pose_quality import FLAGGED_BELOW, LOST_BELOW
 from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_agent.local_map.keyframe_landmarks import KeyframeLandmarks
 from kiteline_agent.step import Estimate, Identity, StepInput
@@ -183,7 +184,7 @@ def test_out_of_the_wall_at_another_place(room: Recording, start: Start, resume:
     assert flown.said("submap: joined") == []
     assert room.error_m(flown, shown, 1) < 0.04
     young = [e.quality for e in flown.estimates if e.tracked and e.submap % MAX_SUBMAPS == 1]
-    assert max(young) < AgentConfig().covariance.flagged_below, "nobody knows how it lies to where the flight began"
+    assert max(young) < LOST_BELOW, "nobody knows how it lies to where the flight began"
     opened = next(h for h in flown.heads if submap_of_keyframe(h.keyframe) == flown.estimates[-1].submap)
     assert opened.parent == NO_KEYFRAME
 
@@ -288,6 +289,5 @@ def test_a_place_out_of_reach_is_rejected(room: Recording, start: Start) -> None
     assert all(e.tracked for e in flown.estimates[37:]) and flown.submaps[-1] == 1
     frames = room.show([*WALL, *range(200, 226)], 120.0)  # within half a second: nearly one g
     flown = fly_on(start(), frames)
-    limit = AgentConfig().covariance.flagged_below
-    assert set(flown.submaps) == {0} and all(0 < e.quality < limit for e in flown.estimates[41:60])
-    assert flown.estimates[-1].quality > limit
+    assert set(flown.submaps) == {0} and all(0 < e.quality < LOST_BELOW for e in flown.estimates[41:60])
+    assert flown.estimates[-1].quality >= FLAGGED_BELOW

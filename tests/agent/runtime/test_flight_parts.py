@@ -117,11 +117,11 @@ def estimate(tracked: bool = True, placed: bool = False, keyframe: int = 3) -> E
 def test_frames_are_tracked_lost_or_dropped() -> None:
     tally = FrameCounts(dropped=2, bytes_up=700)
     first, second = estimate(keyframe=1), estimate(keyframe=2)  # a map may begin with what the camera saw before
-    for e in (first, second, replace(first, bridged=True), replace(second, tracked=False), None):
+    for e in (first, replace(second, quality=74), replace(first, bridged=True), replace(second, tracked=False), None):
         tally.count(e)
     assert tally.as_report() == {
-        "frames": 7, "tracked": 3, "bridged": 1, "lost": 1, "initialising": 0, "dropped": 3, "predicted": 0,
-        "submaps": 1, "keyframes": 3, "bytes_up": 700, "bytes_down": 0, "bytes_per_keyframe": 233.3,
+        "frames": 7, "tracked": 3, "bridged": 1, "flagged": 1, "lost": 1, "initialising": 0, "dropped": 3,
+        "predicted": 0, "submaps": 1, "keyframes": 3, "bytes_up": 700, "bytes_down": 0, "bytes_per_keyframe": 233.3,
     }  # fmt: skip
 
 
