@@ -18,7 +18,6 @@ CHI2_2, CHI2_3 = (
 )  # 95 % of a chi-square with 2 (a pixel) and 3 (a pixel and a disparity) degrees of freedom
 _DAMPINGS = (0.0, 1e-6, 1e-4)  # of covariances, in order: a point far away may leave the system without a solution
 _MEDIAN_2, _MEDIAN_3 = 1.386, 2.366  # medians of the same
-_LEAST_SCALE = 0.02  # of squared residuals: a knee at zero would make none count squared
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +27,7 @@ class BundleConfig:
     robust_trials: int = 5  # Levenberg-Marquardt trials before the outlier test
     final_trials: int = 5  # trials after it
     stop: float = 1e-4  # relative gain in cost below which more trials have no visible effect
-    chi2_mono: float = CHI2_2  # squared normalised residual of a pixel beyond which it is an outlier: 95 %
+    chi2_mono: float = CHI2_2  # squared normalised residual of a pixel at the knee of Huber's cost: 95 %
     chi2_stereo: float = CHI2_3  # the same of a pixel with disparity
 
 
@@ -100,9 +99,7 @@ class BundleResult:
 def bundle(problem: BundleProblem, config: BundleConfig) -> BundleResult:
     """Minimise the sum of Huber costs, remove outliers, and minimise again.
 
-    Residuals are smaller than `sigma` where what they share is counted in it: then Huber's knee lies at their median,
-    since the tails of matching errors pull to one side. If they are larger than `sigma` predicts, the outlier bound
-    grows with it.
+    If the residuals are larger than `sigma` predicts, the outlier bound grows with their median.
     """
     solver = _Solver(problem, config) if problem.border is None else _BorderSolver(problem, problem.border, config)
     squared = solver.squared_residuals()
@@ -115,19 +112,14 @@ def bundle(problem: BundleProblem, config: BundleConfig) -> BundleResult:
     for trials in (config.robust_trials, config.final_trials):
         if trials == 0:
             continue
-        solver.set_knee(_scale(squared, typical, active))
         cost = solver.minimise(active, trials)
         squared = solver.squared_residuals()
-        active[:] = squared <= limit * max(_scale(squared, typical, active), 1.0)
+        scale = float(np.median(squared[active != 0] / typical[active != 0])) if active.any() else 1.0
+        active[:] = squared <= limit * max(scale, 1.0)
     offset, cov = solver.border_estimate(active)
     return BundleResult(
         unpack(solver.cameras), solver.points, active != 0, initial, cost, solver.trials, solver.operations, offset, cov
     )
-
-
-def _scale(squared: F64, typical: F64, active: U8) -> float:
-    """Median of the active squared residuals (m,) over what `sigma` predicts, `typical` (m,); 1 without any."""
-    return float(np.median(squared[active != 0] / typical[active != 0])) if active.any() else 1.0
 
 
 class _Solver:
@@ -143,7 +135,7 @@ class _Solver:
         self._stop = config.stop
         self._lens, self._starts, self._camera = problem.lens, problem.starts, problem.camera
         self._measured, self._weight = problem.measured, 1.0 / np.square(problem.sigma)
-        self._bound = self._most_bound = np.array([config.chi2_mono, config.chi2_stereo])
+        self._bound = np.array([config.chi2_mono, config.chi2_stereo])
         self._free = np.full(len(self.cameras), -1, np.int32)
         self._free[problem.free] = np.arange(f, dtype=np.int32)
         self._hcc, self._bc = np.empty((f, 6, 6)), np.empty((f, 6))
@@ -152,10 +144,6 @@ class _Solver:
         size = 6 * f + border_size
         self._system, self._rhs = np.empty((size, size)), np.empty(size)
         self._new_cameras, self._new_points = np.empty_like(self.cameras), np.empty_like(self.points)
-
-    def set_knee(self, scale: float) -> None:
-        """Set Huber's knee to the median squared residual, `scale` times what `sigma` predicts, or to its bound."""
-        self._bound = np.minimum(np.array([_MEDIAN_2, _MEDIAN_3]) * max(scale, _LEAST_SCALE), self._most_bound)
 
     def squared_residuals(self) -> F64:
         """Squared normalised residuals (m,) of all observations."""
