@@ -23,7 +23,7 @@ from kiteline_codec.schema import (
 from kiteline_core.ids import AgentId
 
 MEMBERS = (KeyframePose, RefinedLandmarks, SubmapPlacement, DisparityCalibration)  # what moves the agent's map
-_MOVING = (KeyframePose, RefinedLandmarks)
+_REFINED = (KeyframePose, RefinedLandmarks)  # of these, what each full bundle changes: the gap counts from them on
 _UNSAVED = 100  # batches that an earlier process may have made after its store was written last; many in 0.25 s
 
 
@@ -37,7 +37,7 @@ class CorrectionBatches:
         self._members: dict[Key, None] = {}  # of the newest batch
         self._missing: Key | None = None  # a member that had not arrived at the last check: it is checked first
         self._made_ns = 0
-        self._moved_ns = -1 << 62  # when keyframes or landmarks were last in one
+        self._refined_ns = -1 << 62  # when keyframes or landmarks were last in one
         self._open = False  # more values of the newest batch come with the next steps
         self._closed = 0  # number of the newest batch whose record was made
         self._overdue = False  # the newest batch does not arrive: later values join it, and wait for no other ones
@@ -50,7 +50,7 @@ class CorrectionBatches:
         self._overdue = not arrived and now_ns - self._made_ns >= self._config.batch_wait_s * 1e9
         if self._overdue:
             return None  # the agent is out of reach: the values go to the store, and to the agent when it returns
-        if not arrived or (now_ns - self._moved_ns < gap_s * 1e9 and not self._open):
+        if not arrived or (now_ns - self._refined_ns < gap_s * 1e9 and not self._open):
             return 0
         rate = channel.rate_bytes_s()
         return None if rate is None else round(rate * self._config.batch_s)
@@ -84,8 +84,8 @@ class CorrectionBatches:
             if not self._open:
                 self._number, self._made_ns, self._members = self._number + 1, now_ns, {}
             self._members.update(dict.fromkeys(keys))
-            if any(isinstance(record, _MOVING) for record in records):
-                self._moved_ns = now_ns
+            if any(isinstance(record, _REFINED) for record in records):
+                self._refined_ns = now_ns
             self._open = unfinished
             batch = [] if unfinished else [CorrectionBatch.of(self._agent, self._number, list(self._members))]
         if batch:

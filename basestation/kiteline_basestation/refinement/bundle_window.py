@@ -128,10 +128,10 @@ def measurements(sparse_map: SparseMap, slots: I32, config: MeasurementConfig) -
     here = np.flatnonzero(np.bincount(rows, minlength=1))
     agents = sparse_map.keyframes.id[here] >> (SEQUENCE_BITS + SUBMAP_BITS + BOOT_BITS)
     for agent in map(AgentId, np.unique(agents).tolist()):
-        own, camera = here[agents == agent], sparse_map.cameras.get(agent)
+        own = here[agents == agent]
         if agent in sparse_map.disparity_calibrated:
             sigma[own] = _SIGMA_CALIBRATED_PX
-        has_depth[own] = camera is not None and (camera.stereo or agent in sparse_map.measures_depth)
+        has_depth[own] = agent in sparse_map.cameras and sparse_map.measures_distances(agent)
     ranged = (table.inv_depth[slots] > 0) & has_depth[rows]
     measured = np.empty((len(slots), 3))
     measured[:, :2] = table.uv[slots]

@@ -119,7 +119,7 @@ def _steps(
         rotation_sigma = max(_ROTATION_SIGMA_PX, worn_px, difference_px)
         few = max(0.0, 1.0 - min(counts[k], counts[p]) / config.enough_observations)
         point_sigma = 1.0 / np.hypot(few / max(config.sigma_px, worn_px), 1.0 / rotation_sigma)
-        ranged = sparse_map.cameras[agent].stereo or agent in sparse_map.measures_depth
+        ranged = sparse_map.measures_distances(agent)
         sets = [(_DEPTHS if few > 0.0 else _ROTATION_DEPTHS, point_sigma)]
         if not ranged:
             sets.append((_DEPTHS, _SCALE_SIGMA_PX))
