@@ -265,3 +265,10 @@ def pose_covariance(
     for i in range(6):
         for k in range(6):
             out[i, k] += e[i, k]
+
+
+def adjoint(T: F64) -> F64:
+    """(6,6): Exp(adjoint @ x) T = T Exp(x) for x [translation, rotation]."""
+    out = np.empty((6, 6))
+    adjoint_into(np.ascontiguousarray(T), out)
+    return out

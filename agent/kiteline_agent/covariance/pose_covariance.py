@@ -7,6 +7,7 @@
   "Drift-free real-time sequential mosaicing"). Residuals tell whether they are those of a good calibration or of a worn
   one. A disparity offset that was found (`disparity_alignment`) moves the keyframes back by its effect.
 - *IMU bias on poses*: the mean offset between poses fused with the IMU and those from images alone.
+- *Scale of one camera*: all lengths of its map err by the same share (`scale_error`).
 - *Dead reckoning* has the covariance of the IMU or odometer, or that of unknown accelerations.
 """
 
@@ -19,7 +20,7 @@ from kiteline_agent.covariance.calibration_error_kernels import (
     CALIBRATION,
     DISPARITY_SHAPES,
     SHAPES,
-    adjoint_into,
+    adjoint,
     pose_covariance,
     sensitivity,
 )
@@ -27,6 +28,8 @@ from kiteline_agent.covariance.calibration_evidence import CalibrationEvidence
 from kiteline_agent.covariance.evaluation_schedule import EvaluationSchedule
 from kiteline_agent.covariance.odometry_drift import covariance_by_map
 from kiteline_agent.covariance.pose_quality import LOST_BELOW, probability_good
+from kiteline_agent.covariance.scale_error import ScaleError
+from kiteline_agent.covariance.unmeasured_motion import unmeasured_growth
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.tracking.pose_state import PoseState
 from kiteline_agent.tracking.track import Track
@@ -41,8 +44,6 @@ _WORN_LENS_PX = 0.8  # px at the image's edge: focal length and centre of a worn
 _WORN_MOUNT_RAD = 3e-3  # rad: rotation of the camera in the body about an axis, if worn
 _IMU_OFFSET_SHARE = 1.0  # of the mean difference: standard deviation of its systematic part
 _REFINED_SHARE = 0.25  # of a keyframe's variance that remains when the base has optimised it
-_LOST_VELOCITY_M_S = 0.03  # m/s: error of the velocity between two frames
-_LOST_RATE_RAD_S = 0.02  # rad/s: the same for the rotation
 _FEW_INLIERS = 10  # inliers with which quality begins to rise: so many agree by chance
 _MANY_INLIERS = 30  # inliers with which quality is not reduced
 _SURPRISE = 7.0  # standard deviations between a relocalised pose and the IMU's prediction, at most
@@ -97,6 +98,8 @@ class PoseCovariance:
         self._track: Track | None = None  # of this frame, if not evaluated yet
         self._T_m_b0: F64 = np.eye(4)  # first pose of the submap
         self._T_o_b0: F64 | None = None  # first pose of the flight
+        self._T_o_b_left: F64 | None = None  # where the map last changed
+        self._scale = ScaleError()
         self._h, self._g = np.zeros((6, 6)), np.zeros((6, SHAPES))
         self._of_errors, self._side = np.zeros((CALIBRATION, CALIBRATION)), np.zeros(6 + CALIBRATION)
 
@@ -111,6 +114,7 @@ class PoseCovariance:
         self._schedule.begin((T_m_b @ self._T_b_c)[:3, 3])
         if self._T_o_b0 is None:
             self._T_o_b0 = T_m_b
+        self._scale.begin_map(T_m_b[:3, 3], (T_m_b if self._T_o_b_left is None else self._T_o_b_left)[:3, 3])
 
     def update(self, track: Track, dt_s: float = 0.0) -> None:
         """Update after images gave the pose, from landmarks of the local map. dt_s: since the last such frame.
@@ -143,6 +147,10 @@ class PoseCovariance:
         if angle_rad != self._camera_rotation_rad:
             self._camera_rotation_rad = angle_rad
             self._extrinsic = self._extrinsic_cov()
+
+    def set_scale_sigma(self, sigma: float) -> None:
+        """Set the relative deviation of lengths in the map of one camera; 0 if cameras measure them, or none does."""
+        self._scale.sigma = sigma
 
     def _extrinsic_cov(self) -> F64:
         """(6,6) of the camera in the body."""
@@ -192,27 +200,17 @@ class PoseCovariance:
         sensor_cov: (6,6) of the pose by IMU or odometer, [translation in m, rotation about the body's axes]; None if
         no sensor measures the motion. moves: the velocity was known when images were lost.
         """
-        before = self._unmeasured_s = self._unmeasured_s or 0.0
+        self._unmeasured_s = self._unmeasured_s or 0.0
         if sensor_cov is not None:
             self._reckoned = sensor_cov
             return
-        self._unmeasured_s = before + dt_s
-        self._reckoned = self._reckoned + self.unmeasured_growth(dt_s, moves=moves, before_s=before)
+        self._reckoned = self._reckoned + self.unmeasured_growth(dt_s, moves=moves)
+        self._unmeasured_s += dt_s
 
-    def unmeasured_growth(self, dt_s: float, *, moves: bool, before_s: float | None = None) -> F64:
-        """Covariance (6,6) that unknown accelerations add in dt_s without measured motion.
-
-        before_s: time without it before that; None: as it is now. moves: as in `dead_reckon`.
-        """
-        c = self._config
-        before = (self._unmeasured_s or 0.0) if before_s is None else before_s
-        after = before + dt_s
-        speed = (_LOST_VELOCITY_M_S, _LOST_RATE_RAD_S) if moves else (c.unknown_velocity_m_s, c.unknown_rate_rad_s)
-        (m0, m1), (t0, t1) = (
-            tuple(v * s + 0.5 * a * s * s for s in (before, after))
-            for v, a in zip(speed, (c.unmeasured_accel_m_s2, c.unmeasured_turn_rad_s2), strict=True)
-        )
-        return np.diag(np.repeat([m1 * m1 - m0 * m0, min(t1 * t1 - t0 * t0, 10.0)], 3))
+    def unmeasured_growth(self, dt_s: float, *, moves: bool) -> F64:
+        """Covariance (6,6) that unknown accelerations add in dt_s without measured motion, from now on."""
+        before_s = self._unmeasured_s or 0.0
+        return unmeasured_growth(self._config, before_s, before_s + dt_s, moves=moves)
 
     def dead_reckoning_within(self, m: float, rad: float) -> bool:
         """True if dead reckoning has a standard deviation up to m in any direction and rad about any axis."""
@@ -246,7 +244,7 @@ class PoseCovariance:
         left, out = np.empty((6, 6)), np.empty((6, 6))
         self._propagate(pose.T_o_m, T_m_b, np.eye(4), left, out)
         # dead reckoning is perturbed in the body, the rest on the left
-        T_o_b = pose.T_o_m @ T_m_b
+        T_o_b = self._T_o_b_left = pose.T_o_m @ T_m_b
         back = np.eye(6)
         back[:3, 3:], back[3:, 3:] = se3.skew(T_o_b[:3, 3]) @ T_o_b[:3, :3], T_o_b[:3, :3]
         turn = np.eye(6)
@@ -313,6 +311,17 @@ class PoseCovariance:
         Each is [translation in m or o, rotation about the body's axes]. in_first: the submap is that in which the
         flight began, so that the drift of the odometry frame is measured in it.
         """
+        cov_m, cov_o = self._without_scale(pose, T_m_b, in_first=in_first)
+        if self._scale.sigma == 0.0:
+            return cov_m, cov_o
+        of_m, of_o = np.zeros((6, 6)), np.zeros((6, 6))
+        p_m_b = T_m_b[:3, 3]
+        at_m, at_o = self._scale.in_m(p_m_b), self._scale.in_o(se3.transform(pose.T_o_m, p_m_b[None])[0])
+        of_m[:3, :3], of_o[:3, :3] = np.outer(at_m, at_m), np.outer(at_o, at_o)
+        return cov_m + of_m, cov_o + of_o
+
+    def _without_scale(self, pose: PoseState, T_m_b: F64, *, in_first: bool) -> tuple[F64, F64]:
+        """The same without the error of a monocular map's scale."""
         left, cov_m = np.empty((6, 6)), np.empty((6, 6))
         carried, self._carried = self._carried, self._zero
         self._propagate(np.eye(4), T_m_b, self._T_m_b0, left, cov_m)
@@ -383,9 +392,6 @@ class PoseCovariance:
         most = 100 if self._doubtful_s == 0.0 else LOST_BELOW - 1
         return min(max(1, round(100.0 * trust * probability_good(cov, c.good_m, c.good_rad))), most)
 
-
-def adjoint(T: F64) -> F64:
-    """(6,6): Exp(adjoint @ x) T = T Exp(x) for x [translation, rotation]."""
-    out = np.empty((6, 6))
-    adjoint_into(np.ascontiguousarray(T), out)
-    return out
+    def dead_reckoning_quality(self) -> int:
+        """The same for what dead reckoning alone added since images were lost."""
+        return self.quality(self._reckoned, None)

@@ -60,7 +60,7 @@ class InertialTracker:
             config, calibration, self._p_b_c, self._buffer, self.self_calibration.correct
         )
         self._reported_s = config.calibration.offset_s
-        self._scale = ScaleFilter(calibration, config.gravity_m_s2, self._p_b_c)
+        self.scale = ScaleFilter(calibration, config.gravity_m_s2, self._p_b_c)  # of a monocular map
         self._scale_from: tuple[int, F64] | None = None  # stamp and pose by images at which its interval begins
         self._cached: tuple[tuple[int, int, int | None], Samples | None] | None = (
             None  # interval that was asked for last
@@ -245,7 +245,7 @@ class InertialTracker:
         self.self_calibration.move_map(T_new_old)
         if self._scale_from is not None:
             self._scale_from = (self._scale_from[0], T_new_old @ self._scale_from[1])
-        self._scale.rotate_map(T_new_old[:3, :3])
+        self.scale.rotate_map(T_new_old[:3, :3])
 
     def scale_map(self, factor: float) -> None:
         """Lengths in a monocular map were multiplied by `factor` about the camera of the last frame."""
@@ -253,7 +253,7 @@ class InertialTracker:
             return
         camera = self._last[1][:3, 3] + self._last[1][:3, :3] @ self._p_b_c
         self._smoother.scale_map(factor, camera)
-        self._scale.scale_map(factor)
+        self.scale.scale_map(factor)
         if self._scale_from is not None:
             self._scale_from = self._scale_from[0], camera_scaled(self._scale_from[1], factor, self._p_b_c, camera)
 
@@ -280,7 +280,7 @@ class InertialTracker:
         self._smoother.start(start.T_w_b, start.velocity, start.bias, start.gravity, StartDeviations(), start.cov)
         self.begin_map(t_ns, T_m_b)
         state = self._smoother.state
-        self._scale.start(state.velocity, self._smoother.gravity, state.bias, start.accel_noise)
+        self.scale.start(state.velocity, self._smoother.gravity, state.bias, start.accel_noise)
 
     def reset(self) -> None:
         """Begin a new map at an unknown pose relative to the old one. Biases are kept."""
@@ -291,11 +291,6 @@ class InertialTracker:
         self._incomplete = None
         self._image_loss_s = 0.0
 
-    def scale_correction(self) -> tuple[float, float] | None:
-        """Factor by which a monocular map is to be scaled, and its deviation; None if it is right as far as known."""
-        factor = self._scale.correction()
-        return None if factor is None else (factor, self._scale.scale[1])
-
     def rescale(self, scale: float) -> None:
         """Scale the map by `scale`, so that it is metric from now on."""
         self.metric = True
@@ -304,12 +299,12 @@ class InertialTracker:
             return
         self._last = (self._last[0], camera_scaled(self._last[1], scale, self._p_b_c))
         self._scale_from = None
-        self._scale.correct(scale)
+        self.scale.correct(scale)
         if self._smoother.running:
             state, gravity = self._smoother.state, self._smoother.gravity
             velocity = scale * state.velocity
             self._smoother.start(self._last[1], velocity, state.bias, gravity, StartDeviations(), state.cov)
-            self._scale.resume(velocity)
+            self.scale.resume(velocity)
 
     # steps
 
@@ -365,18 +360,18 @@ class InertialTracker:
 
     def _watch_scale(self, t_ns: int, T_m_b: F64, depth_m: float, state: InertialState | None) -> None:
         """Compare a pose by images, and one some frames before, with the IMU in between."""
-        if not self._scale.running or state is None:
-            self._scale.stop()
+        if not self.scale.running or state is None:
+            self.scale.stop()
             return
         if self._scale_from is None:
-            self._scale.resume(state.velocity)
+            self.scale.resume(state.velocity)
             self._scale_from = (t_ns, T_m_b)
         elif (t_ns - self._scale_from[0]) * 1e-9 >= INTERVAL_S:
             samples = self.samples_between(self._scale_from[0], t_ns)
             if samples is not None and depth_m > 0.0:
-                self._scale.add(self._scale_from[1], T_m_b, samples, state.bias[:3], depth_m)
+                self.scale.add(self._scale_from[1], T_m_b, samples, state.bias[:3], depth_m)
             else:
-                self._scale.resume(state.velocity)
+                self.scale.resume(state.velocity)
             self._scale_from = (t_ns, T_m_b)
 
     def _complete_interval(self) -> None:

@@ -53,12 +53,18 @@ class ScaleFilter:
         q = max(float(self._x[_UNITS]), 1e-3)
         return 1.0 / q, float(np.sqrt(self._cov[_UNITS, _UNITS])) / q**2
 
-    def correction(self) -> float | None:
-        """Factor by which the map is to be scaled; None if it is right as far as is known."""
+    @property
+    def deviation(self) -> float:
+        """Relative deviation of lengths in the map as it is: how well the scale is known, and how far off it seems."""
+        scale, sigma = self.scale
+        return float(np.hypot(sigma, scale - 1.0))
+
+    def correction(self) -> tuple[float, float] | None:
+        """Factor by which the map is to be scaled, and its deviation; None if it is right as far as is known."""
         scale, sigma = self.scale
         if not self.running or self.age_s < _LEAST_S or sigma > _KNOWN_SIGMA * scale:
             return None
-        return scale if abs(np.log(scale)) > max(_LEAST, _LEAST_DEVIATIONS * sigma / scale) else None
+        return (scale, sigma) if abs(np.log(scale)) > max(_LEAST, _LEAST_DEVIATIONS * sigma / scale) else None
 
     def stop(self) -> None:
         """Forget all."""

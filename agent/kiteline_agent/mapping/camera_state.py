@@ -87,6 +87,7 @@ class CameraState:
     def set_measured(self, track: Track, dt_s: float, *, repeated: bool) -> None:
         """Take over a measured pose. repeated: the image was an old one."""
         self.pose.measured(track.T_m_c, dt_s, repeated=repeated)
+        self.covariance.set_scale_sigma(self.motion.scale_sigma)
         self.covariance.update(track, dt_s)
         self.reference.set_camera(self.pose.T_m_c)
 

@@ -42,7 +42,8 @@ class PoseReport:
             cov_m if tracked and self._knows_place() else cov_o, outcome.inliers or None
         )
         carried = camera.submaps.any and camera.motion.measures_motion
-        if not tracked and (initialising or not carried or quality < LOST_BELOW):
+        lost = not carried or camera.covariance.dead_reckoning_quality() < LOST_BELOW
+        if not tracked and (initialising or lost):
             quality = -1
         keyframe, T_k_c = camera.reference.keyframe, camera.reference.T_k_c
         if keyframe != NO_KEYFRAME:
@@ -65,10 +66,10 @@ class PoseReport:
     def _knows_place(self) -> bool:
         """True if the active submap's pose in the flight's first one rests on more than odometry.
 
-        Always for monocular maps, each of which has a unit of its own.
+        Always for maps of which each has a unit of its own.
         """
         submaps = self._camera.submaps
-        return not self._has_depth or submaps.in_first or self._corrections.is_recognised(submaps.active)
+        return not self._camera.motion.metric or submaps.in_first or self._corrections.is_recognised(submaps.active)
 
     def odometry_quality(self, estimate: Estimate) -> int:
         """`quality` of T_o_b, which no map corrects: for a flight controller."""

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from kiteline_agent.config import OdometerConfig
-from kiteline_agent.covariance.pose_covariance import adjoint
+from kiteline_agent.covariance.calibration_error_kernels import adjoint
 from kiteline_agent.inertial.calibration.known_imu import KnownImuConfig
 from kiteline_agent.inertial.fixed_lag import VisualPoints
 from kiteline_agent.inertial.gravity_alignment import up_of
@@ -85,6 +85,13 @@ class MotionModel:
     def metric(self) -> bool:
         """True if the map's lengths are in metres."""
         return self._metric or self.odometer.metric or (self.tracker is not None and self.tracker.metric)
+
+    @property
+    def scale_sigma(self) -> float:
+        """Relative deviation of the map's lengths in metres; 0 where images measure them, or in a unit of its own."""
+        if self._metric or not self.metric:
+            return 0.0
+        return self.odometer.unit_sigma if self.tracker is None else self.tracker.scale.deviation
 
     @property
     def awaits_scale(self) -> bool:
@@ -249,7 +256,7 @@ class MotionModel:
 
     def scale_correction(self) -> tuple[float, float] | None:
         """Factor by which the map in metres is to be scaled, and its deviation; None if no correction is due."""
-        return None if self._metric or self.tracker is None else self.tracker.scale_correction()
+        return None if self._metric or self.tracker is None else self.tracker.scale.correction()
 
     def reports(self) -> dict[str, Any]:
         """What was found of time offset, IMU and odometer; None for each that is not there."""

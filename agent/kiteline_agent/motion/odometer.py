@@ -68,6 +68,7 @@ class Odometer:
         self._path, self._path_cov, self._path_cross = np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3))  # in m
         self._rotation_cov, self._rotation_cross = np.zeros((3, 3)), np.zeros((3, 3))  # about the body's axes
         self._unit_scale = UnitScale(_ALIGNED)
+        self.unit_sigma = 0.0  # relative deviation of metres per unit, once they were found
         self._unscaled_ns: int | None = None  # stamp of the first frame in a map of unknown scale
         self._trusted = self._reported_trust = False
         self._unmatched = 0  # windows without a sample before the first comparison
@@ -279,6 +280,9 @@ class Odometer:
 
     def set_metric(self, *, metric: bool) -> None:
         """Change the map's unit to metres, or to an unknown one."""
+        found = self.metres_per_unit()
+        if metric and found is not None:
+            self.unit_sigma = float(np.hypot(found[1] / found[0], _SCALE_FLOOR))
         self.metric = metric
         self._anchor = self._last = None
         self._unit_scale.clear()

@@ -8,7 +8,8 @@ import pytest
 
 from kiteline_agent.config import CovarianceConfig
 from kiteline_agent.covariance import calibration_error_kernels as certainty_kernels
-from kiteline_agent.covariance.pose_covariance import PoseCovariance, adjoint
+from kiteline_agent.covariance.calibration_error_kernels import adjoint
+from kiteline_agent.covariance.pose_covariance import PoseCovariance
 from kiteline_agent.covariance.pose_quality import LOST_BELOW, probability_good
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.tracking.pose_state import PoseState

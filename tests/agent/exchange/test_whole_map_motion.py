@@ -156,6 +156,7 @@ def test_tiles_are_read_where_the_base_has_the_vehicle_while_the_live_pose_follo
     camera.submaps.active, camera.pose.T_o_m, camera.motion.metric = SUBMAP, np.eye(4), True
     camera.motion.awaits_scale = False
     camera.covariance.of_poses.return_value, camera.covariance.quality.return_value = (np.eye(6), np.eye(6)), 50
+    camera.covariance.dead_reckoning_quality.return_value = 100
     report = PoseReport(AgentId(0), camera, corrections, MagicMock(), has_depth=True)
     outcome = MagicMock(tracked=True, inliers=50, T_o_n=None)
     report.report(MagicMock(t_ns=SECOND_NS), outcome)

@@ -250,7 +250,7 @@ def test_a_wrong_scale_is_found_and_corrected(unit: float, corrected_every: int)
         tracker.update(step.t_ns, visual, in_unit(step.points, total))
         if k % corrected_every == 0:
             tracker.scale_map(1.0)
-        found = tracker.scale_correction()
+        found = tracker.scale.correction()
         if found is not None:
             factor, sigma = found
             corrections.append(factor)
@@ -273,10 +273,10 @@ def test_velocity_follows_lengths_that_the_base_corrects(unit: float) -> None:
     for k, step in enumerate(steps[11:-1], 11):
         if k == at:
             before = camera_scaled(steps[k - 1].visual, 1.0 / unit, T_B_C[:3, 3])
-            watched = tracker._scale.scale[0]
+            watched = tracker.scale.scale[0]
             tracker.move_map(steps[k - 1].visual @ se3.inverse(before))
             tracker.scale_map(unit)
-            assert tracker._scale.scale[0] == pytest.approx(watched / unit)
+            assert tracker.scale.scale[0] == pytest.approx(watched / unit)
         total = unit if k < at else 1.0
         tracker.predict(step.imu, step.t_ns)
         visual = camera_scaled(step.visual, 1.0 / total, T_B_C[:3, 3])
