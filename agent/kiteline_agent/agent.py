@@ -12,7 +12,7 @@ from kiteline_agent.config import AgentConfig
 from kiteline_agent.exchange.corrections import Corrections
 from kiteline_agent.governor.cost_model import Work
 from kiteline_agent.governor.effort import FULL, governed
-from kiteline_agent.governor.governor import Extra, Governor
+from kiteline_agent.governor.governor import Governor
 from kiteline_agent.image_cells import with_cells_for
 from kiteline_agent.initialisation.inertial_start import InertialStart
 from kiteline_agent.initialisation.two_view_start import TwoViewStart
@@ -26,6 +26,7 @@ from kiteline_agent.mapping.loss_stage import FrameOutcome, LossStage
 from kiteline_agent.mapping.pose_report import PoseReport
 from kiteline_agent.mapping.right_camera import RightCamera
 from kiteline_agent.mapping.submap_stage import SubmapStage
+from kiteline_agent.mapping.track_stage import TrackStage
 from kiteline_agent.motion.extrapolation import LEAST_PREDICTION_PERCENT, MAX_PREDICTION_S
 from kiteline_agent.relocalisation.map_cache import MapCache
 from kiteline_agent.relocalisation.relocaliser import Relocaliser
@@ -34,7 +35,6 @@ from kiteline_agent.scans.scan_stage import ScanStage
 from kiteline_agent.step import Estimate, Identity, PredictedPose, StepInput, StepOutput
 from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_agent.tracking.frame_images import frame_images
-from kiteline_agent.tracking.image_shift import ImageShift
 from kiteline_agent.tracking.map_anchor import MapAnchor
 from kiteline_agent.tracking.rolling_shutter import RollingShutter
 from kiteline_agent.tracking.stuck_camera import StuckCamera
@@ -79,13 +79,13 @@ class Agent:
         self._governor = Governor(config.governor)
         self._effort = FULL
         self._camera = CameraState(rig, imu, config, identity, self.map)
-        self._tracker = Tracker(self.map, self.work)
-        self._image_shift = ImageShift(self._rectifier)
+        tracker = Tracker(self.map, self.work)
         self._stuck_camera = StuckCamera(camera)
         self._relocaliser = Relocaliser(
-            self.map, self._tracker, config, vocabulary, self.map_cache,
+            self.map, tracker, config, vocabulary, self.map_cache,
             partial(self._camera.is_consistent, relocalised=True), self.work,
         )  # fmt: skip
+        self._track = TrackStage(self._camera, tracker, self._relocaliser, self._governor, self._rectifier)
         self.right_camera = None
         if rig.right is not None:
             right = identity.agent, self._camera, self.map, self._rectifier, config, channel, self.work
@@ -104,7 +104,7 @@ class Agent:
             else InertialStart(camera, imu, config, self.work, self._governor.may_solve)
         )  # fmt: skip
         self._submaps = SubmapStage(
-            self._camera, self.map, self._tracker, maker, self._keyframes, self._relocaliser, self._depth,
+            self._camera, self.map, tracker, maker, self._keyframes, self._relocaliser, self._depth,
             self._two_view_start, inertial_start, self._governor, channel, self._rectifier,
         )  # fmt: skip
         self._scans = None
@@ -191,17 +191,18 @@ class Agent:
             repeated=self._stuck_camera.repeated, shutter=self._shutter(frame.t_ns, dt_s),
         )  # fmt: skip
         # 3. Track the landmarks of the local map.
-        submap, track = self.submap, self._track(ctx) if has_map and not stuck else None
+        submap, was_lost = self.submap, self._was_lost
+        track = self._track.track(ctx, was_lost=was_lost) if has_map and not stuck else None
         if track is None:
             # 4. Not tracked: dead reckoning, relocalisation, or a new submap.
-            outcome = self._loss.handle(ctx, stuck=stuck)
+            outcome = self._loss.handle(ctx, stuck=stuck, was_lost=was_lost)
             self._forget_scans(ctx, outcome)
         else:
             # 5. Fuse the pose with IMU and odometer.
             self.work.fused = int(camera.motion.tracker is not None)
             by_images = track
             track, events = camera.fuse(ctx, track)
-            if self._was_lost:
+            if was_lost:
                 camera.resume_after_loss(ctx, track)
             camera.set_measured(track, dt_s, repeated=ctx.repeated)
             self._loss.end()
@@ -243,53 +244,23 @@ class Agent:
         """Note how a frame ended, and report its pose."""
         self._was_lost = not outcome.tracked or outcome.bridged
         if not self._was_lost:
-            self._image_shift.remember(ctx.images.sampled, self._camera.pose.T_c_m)
+            self._track.remember(ctx)
         self._last_t_ns = ctx.t_ns
         self._placed_ns = ctx.t_ns if outcome.tracked else self._placed_ns
         return self._report.report(ctx, outcome)
 
     def _shutter(self, t_ns: int, dt_s: float) -> RollingShutter | None:
         """The rolling shutter's motion in a frame; None for a global shutter, and while the motion is unknown."""
-        readout_s, rectifier, motion = self._rectifier.readout_s, self._rectifier, self._camera.motion
-        if readout_s == 0.0 or dt_s <= 0.0 or not (motion.measures_motion or self._camera.pose.moves):
+        readout_s, rectifier = self._rectifier.readout_s, self._rectifier
+        if readout_s == 0.0 or dt_s <= 0.0 or not self._camera.knows_motion:
             self._motion_known = False
             return None
-        twist = motion.camera_twist(t_ns, dt_s)
+        twist = self._camera.motion.camera_twist(t_ns, dt_s)
         shutter = RollingShutter(rectifier.camera, readout_s, rectifier.camera.height, rectifier.left_grid, twist)
         if not self._motion_known and shutter.largest_px() < _STILL_PX:
             self.map.rolled[:] = False  # the vehicle stood still when its motion was unknown
         self._motion_known = True
         return shutter
-
-    def _track(self, ctx: FrameContext) -> Track | None:
-        """Track from the predicted pose, then retry if most landmarks were missed; None if the pose is not credible."""
-        config = ctx.config.pose
-        by_imu = self._camera.motion.running and not self._was_lost
-        near = self._tracker.track_by_imu(ctx) if by_imu else None
-        track = self._tracker.track(ctx, ctx.T_c_m) if near is None else near
-        if not track.holds(config):
-            track = self._retry_with_image_shift(ctx, track)
-        if not track.holds(config) and track.inliers >= config.min_inliers and self._governor.may(Extra.SEARCH):
-            track = self._retry_with_descriptors(ctx, track)
-        consistent, submap = self._camera.is_consistent, self._camera.submaps.active
-        if track.inliers < config.min_inliers or not consistent(ctx, track.T_c_m, submap, relocalised=False):
-            return None
-        return self._tracker.nearer(ctx, track) if by_imu and near is None else track
-
-    def _retry_with_image_shift(self, ctx: FrameContext, track: Track) -> Track:
-        """The better of a track and another one that starts from the rotation that the image-shift estimate gives."""
-        guess = self._image_shift.rotated_pose(ctx.images.sampled)
-        if guess is None:
-            return track
-        other = self._tracker.track(ctx, guess)
-        return other if other.inliers > track.inliers else track
-
-    def _retry_with_descriptors(self, ctx: FrameContext, track: Track) -> Track:
-        """The better of a track and a relocalisation in the same submap."""
-        found = self._relocaliser.relocalise(ctx, self._camera.reference.keyframe)
-        if found is None or found.submap != self._camera.submaps.active or found.track.inliers < track.inliers:
-            return track
-        return found.track
 
     def _align_gravity(self, ctx: FrameContext) -> list[str]:
         """Tell the base how the first submap is tilted, once that is known. Returns events."""
