@@ -33,9 +33,9 @@ class TrackStage:
         by_imu = camera.motion.running and not was_lost
         near = self._tracker.track_by_imu(ctx) if by_imu else None
         track = self._tracker.track(ctx, ctx.T_c_m) if near is None else near
-        # b. From the rotation that shifts the last image onto this one.
+        # b. From rotations that bring the last image onto this one.
         if not track.holds(config):
-            track = self._from_image_shift(ctx, track)
+            track = self._from_rotations(ctx, track)
         # c. From steps along the axis, while nothing has told the speed.
         if not (track.holds(config) or was_lost or camera.knows_motion) and self._governor.may(Extra.SEARCH):
             track = _better(track, self._tracker.track_along_axis(ctx, camera.pose.T_c_m))
@@ -47,9 +47,13 @@ class TrackStage:
             return None
         return self._tracker.nearer(ctx, track) if by_imu and near is None else track
 
-    def _from_image_shift(self, ctx: FrameContext, track: Track) -> Track:
-        guess = self._image_shift.rotated_pose(ctx.images.sampled)
-        return track if guess is None else _better(track, self._tracker.track(ctx, guess))
+    def _from_rotations(self, ctx: FrameContext, track: Track) -> Track:
+        """The better of a track and those from the rotations that the image tells, until one holds."""
+        for number, T_c_m in enumerate(self._image_shift.rotated_poses(ctx.images.sampled)):
+            if track.holds(ctx.config.pose) or (number > 0 and not self._governor.may(Extra.SEARCH)):
+                break
+            track = _better(track, self._tracker.track(ctx, T_c_m))
+        return track
 
     def _from_descriptors(self, ctx: FrameContext, track: Track) -> Track:
         found = self._relocaliser.relocalise(ctx, self._camera.reference.keyframe)

@@ -1,9 +1,10 @@
-"""Flights that begin in motion: live poses from the fifth frame on."""
+"""Flights that begin in motion: live poses from the fifth frame on; and cameras that take few images a second."""
 
 import numpy as np
 
-from kiteline_bench.harness.bars import Bar, Bench, table
-from kiteline_bench.harness.recording import load
+from kiteline_bench.harness.bars import Bar, Bench, at_most, table
+from kiteline_bench.harness.faults import every_nth
+from kiteline_bench.harness.recording import Recording, load
 from kiteline_bench.reality.flown import Flown, flown, spread
 from kiteline_core.geometry import se3
 from kiteline_lab.evaluation import metrics
@@ -12,9 +13,18 @@ FLIGHT = "room_flight.mcap"
 STARTS_S = (3.0, 5.0, 7.0, 9.0, 11.0, 13.0, 15.0)  # of 22 s
 _FIRST, _BEGIN_S, _SECONDS = 4, 3.0, 6.0  # index of the fifth frame; s that count as the begin, and s that are flown
 _MOST_M, _MOST_DEG = 0.03, 2.0
+STREET = "kitti_straight"  # 10 images a second, 1.2 m between two
+_STREET_STEPS, _STREET_STARTS, _STREET_FRAMES = (1, 2, 3, 4), tuple(range(12)), 8  # every so many images of it
+_ROOM_STEPS, _ROOM_STARTS_S = (2, 4), (0.0, 5.0)  # the same of FLIGHT, which has 20 a second
+_STREET_M, _ROOM_M = 0.1, 0.02
 
 
 def run(bench: Bench) -> list[Bar]:
+    """All bars."""
+    return [*_in_motion(bench), *_slow_cameras(bench)]
+
+
+def _in_motion(bench: Bench) -> list[Bar]:
     """Largest errors of position and rotation in the first seconds, the path aligned as a whole."""
     recording = load(bench.source(FLIGHT))
     rows = []
@@ -32,6 +42,41 @@ def run(bench: Bench) -> list[Bar]:
                 2),
         *spread("start in motion: frames without a pose after the fifth", [row[5] for row in rows], 0.0, "", 0),
     ]  # fmt: skip
+
+
+def _slow_cameras(bench: Bench) -> list[Bar]:
+    """Odometry of the tracker alone, without an IMU: before the second image nothing tells how fast the vehicle is."""
+    street, room = load(bench.source(STREET)), load(bench.source(FLIGHT)).without_imu()
+    rows: list[tuple[str, int, int, int, float, float]] = []
+    for step in _STREET_STEPS:
+        parts = [way.part(start, start + step * _STREET_FRAMES)
+                 for way in (street, street.backward()) for start in bench.chosen(_STREET_STARTS)]  # fmt: skip
+        rows.append((STREET, step, *_every(bench, STREET, parts, step)))
+    for step in _ROOM_STEPS:
+        parts = [room.seconds(start_s, 1e9) for start_s in bench.chosen(_ROOM_STARTS_S)]
+        rows.append((f"{FLIGHT}, no IMU", step, *_every(bench, FLIGHT, parts, step)))
+    table(bench, "Cameras that take few images", ("flight", "every so many images", "starts", "frames without a pose",
+          "ATE of the odometry m, median", "worst"), rows)  # fmt: skip
+    bars = []
+    for name, limit in ((STREET, _STREET_M), (f"{FLIGHT}, no IMU", _ROOM_M)):
+        own = [row for row in rows if row[0] == name]
+        what = f"{name}, every image to every {own[-1][1]}th" if own[0][1] == 1 else f"{name}, every 2nd and 4th image"
+        bars.append(at_most(f"{what}: frames without a pose", sum(row[3] for row in own), 0, "", 0))
+        bars.append(at_most(f"{what}: ATE of the odometry, worst", max(row[5] for row in own), limit, "m"))
+    return bars
+
+
+def _every(bench: Bench, name: str, parts: list[Recording], step: int) -> tuple[int, int, float, float]:
+    """Number of flights, frames without a pose, median and worst ATE of the odometry."""
+    lost, errors = 0, []
+    for part in parts:
+        whole = len(part.items) // step * step
+        flight = flown(
+            bench, f"{name}, every {step}. image", every_nth(part.part(0, whole), 0, whole, step), base=False
+        )
+        lost += sum(not e.tracked for e in flight.run.found)
+        errors.append(flight.ate_m("odometry"))
+    return len(parts), lost, float(np.median(errors)), max(errors)
 
 
 def _begin(flight: Flown) -> tuple[float, float]:
