@@ -111,15 +111,15 @@ def nees_bar(name: str, counts: Counts) -> Bar:
                    f"{mean:.2f} (at the flights' ends {np.mean(counts.final_nees):.2f})")  # fmt: skip
 
 
-def quality_bars(counts: list[Counts]) -> list[Bar]:
-    """Whether `quality` separates bad poses from good ones."""
+def quality_bars(counts: list[Counts], what: str = "") -> list[Bar]:
+    """Whether `quality` separates bad poses from good ones. what: begins the names of the bars."""
     bad, good = sum(c.bad for c in counts), sum(c.good for c in counts)
     flagged = sum(c.bad_flagged for c in counts) / bad if bad else 1.0
     wrongly = sum(c.good_flagged for c in counts) / max(good, 1)
     return [
-        is_true("quality: poses off by more than 0.2 m or 10 degrees are flagged", ">= 95 %", flagged >= 0.95,
+        is_true(f"{what}quality: poses off by more than 0.2 m or 10 degrees are flagged", ">= 95 %", flagged >= 0.95,
                 f"{100 * flagged:.1f} % of {bad}"),
-        is_true("quality: others are flagged", "<= 5 %", wrongly <= 0.05, f"{100 * wrongly:.1f} % of {good}"),
+        is_true(f"{what}quality: others are flagged", "<= 5 %", wrongly <= 0.05, f"{100 * wrongly:.1f} % of {good}"),
     ]  # fmt: skip
 
 
