@@ -21,7 +21,7 @@ def run(bench: Bench) -> list[Bar]:
 
 
 def _one_camera(bench: Bench) -> list[Bar]:
-    """A real flight forward and backward: how far a pose is off grows with the distance from the start, by the scale."""
+    """A real flight forward and backward: errors grow with the distance from the start, by the scale."""
     recording, counts, rows = load(bench.source(FLIGHT), mono=True), Counts(), []
     for way, played in (("forward", recording), ("backward", recording.backward())):
         for start_s in bench.chosen(REAL_STARTS_S):
