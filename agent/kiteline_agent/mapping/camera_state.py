@@ -96,6 +96,21 @@ class CameraState:
         self.covariance.update(track, dt_s)
         self.reference.set_camera(self.pose.T_m_c)
 
+    def images_measured_motion(self, found: Relocalisation) -> bool:
+        """True if a relocalisation tells the motion since the last frame, which was tracked, and no sensor does.
+
+        A flight that begins in motion, slow cameras: the prediction was a guess, and the odometry frame need not hold
+        it against the images.
+        """
+        return not (found.from_cache or self.motion.measures_motion) and found.submap == self.submaps.active
+
+    def move_to(self, found: Relocalisation, before_T_m_c: F64, ctx: FrameContext) -> None:
+        """The camera moved from where the last frame has it, (4,4), to where this one was relocalised."""
+        self.pose.T_m_c = before_T_m_c
+        self.set_measured(found.track, ctx.dt_s, repeated=ctx.repeated)
+        self._map.note_tracking(found.track.rows, found.track.inlier, ctx.number)
+        self.covariance.confirm_relocalisation()
+
     def dead_reckon(self, ctx: FrameContext) -> bool:
         """Take over the predicted pose of a frame without a measured one. True while IMU or odometer can be trusted."""
         reckoned = self.motion.dead_reckon(ctx.T_m_c, ctx.t_ns)
@@ -138,21 +153,6 @@ class CameraState:
         self.leave_map()
         shift = self.covariance.correct_disparities(change)
         self.move_map(se3.orthonormalise(se3.exp(shift) @ self.pose.T_m_c))
-
-    def images_measured_motion(self, found: Relocalisation) -> bool:
-        """True if a relocalisation tells the motion since the last frame, which was tracked, and no sensor does.
-
-        A flight that begins in motion, slow cameras: the prediction was a guess, and the odometry frame need not hold
-        it against the images.
-        """
-        return not (found.from_cache or self.motion.measures_motion) and found.submap == self.submaps.active
-
-    def move_to(self, found: Relocalisation, before_T_m_c: F64, ctx: FrameContext) -> None:
-        """The camera moved from where the last frame has it, (4,4), to where this one was relocalised."""
-        self.pose.T_m_c = before_T_m_c
-        self.set_measured(found.track, ctx.dt_s, repeated=ctx.repeated)
-        self._map.note_tracking(found.track.rows, found.track.inlier, ctx.number)
-        self.covariance.confirm_relocalisation()
 
     def return_to(self, found: Relocalisation, frame_number: int) -> None:
         """Continue in the submap in which the frame was relocalised."""
