@@ -16,6 +16,7 @@ import numpy as np
 from kiteline_agent.config import DisparityAlignmentConfig
 from kiteline_agent.local_map import disparity_kernels as kernels
 from kiteline_agent.local_map.local_map import LocalMap
+from kiteline_agent.local_map.offset_evidence import log_evidence, probability
 from kiteline_core.arrays import F64, I64
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.disparity_offset import GOOD_PX, TERMS, none, terms
@@ -260,9 +261,9 @@ class DisparityAlignment:
             self._prior = self._bent
         log_odds = self._prior_log_odds
         if self._earlier_h.any() and self._moves_sideways():
-            worn, usual = _log_evidence(h, b, self._prior), _log_evidence(h, b, good)
+            worn, usual = log_evidence(h, b, self._prior), log_evidence(h, b, good)
             unknown = np.logaddexp(log_odds + worn, usual) - np.logaddexp(log_odds, 0.0)
-            if unknown - _log_evidence(h, b, self._prior + self._earlier_h, self._earlier_b) > _REFUTED:
+            if unknown - log_evidence(h, b, self._prior + self._earlier_h, self._earlier_b) > _REFUTED:
                 self._earlier_h, self._earlier_b = np.zeros_like(self._earlier_h), none()
                 self._refuted, self.applied = True, False
                 self._events.append("disparities are not those of the rig file: estimated anew")
@@ -270,9 +271,9 @@ class DisparityAlignment:
         h, b = share * h + self._earlier_h, share * b + self._earlier_b
         self.cov = np.linalg.inv(h + self._prior)
         self._estimate = self.cov @ b
-        log_odds += _log_evidence(h, b, self._prior) - _log_evidence(h, b, good)
+        log_odds += log_evidence(h, b, self._prior) - log_evidence(h, b, good)
         self._log_odds = float(log_odds)
-        self.worn = _probability(self._log_odds)
+        self.worn = probability(self._log_odds)
         self._set_rig_worn()
 
     def _solve_good(self, h: F64, b: F64) -> None:
@@ -282,7 +283,7 @@ class DisparityAlignment:
         difference = cov @ beyond
         self._good_estimate = self.expected_px + difference
         is_larger = self._rms_px(np.outer(difference, difference)) > self._rms_px(cov)
-        is_likelier = bool(is_larger and _log_evidence(h, beyond, self._good) > 0.0)
+        is_likelier = bool(is_larger and log_evidence(h, beyond, self._good) > 0.0)
         # In forward motion, where little counts, a small offset stays below its deviation however often it was told.
         self._good_is_known = is_likelier or (self._keyframes >= _FORWARD_TOLD and not self._moves_sideways())
 
@@ -291,13 +292,13 @@ class DisparityAlignment:
         In forward motion, where disparities tell little, the rows of the right image count as well.
         """
         rows = 0.0 if self._moves_sideways() else self._row_evidence
-        if _probability(self._log_odds + rows) < _SURE:
+        if probability(self._log_odds + rows) < _SURE:
             return False
         share = self._own_share(_FORWARD_KEYFRAMES) * self._believed_share()
         h, b = self._sure()
         h, b = share * h + self._earlier_h, share * b + self._earlier_b
-        odds = self._prior_log_odds + _log_evidence(h, b, self._prior) - _log_evidence(h, b, self._good)
-        return _probability(odds + rows) >= _SURE
+        odds = self._prior_log_odds + log_evidence(h, b, self._prior) - log_evidence(h, b, self._good)
+        return probability(odds + rows) >= _SURE
 
     def _sure(self) -> tuple[F64, F64]:
         """Information (5,5) of all pairs and its side (5,), less of those whose landmarks fit badly."""
@@ -307,7 +308,7 @@ class DisparityAlignment:
     def _is_bent(self) -> bool:
         """True if an offset beyond wear is likelier: the mount was bent by up to a degree or two."""
         h, b = self._sure()
-        gain = _log_evidence(h, b, self._bent) - _log_evidence(h, b, self._prior)
+        gain = log_evidence(h, b, self._bent) - log_evidence(h, b, self._prior)
         return self._moves_sideways() and gain + _BENT_LOG_ODDS > 0.0
 
     def _own_share(self, most: int) -> float:
@@ -328,7 +329,7 @@ class DisparityAlignment:
         return not self._earlier_h.any() and self.sigma_px <= self._applied_sigma_px
 
     def _set_rig_worn(self) -> None:
-        self.rig_worn = _probability(self._log_odds + self._row_evidence)
+        self.rig_worn = probability(self._log_odds + self._row_evidence)
 
     def _moves_sideways(self) -> bool:
         """True if enough of the motion was across the optical axis: else errors of a lens pass for an offset."""
@@ -346,13 +347,17 @@ class DisparityAlignment:
         """Change the offset of the map's disparities, unless the base's estimate is more certain."""
         if self._base_sigma_px is not None and self._base_sigma_px <= self.sigma_px:
             return None
-        tells = self._moves_sideways() or _probability(self._prior_log_odds + self._row_evidence) >= _ROWS_SURE
+        tells = self._moves_sideways() or self._rows_are_worn()
         if (tells and self.applied) or ((tells or self._nothing_better_known()) and self._is_sure()):
             return self._apply_worn()
         # Forward motion hardly tells a worn rig from a good one: until then the good one's offset is the better guess.
         doubtful = self.rig_worn > 0.5 if tells else self._refuted
         worn = self.applied or self._earlier_h.any() or np.isfinite(self._base_sigma_px or np.inf)
         return None if worn or doubtful else self._apply_good()
+
+    def _rows_are_worn(self) -> bool:
+        """True if the rows of the right camera alone tell that the rig is worn."""
+        return probability(self._prior_log_odds + self._row_evidence) >= _ROWS_SURE
 
     def _apply_worn(self) -> F64 | None:
         """Set the offset of a rig that is sure to be worn."""
@@ -384,17 +389,3 @@ class DisparityAlignment:
             return None
         self._map.set_disparity_offset(offset)
         return np.asarray(change)
-
-
-def _probability(log_odds: float) -> float:
-    return 1.0 / (1.0 + math.exp(-min(max(log_odds, -50.0), 50.0)))
-
-
-def _log_evidence(h: F64, b: F64, prior: F64, side: F64 | None = None) -> float:
-    """Logarithm, up to a constant of the data, of the likelihood of data with information h (5,5) and its side b (5,).
-
-    prior: (5,5) information; side: (5,) of it, prior @ mean; None: about zero.
-    """
-    side = none() if side is None else side
-    fit = float((b + side) @ np.linalg.solve(h + prior, b + side) - side @ np.linalg.solve(prior, side))
-    return 0.5 * (fit + float(np.linalg.slogdet(prior)[1]) - float(np.linalg.slogdet(h + prior)[1]))
