@@ -20,12 +20,7 @@ _SURE_PX = 0.4  # px of the octave: deviation of the predicted disparity below w
 _COARSE = 3  # times fewer landmarks in the coarse pass than in the fine one
 _COARSEST = 2  # template level at which the coarse pass begins
 _MARGIN_PX = 8.0  # nearer to the border a template hangs over the edge
-_AXIS_STEPS = (
-    0.08,
-    0.16,
-    0.24,
-    0.32,
-)  # of the median depth: steps along the axis that are tried, 28 px of what is near
+_AXIS_STEPS = (0.08, 0.16, 0.24, 0.32)  # of the median depth: steps along the axis that are tried
 _COARSE_STEP_PX = 7.0  # px of the coarse level: half a template
 _ROUNDS = 3  # rounds of the pose optimisation: outliers are chosen anew after each
 
@@ -52,10 +47,13 @@ class Tracker:
     def track_along_axis(self, ctx: FrameContext, T_c_m: F64) -> Track:
         """The best track from poses ahead of T_c_m (4,4) and behind it, along the optical axis.
 
-        For the first step of a vehicle whose speed is unknown: no rotation of the image stands in for it.
+        For the first step of a vehicle whose speed is unknown: no rotation of the image stands in for it. Without a
+        landmark in view the track from T_c_m.
         """
-        depth_m = median(self._map.candidates(T_c_m, 0.0).depth)
-        tracks = []
+        depths_m = self._map.candidates(T_c_m, 0.0).depth
+        if not len(depths_m):
+            return self.track(ctx, T_c_m)
+        depth_m, tracks = median(depths_m), list[Track]()
         for share in _AXIS_STEPS:
             for sign in (1.0, -1.0):
                 ahead = T_c_m.copy()

@@ -1,6 +1,6 @@
 """The agent on recordings and on bad frames: it follows the truth, survives faults, and stays continuous."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -11,7 +11,10 @@ import pytest
 from kiteline_agent.agent import Agent
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.exchange.no_base import NoBaseChannel
+from kiteline_agent.mapping.track_stage import TrackStage
 from kiteline_agent.step import Estimate, Identity, StepInput
+from kiteline_agent.tracking.frame_context import FrameContext
+from kiteline_agent.tracking.track import Track
 from kiteline_core.arrays import F64
 from kiteline_core.frame import Frame, ImuBatch, joined
 from kiteline_core.geometry import se3
@@ -45,15 +48,25 @@ def first_frames(source: FrameSource, n: int) -> list[Frame | ImuBatch]:
     return items
 
 
-def step_errors_m(source: FrameSource, estimates: list[Estimate]) -> F64:
+def map_pose(estimate: Estimate) -> F64 | None:
+    return estimate.T_m_b
+
+
+def odometry_pose(estimate: Estimate) -> F64 | None:
+    return estimate.T_o_b
+
+
+def step_errors_m(
+    source: FrameSource, estimates: list[Estimate], pose: Callable[[Estimate], F64 | None] = map_pose
+) -> F64:
     """Error of the motion between frames that have a true pose at their time."""
     truth = source.ground_truth
     at = {int(t): T for t, T in zip(truth.t_ns, truth.T_w_b)}
-    known = [e for e in estimates if e.t_ns in at and e.T_m_b is not None]
+    known = [(e.t_ns, T) for e in estimates if e.t_ns in at and (T := pose(e)) is not None]
     errors = []
-    for a, b in pairwise(known):
-        true = se3.inverse(at[a.t_ns]) @ at[b.t_ns]
-        errors.append(np.linalg.norm((se3.inverse(true) @ se3.inverse(a.T_m_b) @ b.T_m_b)[:3, 3]))
+    for (t_a, a), (t_b, b) in pairwise(known):
+        true = se3.inverse(at[t_a]) @ at[t_b]
+        errors.append(np.linalg.norm((se3.inverse(true) @ se3.inverse(a) @ b)[:3, 3]))
     return np.array(errors)
 
 
@@ -72,15 +85,6 @@ def every(items: list[Frame | ImuBatch], step: int) -> list[Frame | ImuBatch]:
             waiting = []
         number += 1
     return out
-
-
-def odometry_errors_m(source: FrameSource, estimates: list[Estimate]) -> F64:
-    """Error of the motion of T_o_b between frames, m."""
-    truth = source.ground_truth
-    at = {int(t): T for t, T in zip(truth.t_ns, truth.T_w_b)}
-    steps = [(a, b) for a, b in pairwise(estimates) if a.t_ns in at and b.t_ns in at]
-    return np.array([np.linalg.norm((se3.inverse(a.T_o_b) @ b.T_o_b - se3.inverse(at[a.t_ns]) @ at[b.t_ns])[:3, 3])
-                     for a, b in steps])  # fmt: skip
 
 
 @pytest.mark.parametrize("with_imu", [True, False])
@@ -106,7 +110,23 @@ def test_a_street_is_followed_from_the_first_frame_on_by_slow_cameras(data_dir: 
     source = open_source(str(data_dir / "kitti_straight"))
     estimates = fly(source, every(first_frames(source, 7 * step), step))
     assert all(e.tracked for e in estimates) and len({e.submap for e in estimates}) == 1
-    assert odometry_errors_m(source, estimates).max() < 0.1
+    assert step_errors_m(source, estimates, odometry_pose).max() < 0.1
+
+
+def test_steps_along_the_axis_are_tried_without_a_landmark_in_view(
+    data_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found, track = list[Track](), TrackStage.track
+
+    def looking_back(stage: TrackStage, ctx: FrameContext, *, was_lost: bool) -> Track | None:
+        turned = se3.from_rt(se3.so3_exp(np.array([0.0, np.pi, 0.0])), np.zeros(3)) @ ctx.T_c_m
+        found.append(stage._tracker.track_along_axis(ctx, turned))
+        return track(stage, ctx, was_lost=was_lost)
+
+    monkeypatch.setattr(TrackStage, "track", looking_back)
+    source = open_source(str(data_dir / "kitti_straight"))
+    fly(source, first_frames(source, 2))
+    assert [each.inliers for each in found] == [0]
 
 
 def test_the_odometry_follows_what_slow_cameras_measure(data_dir: Path) -> None:
@@ -114,7 +134,7 @@ def test_the_odometry_follows_what_slow_cameras_measure(data_dir: Path) -> None:
     source = open_source(str(data_dir / "room_flight.mcap"), imu=False)
     estimates = fly(source, every(first_frames(source, 300), 4))
     assert all(e.tracked for e in estimates) and len({e.submap for e in estimates}) == 1
-    assert odometry_errors_m(source, estimates).max() < 0.02
+    assert step_errors_m(source, estimates, odometry_pose).max() < 0.02
 
 
 @pytest.mark.parametrize("with_imu", [True, False])
