@@ -85,7 +85,7 @@ class PoseCovariance:
         self._T_o_m_before: dict[SubmapId, F64] = {}  # of submaps that were left, while all motion since was measured
         self._has_imu_motion = False  # an IMU measures all motion
         self._metric = has_depth
-        self._far_relocalisation = False  # the last relocalisation is far from the predicted pose
+        self.far_relocalisation = False  # the last one is far from the predicted pose
         self._doubtful_s = 0.0  # for which such a relocalisation still has low quality
         self._imu_offset = np.zeros(6)  # mean offset of fused poses from those of images, on the left of T_c_m
         self._imu_offset_cov = np.zeros((6, 6))  # its covariance
@@ -360,7 +360,7 @@ class PoseCovariance:
         T_o_m = pose.T_o_m if submap == active else self._T_o_m_before.get(submap)
         if T_o_m is None or not (self._has_imu_motion or (relocalised and self._metric)):
             return True
-        self._far_relocalisation = False
+        self.far_relocalisation = False
         here, there = pose.T_o_m @ predicted_T_m_c, T_o_m @ se3.inverse(T_c_m)
         away_m = float(np.abs(there[:3, 3] - here[:3, 3]).sum())
         turned = 0.5 * (3.0 - float(np.vdot(here[:3, :3], there[:3, :3])))  # 1 - cos
@@ -374,12 +374,12 @@ class PoseCovariance:
         apart = math.sqrt(float(e @ np.linalg.solve(cov, e)))
         if self._has_imu_motion:
             return apart < _SURPRISE
-        self._far_relocalisation = apart >= _FAR_DEVIATIONS
+        self.far_relocalisation = apart >= _FAR_DEVIATIONS
         return apart < _SURPRISE_UNMEASURED
 
     def confirm_relocalisation(self) -> None:
         """Accept the last consistent relocalisation; if it is far from the prediction, its quality is low at first."""
-        self._doubtful_s = _LOW_QUALITY_S if self._far_relocalisation else 0.0
+        self._doubtful_s = _LOW_QUALITY_S if self.far_relocalisation else 0.0
 
     def quality(self, cov: F64, inliers: int | None) -> int:
         """Probability in percent, at least 1, that a pose of covariance cov (6,6) is good, as configured.

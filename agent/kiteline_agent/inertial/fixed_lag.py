@@ -159,11 +159,11 @@ class FixedLagSmoother:
         """Drop all states."""
         self._n = 0
 
-    def predict(self, samples: Samples) -> tuple[F64, F64]:
-        """Predict pose (4,4) and velocity (3,) after the samples, which begin at the newest state."""
+    def predict(self, samples: Samples) -> F64:
+        """Predict the pose (4,4) after the samples, which begin at the newest state."""
         state = self.state
         motion = self._integrated(samples, state.bias)
-        return motion.propagate(state.T_m_b, state.velocity, state.bias, self.gravity)
+        return motion.propagate(state.T_m_b, state.velocity, state.bias, self.gravity)[0]
 
     def _integrated(self, samples: Samples, bias: F64) -> Preintegrated:
         """The samples preintegrated; cached, as a frame's prediction and its update need the same ones."""

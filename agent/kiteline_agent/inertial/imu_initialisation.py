@@ -93,7 +93,7 @@ class ImuInitialiser:
         """Replace every pose T_m_b by function(T_m_b)."""
         self._poses = [replace(p, T_m_b=function(p.T_m_b)) for p in self._poses]
 
-    def velocity(self) -> F64:
+    def _velocity(self) -> F64:
         """Velocity (3,) m/s between the last two poses; zero with fewer."""
         if len(self._poses) < 2:
             return np.zeros(3)
@@ -153,7 +153,7 @@ class ImuInitialiser:
         if found is None or found.residual_m > _MAX_RESIDUAL_M or found.gravity_error > _MAX_GRAVITY_ERROR:
             return False
         bias[3:] = found.accel_bias
-        velocity = found.velocities[-1] if last.awaited is None else self.velocity()
+        velocity = found.velocities[-1] if last.awaited is None else self._velocity()
         smoother.start(last.T_m_b, velocity, bias, found.gravity, StartDeviations())
         return True
 

@@ -21,14 +21,6 @@ _PRIOR_SIGMA = np.repeat([0.005, 0.1], 3)  # rad/s, m/s^2: of biases of earlier 
 
 
 @dataclass(frozen=True, slots=True)
-class Prediction:
-    """T_m_b: (4,4) predicted. velocity: (3,) m/s in m."""
-
-    T_m_b: F64
-    velocity: F64
-
-
-@dataclass(frozen=True, slots=True)
 class InertialMotion:
     """The body at an instant after the last frame.
 
@@ -139,21 +131,20 @@ class InertialTracker:
 
     # per frame
 
-    def predict(self, imu: ImuBatch | None, t_ns: int) -> Prediction | None:
-        """Buffer samples and predict the body at t_ns; None without samples or a previous pose."""
+    def predict(self, imu: ImuBatch | None, t_ns: int) -> F64 | None:
+        """Buffer samples and predict T_m_b (4,4) at t_ns; None without samples, or while the velocity is unknown."""
         self._buffer.push(imu)
         samples = self._interval(t_ns)
-        if self._last is None or samples is None or self.self_calibration.awaits_search:
+        if samples is None or self.self_calibration.awaits_search or not self._smoother.running:
             return None
-        last_ns, last_T_m_b = self._last
-        if self._smoother.running:
-            T_m_b, velocity = self._smoother.predict(samples)
-            return Prediction(T_m_b, velocity)
-        motion, velocity = preintegrate(samples, self._bias, self._calibration), self._initialiser.velocity()
-        T = last_T_m_b.copy()
-        T[:3, 3] += velocity * (t_ns - last_ns) * 1e-9
-        T[:3, :3] = T[:3, :3] @ motion.turn
-        return Prediction(T, velocity)
+        return self._smoother.predict(samples)
+
+    def turn(self, t_ns: int) -> F64 | None:
+        """Rotation (3,3) R_b0_b1 of the body from the last frame to t_ns, by the gyro; None without samples."""
+        samples = self._interval(t_ns)
+        if samples is None or self.self_calibration.awaits_search:
+            return None
+        return preintegrate(samples, self._bias, self._calibration).turn
 
     def extrapolate(self, imu: ImuBatch | None, t_ns: int) -> InertialMotion | None:
         """The body at t_ns, after the last frame, by the samples so far and `imu`. The state stays as it is.
@@ -230,6 +221,8 @@ class InertialTracker:
             state = self._advance(samples, None, velocity)
         if state is None:
             self._smoother.stop()
+            if self._last is not None:
+                self._set_last(t_ns, self._last[1])
             return None
         self._set_last(t_ns, state.T_m_b)
         return state

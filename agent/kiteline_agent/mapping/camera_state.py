@@ -84,7 +84,12 @@ class CameraState:
         return fused, self.motion.take_events()
 
     def resume_after_loss(self, ctx: FrameContext, track: Track) -> None:
-        """Tracked again after a loss: the map moves by the error of the prediction, the odometry frame stays."""
+        """Tracked again after a loss: the map moves by the error of the prediction, the odometry frame stays.
+
+        If the prediction was a guess, images have measured the motion over the loss, and nothing moves.
+        """
+        if self.pose.is_guess:
+            return
         self.pose.T_m_c = ctx.T_m_c
         self.leave_map()
         self.pose.move_map(track.T_m_c)
@@ -97,24 +102,27 @@ class CameraState:
         self.reference.set_camera(self.pose.T_m_c)
 
     def images_measured_motion(self, found: Relocalisation) -> bool:
-        """True if a relocalisation tells the motion since the last frame, which was tracked, and no sensor does.
+        """True if a relocalisation tells the motion since images were lost, and no sensor does.
 
-        A flight that begins in motion, slow cameras: the prediction was a guess, and the odometry frame need not hold
-        it against the images.
+        A flight that begins in motion, slow cameras, images without content: the prediction was a guess, and the
+        odometry frame need not hold it against the images. A place that a vehicle hardly reaches may be a wrong one.
         """
-        return not (found.from_cache or self.motion.measures_motion) and found.submap == self.submaps.active
+        near = found.submap == self.submaps.active and not self.covariance.far_relocalisation
+        return self.pose.is_guess and near and not found.from_cache
 
-    def move_to(self, found: Relocalisation, before_T_m_c: F64, ctx: FrameContext) -> None:
-        """The camera moved from where the last frame has it, (4,4), to where this one was relocalised."""
-        self.pose.T_m_c = before_T_m_c
-        self.set_measured(found.track, ctx.dt_s, repeated=ctx.repeated)
+    def move_to(self, found: Relocalisation, ctx: FrameContext) -> None:
+        """The camera moved from where images last measured it to where this frame was relocalised."""
+        self.set_measured(found.track, 0.0, repeated=ctx.repeated)
         self._map.note_tracking(found.track.rows, found.track.inlier, ctx.number)
         self.covariance.confirm_relocalisation()
 
     def dead_reckon(self, ctx: FrameContext) -> bool:
         """Take over the predicted pose of a frame without a measured one. True while IMU or odometer can be trusted."""
         reckoned = self.motion.dead_reckon(ctx.T_m_c, ctx.t_ns)
-        self.pose.T_m_c = reckoned.T_m_c
+        if reckoned.cov is None:
+            self.pose.guess(reckoned.T_m_c, ctx.dt_s)
+        else:
+            self.pose.reckon(reckoned.T_m_c)
         self.reference.set_camera(self.pose.T_m_c)
         self.covariance.dead_reckon(ctx.dt_s, reckoned.cov, moves=self.pose.moves)
         return reckoned.trusted

@@ -47,10 +47,9 @@ class LossStage:
         """A frame was tracked."""
         self.failed_searches = 0
 
-    def handle(self, ctx: FrameContext, *, stuck: bool, was_lost: bool) -> FrameOutcome:
-        """Place a frame that was not tracked. stuck: its image is an old one. was_lost: nor was the frame before."""
+    def handle(self, ctx: FrameContext, *, stuck: bool) -> FrameOutcome:
+        """Place a frame that was not tracked. stuck: its image is an old one."""
         events: list[str] = []
-        before = None if was_lost else self._camera.pose.T_m_c
         # a. Dead reckoning places the camera, and extends the map while its covariance is small.
         bridged = self._camera.dead_reckon(ctx)
         if stuck:
@@ -61,7 +60,7 @@ class LossStage:
                 return FrameOutcome(True, True, 0, events)
         # b. Relocalise in the stored submaps.
         submap, T_o_m = self._camera.submaps.active, self._camera.pose.T_o_m
-        track, more = self._relocalise(ctx, before)
+        track, more = self._relocalise(ctx)
         events += more
         placed = track is not None
         T_o_n = None
@@ -89,11 +88,8 @@ class LossStage:
         self._camera.motion.restart(ctx.t_ns)
         return ctx, FrameOutcome(submap.placed, False, 0, submap.events + warnings)
 
-    def _relocalise(self, ctx: FrameContext, before: F64 | None) -> tuple[Track | None, list[str]]:
-        """Search the stored submaps; if the frame is found, continue there, with a keyframe. And events.
-
-        before: T_m_c (4,4) of the last frame, if that was tracked.
-        """
+    def _relocalise(self, ctx: FrameContext) -> tuple[Track | None, list[str]]:
+        """Search the stored submaps; if the frame is found, continue there, with a keyframe. And events."""
         camera = self._camera
         if not camera.submaps.any:
             return None, []
@@ -104,8 +100,8 @@ class LossStage:
         if found is None:
             self.failed_searches += self._relocaliser.has_texture
             return None, []
-        if before is not None and camera.images_measured_motion(found):
-            camera.move_to(found, before, ctx)
+        if camera.images_measured_motion(found):
+            camera.move_to(found, ctx)
         else:
             camera.return_to(found, ctx.number)
             camera.pose.reset_motion()

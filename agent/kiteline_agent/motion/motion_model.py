@@ -116,12 +116,18 @@ class MotionModel:
         self.odometer.add(odometry)
 
     def predict(self, t_ns: int, imu: ImuBatch | None, dt_s: float) -> F64:
-        """Predict T_m_c (4,4) of a frame from the IMU, else the odometer, else constant velocity."""
+        """Predict T_m_c (4,4) of a frame from the IMU, else the odometer, else constant velocity.
+
+        A gyro alone tells the rotation.
+        """
         if self.tracker is not None:
             self._events += self._watch.frame(t_ns, imu)
-        inertial = None if self.tracker is None else self.tracker.predict(imu, t_ns)
-        if inertial is not None:
-            return se3.orthonormalise(inertial.T_m_b @ self._T_b_c)
+            T_m_b = self.tracker.predict(imu, t_ns)
+            if T_m_b is not None:
+                return se3.orthonormalise(T_m_b @ self._T_b_c)
+            turn = self.tracker.turn(t_ns)
+            if turn is not None:
+                return self._pose.predict_turned(dt_s, self._T_c_b[:3, :3] @ turn @ self._T_b_c[:3, :3])
         predicted = self.odometer.predict(self._pose.T_m_c, t_ns)
         return self._pose.predict(dt_s) if predicted is None else predicted
 

@@ -12,7 +12,7 @@ class PoseState:
     """Camera pose and velocity. Whatever moves the map leaves the odometry frame still.
 
     T_m_c: (4,4) camera in the active submap. T_o_m: (4,4) submap in the odometry frame. velocity: (3,) m/s in m.
-    moves: True if the velocity was measured.
+    moves: True if the velocity was measured. Between frames that are measured, poses may be guessed.
     """
 
     def __init__(self) -> None:
@@ -22,6 +22,12 @@ class PoseState:
         self.moves = False
         self._step_T: F64 = np.eye(4)  # T_c0_c1 of the last frame
         self._step_s: float | None = None  # duration of that motion; None: not known
+        self._guessed: tuple[F64, float] | None = None  # last measured T_m_c (4,4), s since then; None: T_m_c is it
+
+    @property
+    def is_guess(self) -> bool:
+        """True if neither images nor a sensor have told the motion since a measured pose in this submap."""
+        return self._guessed is not None
 
     @property
     def T_c_m(self) -> F64:
@@ -35,13 +41,31 @@ class PoseState:
             step = se3.exp(dt_s / self._step_s * se3.log(step))
         return se3.orthonormalise(self.T_m_c @ step)
 
+    def predict_turned(self, dt_s: float, R_c0_c1: F64) -> F64:
+        """T_m_c (4,4) after dt_s at constant velocity and a rotation that is known."""
+        R_m_c = self.T_m_c[:3, :3] @ R_c0_c1
+        return se3.orthonormalise(se3.from_rt(R_m_c, self.T_m_c[:3, 3] + dt_s * self.velocity))
+
     def twist(self, dt_s: float) -> F64:
         """Twist (6,) [m/s, rad/s] of the camera in its own axes, by which it moves in dt_s at constant velocity."""
         return np.asarray(se3.log(se3.inverse(self.T_m_c) @ self.predict(dt_s)) / dt_s)
 
+    def guess(self, T_m_c: F64, dt_s: float) -> None:
+        """Set a pose (4,4) that nothing measured. dt_s: since the last one."""
+        measured_T_m_c, since_s = self._guessed or (self.T_m_c, 0.0)
+        self.T_m_c, self._guessed = T_m_c, (measured_T_m_c, since_s + dt_s)
+
+    def reckon(self, T_m_c: F64) -> None:
+        """Set a pose (4,4) by a sensor other than the camera."""
+        self.T_m_c, self._guessed = T_m_c, None
+
     def measured(self, T_m_c: F64, dt_s: float, *, repeated: bool = False) -> None:
-        """Set a measured pose (4,4). dt_s: since the last one. repeated: from an old image, no motion is derived."""
-        before, self.T_m_c = self.T_m_c, T_m_c
+        """Set a measured pose (4,4). dt_s: since the last one. repeated: from an old image, no motion is derived.
+
+        The motion is that since the last pose that was measured, too.
+        """
+        before, since_s = self._guessed or (self.T_m_c, 0.0)
+        self.T_m_c, self._guessed, dt_s = T_m_c, None, since_s + dt_s
         if repeated:
             return
         self._step_T = se3.orthonormalise(se3.inverse(before) @ T_m_c)
@@ -53,6 +77,7 @@ class PoseState:
     def reset_motion(self) -> None:
         """Forget the motion: the next prediction is the present pose."""
         self._step_T, self.velocity, self.moves = np.eye(4), np.zeros(3), False
+        self._guessed = None
 
     def set_motion(self, step_T: F64, velocity: F64) -> None:
         """Set the motion. step_T: (4,4) T_c0_c1 a frame. velocity: (3,) m/s in m."""
@@ -62,6 +87,9 @@ class PoseState:
         """The map moved under the camera: set its pose in m to T_m_c (4,4), keep that in o."""
         T_o_c = self.T_o_m @ self.T_m_c
         change = T_m_c[:3, :3] @ self.T_m_c[:3, :3].T
+        if self._guessed is not None:
+            measured_T_m_c, since_s = self._guessed
+            self._guessed = se3.orthonormalise(T_m_c @ self.T_c_m @ measured_T_m_c), since_s
         self.velocity = change @ self.velocity
         self.T_m_c = se3.orthonormalise(T_m_c)
         self.T_o_m = se3.orthonormalise(T_o_c @ se3.inverse(self.T_m_c))
@@ -69,7 +97,7 @@ class PoseState:
     def enter_submap(self) -> None:
         """Begin a new submap here; its axes are those of the odometry frame."""
         self.T_m_c = self.T_o_m @ self.T_m_c
-        self.T_o_m = np.eye(4)
+        self.T_o_m, self._guessed = np.eye(4), None
 
     def rescale(self, metres: float) -> F64:
         """Begin a submap in metres here. metres: one unit of the old submap. Returns T_new_old (4,4), lengths in m."""

@@ -193,6 +193,8 @@ class ControllerSession:
         if self._past and pose.t_ns <= self._past[-1].t_ns:
             self.counters.stale += 1
             return None
+        if pose.tracked and self._past and not self._past[-1].tracked:  # what was guessed tells no velocity
+            self._past = deque(p for p in self._past if p.tracked)
         has_earlier = self._has_earlier_pose(pose.t_ns)
         self._past.append(pose)
         if not has_earlier and pose.velocity is None:

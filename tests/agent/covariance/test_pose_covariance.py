@@ -273,7 +273,7 @@ def test_the_kernel_of_poses_composes_as_written() -> None:
 def test_low_quality_after_a_far_relocalisation_lasts_as_long_at_any_frame_rate(rate_hz: float) -> None:
     local_map, covariance = begun()
     track = tracked_at(local_map, np.eye(4))
-    covariance._far_relocalisation = True
+    covariance.far_relocalisation = True
     covariance.confirm_relocalisation()
     frames, sure = 0, 1e-8 * np.eye(6)
     while covariance.quality(sure, 100) < LOST_BELOW and frames < 100:

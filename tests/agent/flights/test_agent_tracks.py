@@ -138,6 +138,25 @@ def test_the_odometry_follows_what_slow_cameras_measure(data_dir: Path) -> None:
 
 
 @pytest.mark.parametrize("with_imu", [True, False])
+def test_the_odometry_follows_what_is_measured_over_frames_without_an_image(data_dir: Path, with_imu: bool) -> None:
+    """At 1.3 m/s and before an IMU is of use: one frame, and three. What stands there meanwhile is a good guess."""
+    source = open_source(str(data_dir / "room_flight.mcap"), imu=with_imu)
+    items, k, lost = [], 0, (6, 9, 10, 11)
+    for item in first_frames(source, 118):
+        if isinstance(item, Frame):
+            k += 1
+            blank = k - 101 in lost
+            item = replace(item, left=np.full_like(item.left, 90), right=np.full_like(item.left, 90)) if blank else item
+        if k > 100:
+            items.append(item)
+    estimates = fly(source, items)
+    assert [k for k, e in enumerate(estimates) if not e.tracked] == [*lost]
+    tracked = [e for e in estimates if e.tracked]
+    assert step_errors_m(source, tracked, odometry_pose).max() < 0.004
+    assert step_errors_m(source, estimates, odometry_pose).max() < 0.03
+
+
+@pytest.mark.parametrize("with_imu", [True, False])
 def test_frames_without_their_right_image_are_tracked(data_dir: Path, with_imu: bool) -> None:
     """Three of ten are lost, and all for one second."""
     source = open_source(str(data_dir / "room_flight.mcap"), imu=with_imu)

@@ -96,6 +96,20 @@ def test_an_untracked_pose_is_marked_and_ardupilot_drops_it() -> None:
     assert ardupilot.dropped == {"quality below VISO_QUAL_MIN": 1}
 
 
+def test_poses_that_were_guessed_tell_no_velocity() -> None:
+    """Found again a metre beside where it was guessed to be: a velocity of the path that was seen, not of the step."""
+    controller, stream = FlightController("px4"), ControllerSession(mounting("flu"))
+    fly(stream, controller, 1.0, 30.0)
+    for k in range(30, 40):
+        pose = circling(k * S // 30, tracked=k >= 33)
+        if not pose.tracked:
+            pose.T_o_b[:2, 3] += 1.0
+        for message in stream.step(pose, pose.t_ns):
+            controller.receive(message, pose.t_ns)
+        speed = np.linalg.norm(controller.accepted[-1].velocity_m_s)
+        assert k < 33 or abs(speed - np.hypot(2.0, 0.5)) < 0.05
+
+
 def test_reset_counter_follows_the_epoch_alone() -> None:
     controller, stream = FlightController("ardupilot"), ControllerSession(mounting("flu"))
     for i in range(60):
