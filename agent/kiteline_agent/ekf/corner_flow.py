@@ -5,20 +5,19 @@ for motion. So each corner is aligned with the image in which it was found, warp
 filter knows it, by its distance.
 """
 
-import cv2
 import numpy as np
 
 from kiteline_agent.config import AlignConfig
 from kiteline_agent.ekf_config import EkfConfig
-from kiteline_agent.imaging import alignment_kernels, features
+from kiteline_agent.imaging import alignment_kernels, features, optical_flow
 from kiteline_agent.imaging.alignment_kernels import ALIGN_ITERATIONS, MIN_NCC, TEMPLATE, TEMPLATE_LEVELS
 from kiteline_agent.imaging.features import DetectorConfig, Pyramid
+from kiteline_agent.imaging.optical_flow import Flow
 from kiteline_agent.tracking.frame_images import NO_GRID
 from kiteline_core.arrays import F64, I64, U8, Bool
 from kiteline_core.geometry.cameras import RectifiedCamera
 
-_BORDER_PX = 8.0  # a window of the flow and its gradients lie inside
-_WINDOW_PX = 21  # px of the flow's window
+_FLOW = Flow(window_px=21)
 _SLIDE_PX = 3.0  # px of its octave between the flow and a corner's template at most
 _REPLENISH = 0.75  # share of the option `corners` below which new ones are searched
 
@@ -43,12 +42,8 @@ class CornerFlow:
     def follow(self, left: Pyramid) -> None:
         """Follow the corners into a frame by optical flow."""
         if self._last is not None and len(self.ids):
-            size = {"winSize": (_WINDOW_PX, _WINDOW_PX), "maxLevel": 3}
-            found, ok, _ = cv2.calcOpticalFlowPyrLK(self._last[0], left[0], self.uv.astype(np.float32), None, **size)  # type: ignore[call-overload]
-            limit = np.array([left[0].shape[1], left[0].shape[0]]) - _BORDER_PX
-            inside = (found >= _BORDER_PX).all(axis=1) & (found < limit).all(axis=1)
-            self.uv = found.astype(np.float64)
-            self._keep((ok.ravel() == 1) & inside)
+            self.uv, found = optical_flow.follow(self._last[0], left[0], self.uv, _FLOW)
+            self._keep(found)
         self._last = left
 
     def align(self, left: Pyramid, T_o_c: F64, depth_m: F64) -> None:

@@ -2,20 +2,19 @@
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from kiteline_agent.imaging import features
 from kiteline_agent.imaging.features import DetectorConfig, Pyramid
+from kiteline_agent.imaging.optical_flow import BlankImages, Flow, follow
 from kiteline_agent.inertial_start_config import CornerTracksConfig
 from kiteline_core.arrays import F64, I64, U8, Bool
 from kiteline_core.geometry.cameras import RectifiedCamera
 
 _LEVELS, _NEAR_LEVELS = 3, 1  # of the flow above the finest one; where a corner is known to be near
-_BORDER_PX = 8.0  # a window of the flow and its gradients lie inside
 _REPLENISH = 0.85  # share of the corners below which a keyframe adds new ones
-_WINDOW_PX = 15  # px; window of the optical flow: the smallest that keeps hold of corners
-_BACKWARD_PX = 0.5  # px between a corner and its image followed back
+_FLOW = Flow(window_px=15, return_px=0.5)  # the smallest window that keeps hold of corners
+_MOST_BLANK = 4  # frames in a row that show nothing and are left out: flow hardly reaches farther
 _DRIFT_PX = 2.0  # px between flow over frames and flow from the last keyframe
 KEYFRAME_S = 0.24  # s between two keyframes: short enough for flow, long enough for parallax
 _THINNED_S = 0.6  # s; longest time between two keyframes after one was left out
@@ -48,7 +47,10 @@ class CornerObservations:
 
 
 class CornerTracks:
-    """Follows corners from keyframe to keyframe. Frames between tell where to look or, with little CPU, the gyro."""
+    """Follows corners from keyframe to keyframe. Frames between tell where to look or, with little CPU, the gyro.
+
+    An image that shows hardly any of the corners is left out, so that it does not cut all tracks in two.
+    """
 
     def __init__(self, camera: RectifiedCamera, detector: DetectorConfig, config: CornerTracksConfig) -> None:
         self._camera = camera
@@ -65,20 +67,27 @@ class CornerTracks:
         self._uv = np.zeros((0, 2))  # in the last keyframe
         self._last: U8 | None = None  # frame into which they were followed, and where they are there
         self._last_uv = np.zeros((0, 2))
+        self._blank, self._blank_keyframes = BlankImages(_MOST_BLANK), BlankImages(1)
 
     def is_due(self, t_ns: int) -> bool:
         """True if a frame is to become a keyframe."""
         return not self.keyframes or (t_ns - self.keyframes[-1].t_ns) * 1e-9 >= KEYFRAME_S
 
-    def follow(self, left: Pyramid) -> None:
-        """Follow the corners into the frame after the one before; the next keyframe looks for them where they are."""
+    def follow(self, left: Pyramid) -> bool:
+        """Follow the corners into the frame after the one before; the next keyframe looks for them where they are.
+
+        False if the image is left out.
+        """
         if self._last is not None and len(self._last_uv):
-            uv, good = self._followed(self._last, left[0], self._last_uv, None, _LEVELS)
+            uv, good = follow(self._last, left[0], self._last_uv, _FLOW, _LEVELS)
+            if self._blank.leaves_out(good):
+                return False
             self._last_uv, self._uv, self._ids = uv[good], self._uv[good], self._ids[good]
         self._last = left[0]
+        return True
 
-    def add(self, t_ns: int, left: Pyramid, turn: F64 | None = None) -> None:
-        """Follow the corners from the last keyframe into a new one, and find more.
+    def add(self, t_ns: int, left: Pyramid, turn: F64 | None = None) -> bool:
+        """Follow the corners from the last keyframe into a new one, and find more. False if the image is left out.
 
         turn: (3,3) rotation of this camera in that of the last keyframe; None: unknown. It counts if the corners were
         not followed into this frame.
@@ -86,15 +95,18 @@ class CornerTracks:
         if self.keyframes and len(self._uv):
             before, near = self.keyframes[-1].left[0], self._last is left[0]
             if near:
-                uv, good = self._followed(before, left[0], self._uv, self._last_uv, _NEAR_LEVELS)
+                uv, good = follow(before, left[0], self._uv, _FLOW, _NEAR_LEVELS, self._last_uv)
                 good &= np.linalg.norm(uv - self._last_uv, axis=1) < _DRIFT_PX
             else:
                 guess = None if turn is None else self._turned(turn)
-                uv, good = self._followed(before, left[0], self._uv, guess, _LEVELS)
+                uv, good = follow(before, left[0], self._uv, _FLOW, _LEVELS, guess)
+                if self._blank_keyframes.leaves_out(good):
+                    return False
             self._uv, self._ids = uv[good], self._ids[good]
         self._replenish(left)
         self._last_uv = self._uv
         self.keyframes.append(TrackedKeyframe(t_ns, left, self._ids.copy(), self._uv.copy()))
+        return True
 
     def drop_before(self, t_ns: int) -> None:
         """Forget keyframes that are older than this; of too many, the oldest that lie close to their neighbours."""
@@ -126,19 +138,6 @@ class CornerTracks:
         length = seen.sum(axis=0)
         order = np.argsort(-length, kind="stable")
         return CornerObservations(xy, seen, ids).part(order[length[order] >= 3])
-
-    def _followed(self, before: U8, after: U8, uv: F64, guess: F64 | None, levels: int) -> tuple[F64, Bool]:
-        """Pixels (n,2) of corners in the next image, and which of them are found, forward and backward."""
-        size = {"winSize": (_WINDOW_PX, _WINDOW_PX), "maxLevel": levels}
-        flags = 0 if guess is None else cv2.OPTFLOW_USE_INITIAL_FLOW
-        start = uv.astype(np.float32)
-        there = None if guess is None else guess.astype(np.float32)
-        found, ok, _ = cv2.calcOpticalFlowPyrLK(before, after, start, there, flags=flags, **size)  # type: ignore[call-overload]
-        back, ok_back, _ = cv2.calcOpticalFlowPyrLK(after, before, found, start.copy(), flags=flags, **size)  # type: ignore[call-overload]
-        limit = np.array([after.shape[1], after.shape[0]]) - _BORDER_PX
-        inside = (found >= _BORDER_PX).all(axis=1) & (found < limit).all(axis=1)
-        same = np.linalg.norm(back - start, axis=1) < _BACKWARD_PX
-        return found.astype(np.float64), (ok.ravel() == 1) & (ok_back.ravel() == 1) & inside & same
 
     def _turned(self, turn: F64) -> F64:
         """Pixels (n,2) of the corners after a rotation of the camera alone."""

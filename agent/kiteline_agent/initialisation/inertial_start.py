@@ -160,16 +160,15 @@ class InertialStart:
         prior: biases of earlier tracking. offset_s: frame stamp + offset = IMU time.
         """
         every = self._config.governor.cpu_percent <= 0.0  # else the frames between keyframes do not come here
-        if every:
-            self._work.followed += 1
-            self._tracks.follow(ctx.images.left)
-        if self._tracks.is_due(ctx.t_ns):
+        self._work.followed += int(every)
+        shows = not every or self._tracks.follow(ctx.images.left)
+        if shows and self._tracks.is_due(ctx.t_ns):
             self._work.followed += 1
             turn = None if every else self._turn(ctx.t_ns, prior, offset_s)
-            self._tracks.add(ctx.t_ns, ctx.images.left, turn)
-            self._bound_window(ctx.t_ns)
-            if self._attempt is None:
-                self._attempt = self._begin(ctx, prior, offset_s)
+            if self._tracks.add(ctx.t_ns, ctx.images.left, turn):
+                self._bound_window(ctx.t_ns)
+                if self._attempt is None:
+                    self._attempt = self._begin(ctx, prior, offset_s)
         return self.go_on()
 
     def go_on(self) -> InertialMap | None:

@@ -5,13 +5,13 @@ The scale is free: the median depth of the first landmarks is set to a conventio
 
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.governor.cost_model import Work
 from kiteline_agent.imaging import alignment_kernels, features
 from kiteline_agent.imaging.alignment_kernels import ALIGN_ITERATIONS, FINE_STEP_PX, MIN_NCC
+from kiteline_agent.imaging.optical_flow import BlankImages, Flow, follow
 from kiteline_agent.initialisation.two_view import MIN_POINTS, two_view
 from kiteline_agent.keyframes.depth_from_motion import triangulated_sigma
 from kiteline_agent.keyframes.new_landmarks import NewPoints
@@ -24,10 +24,9 @@ from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import KeyframeId
 from kiteline_core.order_statistics import median
 
-_MAX_RETURN_PX = 1.0  # px between a corner and where it lies when it is followed back
-_MARGIN_PX = 4.0  # px to the border, within which the flow's window hangs over it
 _CORNERS = 400  # corners followed from the first frame; half of them are lost or have no parallax
-_WINDOW_PX = 15  # px; window of the optical flow: the smallest that keeps hold of corners
+_FLOW = Flow(window_px=15, border_px=4.0, return_px=1.0)  # the smallest window that keeps hold of corners
+_MOST_BLANK = 4  # images in a row that show nothing and are left out: flow hardly reaches farther
 _MIN_SHARE = 0.4  # of the first corners; with fewer left a new first frame is taken
 _MAX_S = 1.98  # s after which a new first frame is taken: the view has changed too much
 
@@ -72,6 +71,7 @@ class TwoViewStart:
         self._first_t_ns = 0
         self._frames = 0
         self._last: U8 = np.zeros((0, 0), np.uint8)
+        self._blank = BlankImages(_MOST_BLANK)
         self._uv0 = np.zeros((0, 2))
         self._octave = np.zeros(0, np.uint8)
         self._templates = np.zeros((0, 3, alignment_kernels.TEMPLATE, alignment_kernels.TEMPLATE), np.uint8)
@@ -100,8 +100,9 @@ class TwoViewStart:
         if self._first is None:
             self._begin(ctx)
             return None
-        self._follow(ctx.images)
         self._frames += 1
+        if not self._follow(ctx.images):
+            return None
         flow = np.linalg.norm(self._uv - self._uv0, axis=1)
         start = None
         if len(flow) >= MIN_POINTS and np.median(flow) > config.min_flow * self._camera.fx:
@@ -124,21 +125,16 @@ class TwoViewStart:
         self._index = np.arange(len(corners.uv))
         alignment_kernels.cut_templates(images.aligned, corners.uv, corners.octave, self._templates)
 
-    def _follow(self, images: FrameImages) -> None:
-        """Follow the corners by pyramidal optical flow from the last frame, checked backwards."""
-        image, window = images.left[0], _WINDOW_PX
+    def _follow(self, images: FrameImages) -> bool:
+        """Follow the corners from the last frame that showed them. False if this one does not."""
         if len(self._uv):
-            before = self._uv.astype(np.float32)
-            size = {"winSize": (window, window), "maxLevel": 3}
-            after, ok, _ = cv2.calcOpticalFlowPyrLK(self._last, image, before, None, **size)  # type: ignore[call-overload]
-            back, ok_back, _ = cv2.calcOpticalFlowPyrLK(image, self._last, after, None, **size)  # type: ignore[call-overload]
-            same = np.linalg.norm(back - before, axis=1) < _MAX_RETURN_PX
-            most = np.array([image.shape[1], image.shape[0]]) - _MARGIN_PX
-            inside = (after >= _MARGIN_PX).all(axis=1) & (after < most).all(axis=1)
-            keep = (ok.ravel() == 1) & (ok_back.ravel() == 1) & same & inside
-            self._uv, self._uv0 = after[keep].astype(np.float64), self._uv0[keep]
+            after, keep = follow(self._last, images.left[0], self._uv, _FLOW)
+            if self._blank.leaves_out(keep):
+                return False
+            self._uv, self._uv0 = after[keep], self._uv0[keep]
             self._octave, self._index = self._octave[keep], self._index[keep]
-        self._last = image
+        self._last = images.left[0]
+        return True
 
     def _reconstruct(self, first: FrameImages, images: FrameImages) -> TwoViewMap | None:
         """Align the corners with their templates, and solve for motion and depth."""

@@ -15,6 +15,7 @@ Fault = Callable[[Recording], Recording]
 
 _WALL_GREY, _BLACK_GREY = 120.0, 6.0
 _NOISE_GREY = 1.3  # deviation of a camera's noise
+_LEFT = 3  # frames with which a flight begins in any case
 
 
 # changes of one frame
@@ -67,6 +68,22 @@ def changed(recording: Recording, begin: int, end: int, change: Change) -> Recor
     items = list(recording.items)
     for k in range(begin, min(end, len(items))):
         items[k] = replace(items[k], frame=change(items[k].frame))
+    return replace(recording, items=tuple(items))
+
+
+def some(recording: Recording, share: float, change: Change, seed: int) -> Recording:
+    """Change a share of all frames, drawn by chance; the first three are left."""
+    chosen = np.random.default_rng(seed).random(len(recording.items)) < share
+    items = [replace(item, frame=change(item.frame)) if chosen[k] and k >= _LEFT else item
+             for k, item in enumerate(recording.items)]  # fmt: skip
+    return replace(recording, items=tuple(items))
+
+
+def flickering(recording: Recording, deviation: float, seed: int) -> Recording:
+    """Multiply each image by a factor of its own; deviation: of its natural logarithm. Bright parts are clipped."""
+    factors = np.exp(np.random.default_rng(seed).normal(0.0, deviation, len(recording.items)))
+    items = [replace(item, frame=gain(float(factor))(item.frame))
+             for item, factor in zip(recording.items, factors, strict=True)]  # fmt: skip
     return replace(recording, items=tuple(items))
 
 

@@ -129,6 +129,18 @@ def test_standing_and_turning_begin_nothing() -> None:
             assert start.add(context(k, view)) is None
 
 
+def test_images_that_show_nothing_hardly_delay_a_start() -> None:
+    def frames_until_a_map(blank: tuple[int, ...]) -> int:
+        start = TwoViewStart(Rectifier(RIG).camera, AgentConfig(), Work())
+        for k in range(3, 30):
+            left = np.full_like(frame(k).left, 90) if k in blank else frame(k).left
+            if start.add(context(k, FrameImages(build_pyramid(left, 4), None, None))) is not None:
+                return k
+        raise AssertionError("no map")
+
+    assert frames_until_a_map((5, 7)) <= frames_until_a_map(()) + 1
+
+
 def test_a_second_start_takes_on_the_scale_of_the_first() -> None:
     start = TwoViewStart(Rectifier(RIG).camera, AgentConfig(), Work())
     start.note_depths(np.array([6.0, 7.0, 9.0]))

@@ -37,11 +37,12 @@ class Tracks:
     def is_due(self, _t_ns: int) -> bool:
         return True
 
-    def follow(self, _left: object) -> None:
-        pass
+    def follow(self, _left: object) -> bool:
+        return True
 
-    def add(self, t_ns: int, _left: object, _turn: object) -> None:
+    def add(self, t_ns: int, _left: object, _turn: object) -> bool:
         self.keyframes.append(SimpleNamespace(t_ns=t_ns))
+        return True
 
     def drop_before(self, t_ns: int) -> None:
         pass
@@ -156,8 +157,8 @@ def test_a_window_begins_after_the_samples_that_are_missing(monkeypatch: pytest.
     start = InertialStart(CAMERA, CALIBRATION, AgentConfig(), Work())
     monkeypatch.setattr(start._tracks, "flow_px", lambda: 100.0)
     monkeypatch.setattr(start._tracks, "is_due", lambda _t_ns: True)
-    monkeypatch.setattr(start._tracks, "add", lambda *_: None)
-    monkeypatch.setattr(start._tracks, "follow", lambda _left: None)
+    monkeypatch.setattr(start._tracks, "add", lambda *_: True)
+    monkeypatch.setattr(start._tracks, "follow", lambda _left: True)
     start._tracks.keyframes = [SimpleNamespace(t_ns=250_000_000 * k) for k in range(20)]  # type: ignore[misc]
     t_ns = np.arange(1_100_000_000, 4_800_000_000, 5_000_000)
     ctx: Any = SimpleNamespace(
@@ -186,8 +187,8 @@ def test_of_a_long_rest_a_window_holds_the_end(monkeypatch: pytest.MonkeyPatch, 
     )
     monkeypatch.setattr(start._tracks, "flow_px", lambda: flow_px)
     monkeypatch.setattr(start._tracks, "is_due", lambda _t_ns: True)
-    monkeypatch.setattr(start._tracks, "add", lambda *_: None)
-    monkeypatch.setattr(start._tracks, "follow", lambda _left: None)
+    monkeypatch.setattr(start._tracks, "add", lambda *_: True)
+    monkeypatch.setattr(start._tracks, "follow", lambda _left: True)
     monkeypatch.setattr(start, "_attempting", lambda *_: None)
     monkeypatch.setattr(start, "_intervals", lambda *_: None)
     start._tracks.keyframes = [SimpleNamespace(t_ns=250_000_000 * k) for k in range(77)]  # type: ignore[misc]
@@ -237,8 +238,8 @@ def test_corners_are_followed_over_a_turn_that_the_gyro_tells() -> None:
     def followed(told: F64 | None) -> int:
         tracks = CornerTracks(CAMERA, config.detector, config.inertial_start.corner_tracks)
         tracks.add(0, build_pyramid(image, 4))
-        tracks.add(SECOND // 4, build_pyramid(np.asarray(turned, np.uint8), 4), told)
-        return len(np.intersect1d(tracks.keyframes[0].ids, tracks.keyframes[1].ids))
+        added = tracks.add(SECOND // 4, build_pyramid(np.asarray(turned, np.uint8), 4), told)
+        return added and len(np.intersect1d(tracks.keyframes[0].ids, tracks.keyframes[1].ids))
 
     assert followed(turn) > 80 and followed(None) < 40
 
@@ -254,10 +255,29 @@ def test_frames_between_keyframes_tell_where_corners_went() -> None:
             if frame_by_frame:
                 tracks.follow(frame)
             if k in (0, len(frames) - 1):
-                tracks.add(k * SECOND // 20, frame)
-        return len(np.intersect1d(tracks.keyframes[0].ids, tracks.keyframes[1].ids))
+                added = tracks.add(k * SECOND // 20, frame)
+        return added and len(np.intersect1d(tracks.keyframes[0].ids, tracks.keyframes[1].ids))
 
     assert followed(frame_by_frame=True) > 80 and followed(frame_by_frame=False) < 40
+
+
+@pytest.mark.parametrize("frame_by_frame", [True, False])
+def test_tracks_go_on_over_images_that_show_nothing(frame_by_frame: bool) -> None:
+    """One between two keyframes, and one that was to be a keyframe; if that lasts, what is there is taken."""
+    config, rng = AgentConfig(), np.random.default_rng(4)
+    scene = cv2.GaussianBlur(rng.normal(128.0, 80.0, (480, 852)), (0, 0), 2.0).clip(0.0, 255.0).astype(np.uint8)
+    blank = rng.normal(120.0, 1.3, (480, 752)).clip(0.0, 255.0).astype(np.uint8)
+    tracks = CornerTracks(CAMERA, config.detector, config.inertial_start.corner_tracks)
+
+    def show(k: int, *, nothing: bool) -> bool:
+        image = build_pyramid(blank if nothing else np.ascontiguousarray(scene[:, 4 * k : 752 + 4 * k]), 4)
+        shows = not frame_by_frame or tracks.follow(image)
+        return shows and tracks.is_due(k * SECOND // 20) and tracks.add(k * SECOND // 20, image)
+
+    assert [k for k in range(8) if show(k, nothing=k in (3, 5))] == [0, 6]
+    assert len(np.intersect1d(tracks.keyframes[0].ids, tracks.keyframes[1].ids)) > 80
+    due = 12  # four images are left out; without the frames between one, at 0.24 s after frame 6
+    assert next(k for k in range(8, 25) if show(k, nothing=True)) == due
 
 
 def test_frames_that_wait_are_some_time_apart_and_lose_no_samples() -> None:

@@ -90,8 +90,8 @@ def odometry_follows_map(estimates: Sequence[Estimate]) -> bool:
     last = next((e for e in reversed(estimates[:-1]) if e.tracked), None)
     if last is None or last.T_m_b is None or end.T_m_b is None or last.submap != end.submap:
         return False
-    steps = [se3.inverse(a) @ b for a, b in ((last.T_o_b, end.T_o_b), (last.T_m_b, end.T_m_b))]
-    return bool(np.allclose(*steps, atol=1e-6))
+    in_o, in_m = se3.inverse(last.T_o_b) @ end.T_o_b, se3.inverse(last.T_m_b) @ end.T_m_b
+    return bool(np.allclose(in_o, in_m, atol=1e-6))
 
 
 def wall(like: Frame, level: float, frames: int) -> list[Frame]:
