@@ -44,6 +44,7 @@ _MIN_DEPTH_M = 0.1  # m of a landmark in the newest camera
 _MIN_SPAN_S = 2.4  # s before which a window tells no scale
 _MAX_SPAN_S = 24.0  # s; longest window: older keyframes are dropped
 _REST_S = 4.0  # s of a rest before the flight that a window holds: enough for the biases
+_MAX_GAP_S = 0.5  # s without samples: a longer gap ends a window; in a shorter one images tell what is missing
 _ATTEMPT_S = 0.45  # s between two solutions: each costs as much as some frames
 _ATTEMPT_SHARE = 0.09  # of the window's length between two solutions: long windows cost more
 _LANDMARKS_EACH = 70  # in each keyframe: in fast turns no track is long
@@ -108,7 +109,7 @@ class InertialStart:
         detector = replace(config.detector, cell_px=start.corner_tracks.cell_px, max_corners=corner_tracks.CORNERS)
         self._tracks = CornerTracks(camera, detector, start.corner_tracks)
         self.waiting = WaitingFrames(corner_tracks.KEYFRAME_S)
-        self._buffer = SampleBuffer(_MAX_SPAN_S + 1.0, config.inertial.max_gap_s)
+        self._buffer = SampleBuffer(_MAX_SPAN_S + 1.0, _MAX_GAP_S)
         self._before: SolvedWindow | None = None
         self._noise: WindowNoise | None = None  # as the windows so far show it
         self._vibration: Vibration | None = None  # of the newest window

@@ -26,8 +26,7 @@ class InertialTerms:
         config: InertialBundleConfig, noise: WindowNoise,
     ) -> None:  # fmt: skip
         """intervals: K - 1."""
-        # The measured noise is not used: much of it is fast motion, which averages out over an interval.
-        self.intervals = [replace(s, density=None) for s in intervals]
+        self.intervals = _without_measured_noise(intervals)
         self._calibration = replace(
             calibration,
             gyro_noise=noise.gyro * config.imu_inflation * calibration.gyro_noise,
@@ -192,3 +191,15 @@ class InertialTerms:
         h[rows, rows] += info
         b[rows] += info * (np.concatenate([state.gyro_bias, state.accel_bias[0]]) - self._prior.bias)
         return self._prior_cost(state)
+
+
+def _without_measured_noise(intervals: list[Samples]) -> list[Samples]:
+    """Samples with the calibrated noise, and more only in steps that miss samples or are clipped.
+
+    Much of the measured noise is fast motion, which averages out over an interval.
+    """
+    measured = [s.density for s in intervals if s.density is not None]
+    if len(measured) < len(intervals):
+        return [replace(s, density=None) for s in intervals]
+    usual = np.concatenate(measured).min(axis=0)
+    return [replace(s, density=np.where(d > usual, d, 0.0)) for s, d in zip(intervals, measured, strict=True)]

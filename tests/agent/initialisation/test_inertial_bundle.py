@@ -16,7 +16,7 @@ from kiteline_agent.initialisation.lens_correction import TERMS, moved
 from kiteline_agent.initialisation.window_kernels import add_observations
 from kiteline_agent.initialisation.window_noise import NoiseEvidence, WindowNoise
 from kiteline_core.arrays import F64, Bool
-from kiteline_core.frame import ImuCalibration
+from kiteline_core.frame import ImuBatch, ImuCalibration
 from kiteline_core.geometry import se3
 from kiteline_hw.sim.sensors import imu as sim_imu
 from kiteline_hw.sim.world.built_in_paths import built_in_path
@@ -30,17 +30,19 @@ CALIBRATION = ImuCalibration()
 
 
 def window(
-    seed: int, keyframes: int = 13, haste: float = 0.4, noise_px: float = 0.5, still: bool = False
-) -> tuple[CornerObservations, list[Samples], F64]:
-    """Corners, samples and true poses T_w_b (K,4,4) of keyframes 0.25 s apart."""
+    seed: int, keyframes: int = 13, haste: float = 0.4, noise_px: float = 0.5, still: bool = False,
+    lost_s: tuple[float, float] = (0.0, 0.0),
+) -> tuple[CornerObservations, list[Samples], F64]:  # fmt: skip
+    """Corners, samples and true poses T_w_b (K,4,4) of keyframes 0.25 s apart. lost_s: between these are no samples."""
     rng = np.random.default_rng(seed)
     path = built_in_path("room", 12.0 / haste, T_B_C, seed)
     path = Path(path.coefficients, path.knot_s * haste, path.length_s * haste, 0.7, 8.0 if still else 0.0)
     t_ns = 500_000_000 + 250_000_000 * np.arange(keyframes, dtype=np.int64)
     imu_t = np.arange(0, int(t_ns[-1]) + 10_000_000, 5_000_000, dtype=np.int64)
     samples = sim_imu.measure(path, imu_t, 0, CALIBRATION, seed)
-    buffer = SampleBuffer(100.0, 0.05)
-    buffer.push(samples)
+    here = (imu_t * 1e-9 < lost_s[0]) | (imu_t * 1e-9 >= lost_s[1])
+    buffer = SampleBuffer(100.0, 0.5)
+    buffer.push(ImuBatch(samples.t_ns[here], samples.gyro[here], samples.accel[here]))
     truth = path.motion(t_ns * 1e-9).T_w_b
     cloud = truth[:, :3, 3].mean(axis=0) + rng.uniform(-5.0, 5.0, (400, 3))
     xy, seen = np.zeros((keyframes, len(cloud), 2)), np.zeros((keyframes, len(cloud)), np.bool_)
@@ -150,6 +152,17 @@ def test_a_noisier_model_of_the_imu_knows_the_scale_less_well() -> None:
     sigma = [s.scale_sigma for s in found if s is not None]
     assert len(sigma) == 3 and sigma[0] < sigma[1] < sigma[2]
     assert all(s is not None and s.converged for s in found)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_samples_that_are_missing_count_as_missing(seed: int) -> None:
+    corners, samples, truth = window(seed, lost_s=(2.1, 2.5))
+    found = bundle(corners, samples).solve()
+    assert found.fits and abs(np.log(scale_of(found, truth))) < max(4.0 * found.scale_sigma, 0.01)
+    whole = bundle(*window(seed)[:2]).solve()
+    assert whole.scale_sigma < found.scale_sigma < 2.0 * whole.scale_sigma
+    trusted = bundle(corners, [replace(s, density=None) for s in samples]).solve()
+    assert trusted.imu_chi2 > 3.0 * found.imu_chi2
 
 
 @pytest.mark.parametrize("factor", [1.0, 12.0])

@@ -169,9 +169,9 @@ def test_a_window_begins_after_the_samples_that_are_missing(monkeypatch: pytest.
     solved: list[int] = []
     monkeypatch.setattr(start, "_attempting", lambda _ctx, keyframes, *_: iter([solved.append(len(keyframes))]))
     start.add(ctx, None, 0.0)
-    assert [k.t_ns for k in start._tracks.keyframes] == [250_000_000 * k for k in range(4, 20)]  # 0.2 s are bridged
+    assert [k.t_ns for k in start._tracks.keyframes] == [250_000_000 * k for k in range(3, 20)]  # 0.5 s are bridged
     start.add(ctx, None, 0.0)
-    assert solved == [16]
+    assert solved == [17]
 
 
 @pytest.mark.parametrize(("flow_px", "kept"), [(0.2, 17), (8.0, 77)])
