@@ -195,7 +195,7 @@ class Agent:
         track = self._track.track(ctx, was_lost=was_lost) if has_map and not stuck else None
         if track is None:
             # 4. Not tracked: dead reckoning, relocalisation, or a new submap.
-            outcome = self._loss.handle(ctx, stuck=stuck)
+            outcome = self._loss.handle(ctx, stuck=stuck, was_lost=was_lost)
             self._forget_scans(ctx, outcome)
         else:
             # 5. Fuse the pose with IMU and odometer.

@@ -194,23 +194,23 @@ class PoseCovariance:
         slot = self._map.slot_of(keyframe)
         self._noise_k[slot], self._shift_k[slot], self._refined[slot] = self._noise, self._shift, False
 
-    def dead_reckon(self, dt_s: float, sensor_cov: F64 | None, *, moves: bool = True) -> None:
+    def dead_reckon(self, dt_s: float, sensor_cov: F64 | None, over_s: float | None = 0.0) -> None:
         """Update after another dt_s without a pose from images.
 
         sensor_cov: (6,6) of the pose by IMU or odometer, [translation in m, rotation about the body's axes]; None if
-        no sensor measures the motion. moves: the velocity was known when images were lost.
+        no sensor measures the motion. over_s: s over which the velocity was measured; None: it is not known.
         """
         self._unmeasured_s = self._unmeasured_s or 0.0
         if sensor_cov is not None:
             self._reckoned = sensor_cov
             return
-        self._reckoned = self._reckoned + self.unmeasured_growth(dt_s, moves=moves)
+        self._reckoned = self._reckoned + self.unmeasured_growth(dt_s, over_s)
         self._unmeasured_s += dt_s
 
-    def unmeasured_growth(self, dt_s: float, *, moves: bool) -> F64:
+    def unmeasured_growth(self, dt_s: float, over_s: float | None) -> F64:
         """Covariance (6,6) that unknown accelerations add in dt_s without measured motion, from now on."""
         before_s = self._unmeasured_s or 0.0
-        return unmeasured_growth(self._config, before_s, before_s + dt_s, moves=moves)
+        return unmeasured_growth(self._config, before_s, before_s + dt_s, over_s)
 
     def dead_reckoning_within(self, m: float, rad: float) -> bool:
         """True if dead reckoning has a standard deviation up to m in any direction and rad about any axis."""

@@ -101,13 +101,14 @@ class CameraState:
         self.covariance.update(track, dt_s)
         self.reference.set_camera(self.pose.T_m_c)
 
-    def images_measured_motion(self, found: Relocalisation) -> bool:
+    def images_measured_motion(self, found: Relocalisation, *, was_lost: bool) -> bool:
         """True if a relocalisation tells the motion since images were lost, and no sensor does.
 
         A flight that begins in motion, slow cameras, images without content: the prediction was a guess, and the
-        odometry frame need not hold it against the images. A place that a vehicle hardly reaches may be a wrong one.
+        odometry frame need not hold it against the images. After some frames (was_lost: not the first one) a place
+        that a vehicle hardly reaches may be a wrong one.
         """
-        near = found.submap == self.submaps.active and not self.covariance.far_relocalisation
+        near = found.submap == self.submaps.active and not (was_lost and self.covariance.far_relocalisation)
         return self.pose.is_guess and near and not found.from_cache
 
     def move_to(self, found: Relocalisation, ctx: FrameContext) -> None:
@@ -124,7 +125,7 @@ class CameraState:
         else:
             self.pose.reckon(reckoned.T_m_c)
         self.reference.set_camera(self.pose.T_m_c)
-        self.covariance.dead_reckon(ctx.dt_s, reckoned.cov, moves=self.pose.moves)
+        self.covariance.dead_reckon(ctx.dt_s, reckoned.cov, self.pose.measured_over_s)
         return reckoned.trusted
 
     def align_gravity(self, t_ns: int) -> GravityAlignment | None:

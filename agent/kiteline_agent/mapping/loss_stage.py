@@ -47,8 +47,8 @@ class LossStage:
         """A frame was tracked."""
         self.failed_searches = 0
 
-    def handle(self, ctx: FrameContext, *, stuck: bool) -> FrameOutcome:
-        """Place a frame that was not tracked. stuck: its image is an old one."""
+    def handle(self, ctx: FrameContext, *, stuck: bool, was_lost: bool) -> FrameOutcome:
+        """Place a frame that was not tracked. stuck: its image is an old one. was_lost: nor was the frame before."""
         events: list[str] = []
         # a. Dead reckoning places the camera, and extends the map while its covariance is small.
         bridged = self._camera.dead_reckon(ctx)
@@ -60,7 +60,7 @@ class LossStage:
                 return FrameOutcome(True, True, 0, events)
         # b. Relocalise in the stored submaps.
         submap, T_o_m = self._camera.submaps.active, self._camera.pose.T_o_m
-        track, more = self._relocalise(ctx)
+        track, more = self._relocalise(ctx, was_lost=was_lost)
         events += more
         placed = track is not None
         T_o_n = None
@@ -88,7 +88,7 @@ class LossStage:
         self._camera.motion.restart(ctx.t_ns)
         return ctx, FrameOutcome(submap.placed, False, 0, submap.events + warnings)
 
-    def _relocalise(self, ctx: FrameContext) -> tuple[Track | None, list[str]]:
+    def _relocalise(self, ctx: FrameContext, *, was_lost: bool) -> tuple[Track | None, list[str]]:
         """Search the stored submaps; if the frame is found, continue there, with a keyframe. And events."""
         camera = self._camera
         if not camera.submaps.any:
@@ -100,7 +100,7 @@ class LossStage:
         if found is None:
             self.failed_searches += self._relocaliser.has_texture
             return None, []
-        if camera.images_measured_motion(found):
+        if camera.images_measured_motion(found, was_lost=was_lost):
             camera.move_to(found, ctx)
         else:
             camera.return_to(found, ctx.number)

@@ -96,7 +96,7 @@ class PoseReport:
         moved = camera.motion.extrapolate(t_ns, imu, dt_s)
         R_o_m, growth = camera.pose.T_o_m[:3, :3], moved.growth
         if growth is None:
-            growth = camera.covariance.unmeasured_growth(dt_s, moves=camera.pose.moves)
+            growth = camera.covariance.unmeasured_growth(dt_s, camera.pose.measured_over_s)
         turn = np.eye(6)
         turn[:3, :3] = R_o_m
         cov_o = last.cov_o + turn @ growth @ turn.T

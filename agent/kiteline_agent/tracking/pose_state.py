@@ -30,6 +30,11 @@ class PoseState:
         return self._guessed is not None
 
     @property
+    def measured_over_s(self) -> float | None:
+        """Time between the two poses that told the velocity; None if it is not known."""
+        return (self._step_s or 0.0) if self.moves else None
+
+    @property
     def T_c_m(self) -> F64:
         """(4,4) submap in the camera."""
         return se3.inverse(self.T_m_c)

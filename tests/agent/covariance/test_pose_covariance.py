@@ -201,15 +201,16 @@ def test_dead_reckoning_grows_uncertain_and_the_odometry_keeps_it() -> None:
     assert after[0, 0] > before[0, 0]
 
 
-def test_dead_reckoning_from_an_unknown_speed_is_worse() -> None:
+def test_dead_reckoning_from_an_unknown_speed_is_worse_and_one_by_a_slow_camera_too() -> None:
     sigma = []
-    for moves in (True, False):
+    for over_s in (0.0, None, 0.4):
         _, covariance = begun(unknown_velocity_m_s=5.0, unknown_rate_rad_s=1.0)
         covariance.begin_submap(np.eye(4))
-        covariance.dead_reckon(0.3, None, moves=moves)
+        covariance.dead_reckon(0.3, None, over_s)
         sigma.append(np.sqrt(np.diag(covariance.of_poses(PoseState(), np.eye(4))[0])))
     np.testing.assert_allclose(sigma[0], np.repeat([0.03 * 0.3 + 0.09, 0.02 * 0.3 + 0.09], 3), rtol=1e-6)
     np.testing.assert_allclose(sigma[1], np.repeat([5.0 * 0.3 + 0.09, 1.0 * 0.3 + 0.09], 3), rtol=1e-6)
+    np.testing.assert_allclose(sigma[2], sigma[0] + 0.3 * 0.4, rtol=1e-6)  # of 2 m/s^2 since its middle
 
 
 @pytest.mark.parametrize(("option", "axis"), [("unmeasured_accel_m_s2", 0), ("unmeasured_turn_rad_s2", 3)])
