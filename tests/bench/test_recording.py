@@ -11,7 +11,16 @@ import pytest
 from kiteline_bench.agent.governor import governor_table
 from kiteline_bench.agent.governor_plot import plot_governor
 from kiteline_bench.harness import processes
-from kiteline_bench.harness.faults import CAMERA_FAULTS, black, camera_faults_of, changed, rearranged, wall
+from kiteline_bench.harness.faults import (
+    CAMERA_FAULTS,
+    black,
+    camera_faults_of,
+    changed,
+    flickering,
+    rearranged,
+    some,
+    wall,
+)
 from kiteline_bench.harness.limited_cpu import LimitedFlight, fly_limited
 from kiteline_bench.harness.recording import Recording, load
 from kiteline_bench.harness.result import busiest_window
@@ -150,6 +159,16 @@ def test_errors_of_a_flight_are_small_and_counted_from_its_start(flight: Recordi
     assert max(error.position_m for error in errors) < 0.05 and run.ate_m() < 0.01
     n = len(flight.items)
     assert run.drift_m(1, n) == pytest.approx(float(np.linalg.norm(errors[-1].odometry[:3])), abs=1e-6)
+
+
+def test_light_that_flickers_and_images_that_show_nothing_are_drawn_by_chance(flight: Recording) -> None:
+    drawn = some(flight, 0.5, wall, 1).items
+    blank = [not np.array_equal(a.frame.left, b.frame.left) for a, b in zip(drawn, flight.items)]
+    assert not any(blank[:3]) and 0.2 * len(blank) < sum(blank) < 0.8 * len(blank)
+    lit = flickering(flight, 0.25, 1)
+    ratios = [a.frame.left.mean() / b.frame.left.mean() for a, b in zip(lit.items, flight.items)]
+    assert 0.1 < np.std(np.log(ratios)) < 0.4
+    assert all(a.frame.right is not None and a.frame.t_ns == b.frame.t_ns for a, b in zip(lit.items, flight.items))
 
 
 def test_errors_are_counted_from_the_first_pose(flight: Recording) -> None:
