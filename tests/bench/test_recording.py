@@ -20,6 +20,7 @@ from kiteline_bench.harness.faults import (
     rearranged,
     some,
     wall,
+    without_samples,
 )
 from kiteline_bench.harness.limited_cpu import LimitedFlight, fly_limited
 from kiteline_bench.harness.recording import Recording, load
@@ -169,6 +170,17 @@ def test_light_that_flickers_and_images_that_show_nothing_are_drawn_by_chance(fl
     ratios = [a.frame.left.mean() / b.frame.left.mean() for a, b in zip(lit.items, flight.items)]
     assert 0.1 < np.std(np.log(ratios)) < 0.4
     assert all(a.frame.right is not None and a.frame.t_ns == b.frame.t_ns for a, b in zip(lit.items, flight.items))
+
+
+def test_samples_of_the_imu_are_left_out(flight: Recording) -> None:
+    def stamps(recording: Recording) -> np.ndarray:
+        return np.concatenate([item.imu.t_ns for item in recording.items if item.imu is not None])
+
+    left, everything = stamps(without_samples(flight, 0.5, 0.2)), stamps(flight)
+    gone = np.setdiff1d(everything, left)
+    assert len(left) + len(gone) == len(everything)
+    assert ((gone - everything[0]) * 1e-9 % 0.5 >= 0.3 - 1e-9).all() and 0.3 < len(gone) / len(everything) < 0.5
+    assert all(item.imu is None for item in without_samples(flight.without_imu(), 0.5, 0.2).items)
 
 
 def test_errors_are_counted_from_the_first_pose(flight: Recording) -> None:

@@ -357,10 +357,10 @@ class PoseCovariance:
         Without a sensor for the path, tests if a vehicle can fly there in the time. relocalised: the pose comes from
         relocalisation, not from tracking.
         """
+        self.far_relocalisation = False
         T_o_m = pose.T_o_m if submap == active else self._T_o_m_before.get(submap)
         if T_o_m is None or not (self._has_imu_motion or (relocalised and self._metric)):
             return True
-        self.far_relocalisation = False
         here, there = pose.T_o_m @ predicted_T_m_c, T_o_m @ se3.inverse(T_c_m)
         away_m = float(np.abs(there[:3, 3] - here[:3, 3]).sum())
         turned = 0.5 * (3.0 - float(np.vdot(here[:3, :3], there[:3, :3])))  # 1 - cos

@@ -9,10 +9,8 @@ from numpy.typing import NDArray
 from kiteline_core.arrays import F64, U8, Bool
 
 _LEAST_FOLLOWED = 0.08  # share of the corners that an image must show: fewer, and it is black, covered or damaged
-_SAME_LIGHT = (
-    1.1  # ratio of contrasts or means of two images beyond which light may have changed, which flow does not know
-)
-_LIGHT_STEP = 4  # px between the pixels that tell them
+_SAME_LIGHT = 1.1  # ratio of the contrasts or means of two images below which flow is as good as in equal light
+_LIGHT_STEP = 4  # px between the pixels whose contrast and mean are compared
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,15 +22,15 @@ class Flow:
     """
 
     window_px: int
-    border_px: float = 8.0  # a window of 15 px and its gradients lie inside
+    border_px: float = 8.0  # a window of 15 px lies inside
     return_px: float = np.inf
 
 
 class BlankImages:
     """Tells which images to leave out: those that show hardly any of the corners before, but not for ever."""
 
-    def __init__(self, most: int) -> None:
-        """most: in a row that are left out."""
+    def __init__(self, most: int = 4) -> None:
+        """most: in a row that are left out; flow hardly reaches over more than four frames."""
         self._most = most
         self._in_a_row = 0
 
@@ -50,7 +48,7 @@ def follow(before: U8, after: U8, uv: F64, flow: Flow, levels: int = 3, guess: F
     """
     found, good, error = _followed(before, after, uv, flow, levels, guess)
     lit = as_bright_as(before, after)
-    if lit is not after:  # another light, or another scene beside the same one: as the corners themselves look alike
+    if lit is not after:  # by exposure, or by what else the image shows: what makes the windows more alike is right
         other, good_there, error_there = _followed(before, lit, uv, flow, levels, guess)
         both = good & good_there
         likelier = error_there[both].sum() < error[both].sum() if both.any() else good_there.any()

@@ -14,7 +14,6 @@ from kiteline_core.geometry.cameras import RectifiedCamera
 _LEVELS, _NEAR_LEVELS = 3, 1  # of the flow above the finest one; where a corner is known to be near
 _REPLENISH = 0.85  # share of the corners below which a keyframe adds new ones
 _FLOW = Flow(window_px=15, return_px=0.5)  # the smallest window that keeps hold of corners
-_MOST_BLANK = 4  # frames in a row that show nothing and are left out: flow hardly reaches farther
 _DRIFT_PX = 2.0  # px between flow over frames and flow from the last keyframe
 KEYFRAME_S = 0.24  # s between two keyframes: short enough for flow, long enough for parallax
 _THINNED_S = 0.6  # s; longest time between two keyframes after one was left out
@@ -67,7 +66,7 @@ class CornerTracks:
         self._uv = np.zeros((0, 2))  # in the last keyframe
         self._last: U8 | None = None  # frame into which they were followed, and where they are there
         self._last_uv = np.zeros((0, 2))
-        self._blank, self._blank_keyframes = BlankImages(_MOST_BLANK), BlankImages(1)
+        self._blank, self._blank_keyframes = BlankImages(), BlankImages(1)
 
     def is_due(self, t_ns: int) -> bool:
         """True if a frame is to become a keyframe."""

@@ -10,7 +10,7 @@ from kiteline_agent.config import AgentConfig
 from kiteline_agent.governor.cost_model import Work
 from kiteline_agent.inertial.imu_watch import SILENT_S
 from kiteline_agent.inertial.preintegration import BiasPrior, Samples, preintegrate
-from kiteline_agent.inertial.sample_buffer import SampleBuffer
+from kiteline_agent.inertial.sample_buffer import SampleBuffer, without_held
 from kiteline_agent.initialisation import corner_tracks, lens_correction
 from kiteline_agent.initialisation.contradiction import ContradictionWatch, contradicts, exceeds_lens_errors
 from kiteline_agent.initialisation.corner_tracks import CornerObservations, CornerTracks, TrackedKeyframe
@@ -392,7 +392,8 @@ class InertialStart:
         found = [self._buffer.between(a.t_ns + offset_ns, b.t_ns + offset_ns) for a, b in pairwise(keyframes)]
         complete = [samples for samples in found if samples is not None]
         if len(complete) == len(found):
-            return complete
+            late = self._buffer.lacks(keyframes[-1].t_ns + offset_ns)
+            return [*complete[:-1], without_held(complete[-1])] if late else complete
         last_missing = max(k for k, samples in enumerate(found) if samples is None)
         self._tracks.drop_before(keyframes[last_missing + 1].t_ns)
         self._tried_ns = None

@@ -26,7 +26,6 @@ from kiteline_core.order_statistics import median
 
 _CORNERS = 400  # corners followed from the first frame; half of them are lost or have no parallax
 _FLOW = Flow(window_px=15, border_px=4.0, return_px=1.0)  # the smallest window that keeps hold of corners
-_MOST_BLANK = 4  # images in a row that show nothing and are left out: flow hardly reaches farther
 _MIN_SHARE = 0.4  # of the first corners; with fewer left a new first frame is taken
 _MAX_S = 1.98  # s after which a new first frame is taken: the view has changed too much
 
@@ -71,7 +70,7 @@ class TwoViewStart:
         self._first_t_ns = 0
         self._frames = 0
         self._last: U8 = np.zeros((0, 0), np.uint8)
-        self._blank = BlankImages(_MOST_BLANK)
+        self._blank = BlankImages()
         self._uv0 = np.zeros((0, 2))
         self._octave = np.zeros(0, np.uint8)
         self._templates = np.zeros((0, 3, alignment_kernels.TEMPLATE, alignment_kernels.TEMPLATE), np.uint8)

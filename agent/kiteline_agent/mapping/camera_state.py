@@ -113,6 +113,7 @@ class CameraState:
 
     def move_to(self, found: Relocalisation, ctx: FrameContext) -> None:
         """The camera moved from where images last measured it to where this frame was relocalised."""
+        self.reference.return_to(found.keyframe, found.track.inliers, ctx.number)
         self.set_measured(found.track, 0.0, repeated=ctx.repeated)
         self._map.note_tracking(found.track.rows, found.track.inlier, ctx.number)
         self.covariance.confirm_relocalisation()
@@ -123,7 +124,7 @@ class CameraState:
         if reckoned.cov is None:
             self.pose.guess(reckoned.T_m_c, ctx.dt_s)
         else:
-            self.pose.reckon(reckoned.T_m_c)
+            self.pose.reckon(reckoned.T_m_c, ctx.dt_s)
         self.reference.set_camera(self.pose.T_m_c)
         self.covariance.dead_reckon(ctx.dt_s, reckoned.cov, self.pose.measured_over_s)
         return reckoned.trusted

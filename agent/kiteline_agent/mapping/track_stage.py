@@ -41,7 +41,10 @@ class TrackStage:
             track = _better(track, self._tracker.track_along_axis(ctx, camera.pose.T_c_m))
         # d. From matched descriptors.
         if not track.holds(config) and track.inliers >= config.min_inliers and self._governor.may(Extra.SEARCH):
-            track = self._from_descriptors(ctx, track)
+            found = self._from_descriptors(ctx, track)
+            if found is not track and was_lost and camera.covariance.far_relocalisation:  # the loss stage decides
+                return None
+            track = found
         submap = camera.submaps.active
         if track.inliers < config.min_inliers or not camera.is_consistent(ctx, track.T_c_m, submap, relocalised=False):
             return None

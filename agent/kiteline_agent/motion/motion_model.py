@@ -120,15 +120,16 @@ class MotionModel:
 
         A gyro alone tells the rotation.
         """
+        turn = None
         if self.tracker is not None:
             self._events += self._watch.frame(t_ns, imu)
             T_m_b = self.tracker.predict(imu, t_ns)
             if T_m_b is not None:
                 return se3.orthonormalise(T_m_b @ self._T_b_c)
             turn = self.tracker.turn(t_ns)
-            if turn is not None:
-                return self._pose.predict_turned(dt_s, self._T_c_b[:3, :3] @ turn @ self._T_b_c[:3, :3])
         predicted = self.odometer.predict(self._pose.T_m_c, t_ns)
+        if predicted is None and turn is not None:
+            return self._pose.predict_turned(dt_s, self._T_c_b[:3, :3] @ turn @ self._T_b_c[:3, :3])
         return self._pose.predict(dt_s) if predicted is None else predicted
 
     def extrapolate(self, t_ns: int, imu: ImuBatch | None, dt_s: float) -> Extrapolation:

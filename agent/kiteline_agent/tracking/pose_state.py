@@ -5,6 +5,7 @@ import numpy as np
 from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
 
+_KNOWN_S, _KNOWN_TURN = 1.0, 0.1  # s without an image, and cosine of the rotation in it, whose mean motion still tells
 _EVEN_SPACING = 0.2  # relative; frame intervals that differ by less count as equal
 
 
@@ -22,12 +23,13 @@ class PoseState:
         self.moves = False
         self._step_T: F64 = np.eye(4)  # T_c0_c1 of the last frame
         self._step_s: float | None = None  # duration of that motion; None: not known
-        self._guessed: tuple[F64, float] | None = None  # last measured T_m_c (4,4), s since then; None: T_m_c is it
+        self._measured: tuple[F64, float] | None = None  # T_m_c (4,4) by the last new image, and s since; None: T_m_c
+        self._by_sensor = False  # since the last pose by images a sensor has told a part of the motion
 
     @property
     def is_guess(self) -> bool:
         """True if neither images nor a sensor have told the motion since a measured pose in this submap."""
-        return self._guessed is not None
+        return self._measured is not None
 
     @property
     def measured_over_s(self) -> float | None:
@@ -57,32 +59,45 @@ class PoseState:
 
     def guess(self, T_m_c: F64, dt_s: float) -> None:
         """Set a pose (4,4) that nothing measured. dt_s: since the last one."""
-        measured_T_m_c, since_s = self._guessed or (self.T_m_c, 0.0)
-        self.T_m_c, self._guessed = T_m_c, (measured_T_m_c, since_s + dt_s)
+        measured_T_m_c, since_s = self._measured or (self.T_m_c, 0.0)
+        self.T_m_c = T_m_c
+        if not self._by_sensor:
+            self._measured = measured_T_m_c, since_s + dt_s
 
-    def reckon(self, T_m_c: F64) -> None:
-        """Set a pose (4,4) by a sensor other than the camera."""
-        self.T_m_c, self._guessed = T_m_c, None
+    def reckon(self, T_m_c: F64, dt_s: float) -> None:
+        """Set a pose (4,4) by a sensor other than the camera. dt_s: since the last one."""
+        before, guessed = self.T_m_c, self.is_guess
+        self.T_m_c, self._measured, self._by_sensor = T_m_c, None, True
+        if not guessed:
+            self._set_step(before, dt_s)
 
     def measured(self, T_m_c: F64, dt_s: float, *, repeated: bool = False) -> None:
-        """Set a measured pose (4,4). dt_s: since the last one. repeated: from an old image, no motion is derived.
+        """Set a pose (4,4) by images. dt_s: since the last one. repeated: from an old image, no motion is derived.
 
-        The motion is that since the last pose that was measured, too.
+        The motion is that since the last pose by a new image.
         """
-        before, since_s = self._guessed or (self.T_m_c, 0.0)
-        self.T_m_c, self._guessed, dt_s = T_m_c, None, since_s + dt_s
-        if repeated:
-            return
-        self._step_T = se3.orthonormalise(se3.inverse(before) @ T_m_c)
+        before, since_s = self._measured or (self.T_m_c, 0.0)
+        since_s += dt_s
+        guessed, self._by_sensor, self.T_m_c = self.is_guess, False, T_m_c
+        self._measured = (T_m_c, since_s) if repeated else None
+        turned = 0.5 * (float(np.trace(before[:3, :3].T @ T_m_c[:3, :3])) - 1.0)  # cosine
+        if guessed and (since_s > _KNOWN_S or turned < _KNOWN_TURN):
+            self.reset_motion()
+        elif not repeated:
+            self._set_step(before, since_s)
+
+    def _set_step(self, before: F64, dt_s: float) -> None:
+        """Take the motion from a pose (4,4) to the present one, in dt_s, for that of the next frames."""
+        self._step_T = se3.orthonormalise(se3.inverse(before) @ self.T_m_c)
         self._step_s = dt_s if dt_s > 0.0 else None
         if dt_s > 0.0:
-            self.velocity = (T_m_c[:3, 3] - before[:3, 3]) / dt_s
+            self.velocity = (self.T_m_c[:3, 3] - before[:3, 3]) / dt_s
             self.moves = True
 
     def reset_motion(self) -> None:
         """Forget the motion: the next prediction is the present pose."""
         self._step_T, self.velocity, self.moves = np.eye(4), np.zeros(3), False
-        self._guessed = None
+        self._measured, self._by_sensor = None, False
 
     def set_motion(self, step_T: F64, velocity: F64) -> None:
         """Set the motion. step_T: (4,4) T_c0_c1 a frame. velocity: (3,) m/s in m."""
@@ -92,9 +107,9 @@ class PoseState:
         """The map moved under the camera: set its pose in m to T_m_c (4,4), keep that in o."""
         T_o_c = self.T_o_m @ self.T_m_c
         change = T_m_c[:3, :3] @ self.T_m_c[:3, :3].T
-        if self._guessed is not None:
-            measured_T_m_c, since_s = self._guessed
-            self._guessed = se3.orthonormalise(T_m_c @ self.T_c_m @ measured_T_m_c), since_s
+        if self._measured is not None:
+            measured_T_m_c, since_s = self._measured
+            self._measured = se3.orthonormalise(T_m_c @ self.T_c_m @ measured_T_m_c), since_s
         self.velocity = change @ self.velocity
         self.T_m_c = se3.orthonormalise(T_m_c)
         self.T_o_m = se3.orthonormalise(T_o_c @ se3.inverse(self.T_m_c))
@@ -102,7 +117,7 @@ class PoseState:
     def enter_submap(self) -> None:
         """Begin a new submap here; its axes are those of the odometry frame."""
         self.T_m_c = self.T_o_m @ self.T_m_c
-        self.T_o_m, self._guessed = np.eye(4), None
+        self.T_o_m, self._measured, self._by_sensor = np.eye(4), None, False
 
     def rescale(self, metres: float) -> F64:
         """Begin a submap in metres here. metres: one unit of the old submap. Returns T_new_old (4,4), lengths in m."""

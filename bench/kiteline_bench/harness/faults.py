@@ -15,7 +15,7 @@ Fault = Callable[[Recording], Recording]
 
 _WALL_GREY, _BLACK_GREY = 120.0, 6.0
 _NOISE_GREY = 1.3  # deviation of a camera's noise
-_LEFT = 3  # frames with which a flight begins in any case
+_FIRST_KEPT = 3  # first frames of a flight that no chance changes
 
 
 # changes of one frame
@@ -74,7 +74,7 @@ def changed(recording: Recording, begin: int, end: int, change: Change) -> Recor
 def some(recording: Recording, share: float, change: Change, seed: int) -> Recording:
     """Change a share of all frames, drawn by chance; the first three are left."""
     chosen = np.random.default_rng(seed).random(len(recording.items)) < share
-    items = [replace(item, frame=change(item.frame)) if chosen[k] and k >= _LEFT else item
+    items = [replace(item, frame=change(item.frame)) if chosen[k] and k >= _FIRST_KEPT else item
              for k, item in enumerate(recording.items)]  # fmt: skip
     return replace(recording, items=tuple(items))
 
@@ -85,6 +85,22 @@ def flickering(recording: Recording, deviation: float, seed: int) -> Recording:
     items = [replace(item, frame=gain(float(factor))(item.frame))
              for item, factor in zip(recording.items, factors, strict=True)]  # fmt: skip
     return replace(recording, items=tuple(items))
+
+
+def without_samples(recording: Recording, every_s: float, length_s: float) -> Recording:
+    """Leave out the inertial samples of the last `length_s` of every `every_s`."""
+    batches = [item.imu for item in recording.items if item.imu is not None]
+    if not batches:
+        return recording
+    begin_ns = int(batches[0].t_ns[0])
+
+    def kept(imu: ImuBatch | None) -> ImuBatch | None:
+        if imu is None:
+            return None
+        keep = (imu.t_ns - begin_ns) * 1e-9 % every_s < every_s - length_s
+        return ImuBatch(imu.t_ns[keep], imu.gyro[keep], imu.accel[keep]) if keep.any() else None
+
+    return replace(recording, items=tuple(replace(item, imu=kept(item.imu)) for item in recording.items))
 
 
 def stuck(recording: Recording, begin: int, end: int) -> Recording:

@@ -42,7 +42,7 @@ ARDUPILOT_PARAMETERS = {  # those of a vehicle that is set up well, with the com
 }  # fmt: skip
 PX4_PARAMETERS = {  # likewise, with the companion at MAVLink instance 1
     "EKF2_EN": 1, "EKF2_EV_CTRL": 15, "EKF2_HGT_REF": 3, "EKF2_EV_DELAY": 0.0, "EKF2_EV_POS_X": 0.0,
-    "EKF2_EV_POS_Y": 0.0, "EKF2_EV_POS_Z": 0.0, "EKF2_EV_NOISE_MD": 0, "EKF2_EV_QMIN": 0, "MAV_0_CONFIG": 101,
+    "EKF2_EV_POS_Y": 0.0, "EKF2_EV_POS_Z": 0.0, "EKF2_EV_NOISE_MD": 0, "EKF2_EV_QMIN": 1, "MAV_0_CONFIG": 101,
     "MAV_0_FORWARD": 0, "MAV_1_CONFIG": 102, "MAV_1_FORWARD": 0, "MAV_2_CONFIG": 0,
 }  # fmt: skip
 

@@ -238,8 +238,9 @@ def test_corners_are_followed_over_a_turn_that_the_gyro_tells() -> None:
     def followed(told: F64 | None) -> int:
         tracks = CornerTracks(CAMERA, config.detector, config.inertial_start.corner_tracks)
         tracks.add(0, build_pyramid(image, 4))
-        added = tracks.add(SECOND // 4, build_pyramid(np.asarray(turned, np.uint8), 4), told)
-        return added and len(np.intersect1d(tracks.keyframes[0].ids, tracks.keyframes[1].ids))
+        if not tracks.add(SECOND // 4, build_pyramid(np.asarray(turned, np.uint8), 4), told):
+            return 0  # it shows too few
+        return len(np.intersect1d(tracks.keyframes[0].ids, tracks.keyframes[1].ids))
 
     assert followed(turn) > 80 and followed(None) < 40
 
@@ -254,9 +255,9 @@ def test_frames_between_keyframes_tell_where_corners_went() -> None:
         for k, frame in enumerate(frames):
             if frame_by_frame:
                 tracks.follow(frame)
-            if k in (0, len(frames) - 1):
-                added = tracks.add(k * SECOND // 20, frame)
-        return added and len(np.intersect1d(tracks.keyframes[0].ids, tracks.keyframes[1].ids))
+            if k in (0, len(frames) - 1) and not tracks.add(k * SECOND // 20, frame):
+                return 0  # it shows too few
+        return len(np.intersect1d(tracks.keyframes[0].ids, tracks.keyframes[1].ids))
 
     assert followed(frame_by_frame=True) > 80 and followed(frame_by_frame=False) < 40
 

@@ -3,11 +3,14 @@
 import numpy as np
 import pytest
 
+from kiteline_agent.config import OdometerConfig
 from kiteline_agent.inertial.gravity_alignment import up_of
 from kiteline_agent.inertial.inertial_config import InertialConfig, StartDeviations
 from kiteline_agent.inertial.inertial_tracker import InertialTracker
 from kiteline_agent.motion.loss_motion import LossMotion, LossMotionEstimator, _largest
+from kiteline_agent.motion.motion_model import MotionModel
 from kiteline_agent.motion.recent_motion import RecentMotion
+from kiteline_agent.tracking.pose_state import PoseState
 from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuBatch, ImuCalibration
 from kiteline_core.geometry import se3
@@ -125,3 +128,27 @@ def test_a_loss_forgets_the_motion() -> None:
     for i in range(5):
         motion.add(i * 50 * MS, at(0.05 * i), measured=i != 3)
     assert motion.rates(210 * MS) is None
+
+
+@pytest.mark.parametrize("driven", [False, True])
+def test_without_a_known_velocity_an_odometer_predicts_else_the_camera_and_the_gyro(
+    monkeypatch: pytest.MonkeyPatch, driven: bool
+) -> None:
+    pose, by_odometer = PoseState(), se3.from_rt(np.eye(3), np.array([9.0, 0.0, 0.0]))
+    model = MotionModel(CAMERA, CALIBRATION, CONFIG, OdometerConfig(), pose, metric=True)
+    pose.measured(se3.from_rt(np.eye(3), VELOCITY * PERIOD_NS * 1e-9), PERIOD_NS * 1e-9)
+    assert model.tracker is not None
+    model.tracker.begin_map(0, pose.T_m_c)
+    monkeypatch.setattr(model.odometer, "predict", lambda *_: by_odometer if driven else None)
+    rate = np.array([0.0, 0.4, 0.0])
+    for k in (1, 2):  # the first of them has no pose by images
+        stamps = np.arange((k - 1) * PERIOD_NS, k * PERIOD_NS + 1, 5_000_000)[k > 1 :]
+        imu = ImuBatch(stamps, np.tile(rate, (len(stamps), 1)), np.tile(UP, (len(stamps), 1)))
+        predicted = model.predict(k * PERIOD_NS, imu, PERIOD_NS * 1e-9)
+        model.dead_reckon(predicted, k * PERIOD_NS)
+        pose.guess(predicted, PERIOD_NS * 1e-9)
+    if driven:
+        assert np.array_equal(predicted, by_odometer)
+    else:
+        np.testing.assert_allclose(predicted[:3, 3], 3.0 * VELOCITY * PERIOD_NS * 1e-9, atol=1e-9)
+        np.testing.assert_allclose(se3.so3_log(predicted[:3, :3]), 2.0 * rate * PERIOD_NS * 1e-9, atol=1e-6)

@@ -47,19 +47,50 @@ def test_a_map_that_moves_takes_the_last_measured_pose_along() -> None:
     assert apart(pose.predict(DT_S), MAP_MOTION @ STEP @ STEP @ STEP @ STEP) < 1e-9
 
 
-@pytest.mark.parametrize("event", ["a sensor tells", "a new submap", "the motion is forgotten"])
+@pytest.mark.parametrize("event", ["a new submap", "the motion is forgotten"])
 def test_nothing_is_measured_from_before(event: str) -> None:
     pose = moving()
     pose.guess(pose.predict(DT_S), DT_S)
-    if event == "a sensor tells":
-        pose.reckon(pose.predict(DT_S))
-    elif event == "a new submap":
+    if event == "a new submap":
         pose.enter_submap()
     else:
         pose.reset_motion()
     assert not pose.is_guess
     pose.measured(pose.T_m_c @ STEP, DT_S)
     assert apart(pose.predict(DT_S), pose.T_m_c @ STEP) < 1e-9
+
+
+@pytest.mark.parametrize("guessed_first", [False, True])
+def test_what_a_sensor_told_in_between_stays(guessed_first: bool) -> None:
+    """The sensor ends before the images come back; until then its velocity counts, not that of the last images."""
+    pose, slow = moving(), se3.exp(0.5 * se3.log(STEP))
+    if guessed_first:
+        pose.guess(pose.predict(DT_S), DT_S)
+    pose.reckon(pose.T_m_c @ slow, DT_S)
+    assert guessed_first or apart(pose.predict(DT_S), pose.T_m_c @ slow) < 1e-9
+    pose.guess(pose.predict(DT_S), DT_S)
+    assert not pose.is_guess
+    pose.measured(STEP, DT_S)
+    pose.guess(pose.predict(DT_S), DT_S)
+    assert pose.is_guess
+
+
+def test_the_mean_of_a_long_loss_tells_no_velocity() -> None:
+    for frames, step in ((25, STEP), (4, se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.5, 0.0])))):
+        pose = moving()
+        for _ in range(frames):
+            pose.guess(pose.predict(DT_S), DT_S)
+        there = se3.exp(frames * se3.log(step))
+        pose.measured(there, DT_S)
+        assert not pose.moves and pose.measured_over_s is None and apart(pose.predict(DT_S), there) < 1e-9
+
+
+def test_an_old_image_tells_no_motion_and_takes_its_time() -> None:
+    pose = moving()
+    pose.measured(STEP, DT_S, repeated=True)
+    assert apart(pose.predict(DT_S), STEP @ STEP) < 1e-9
+    pose.measured(STEP @ STEP @ STEP, DT_S)
+    assert apart(pose.predict(DT_S), STEP @ STEP @ STEP @ STEP) < 1e-9
 
 
 def test_a_gyro_turns_the_prediction_and_the_velocity_stays() -> None:

@@ -65,7 +65,8 @@ RULES: Mapping[int, tuple[Rule, ...]] = {
         Rule("EKF2_EV_POS_Y", _is(0), "0", "an offset is applied by the agent", needed=False),
         Rule("EKF2_EV_POS_Z", _is(0), "0", "an offset is applied by the agent", needed=False),
         Rule("EKF2_EV_NOISE_MD", _is(0), "0", "the covariances of the poses are not used", needed=False),
-        Rule("EKF2_EV_QMIN", lambda v: v <= 50, "at most 50", "good poses are dropped too", needed=False),
+        Rule("EKF2_EV_QMIN", lambda v: v >= 1, "1 to 50", "poses that are not tracked are used, too", needed=False),
+        Rule("EKF2_EV_QMIN", lambda v: v <= 50, "1 to 50", "good poses are dropped too", needed=False),
     ),
 }  # fmt: skip
 
