@@ -5,7 +5,8 @@ import numpy as np
 from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
 
-_KNOWN_S, _KNOWN_TURN = 1.0, 0.1  # s without an image, and cosine of the rotation in it, whose mean motion still tells
+_KNOWN_S = 1.0  # s without an image, whose mean motion still tells how the vehicle moves
+_KNOWN_TRACE = 1.2  # of the rotation in that time, at least: 84 degrees
 _EVEN_SPACING = 0.2  # relative; frame intervals that differ by less count as equal
 
 
@@ -80,8 +81,7 @@ class PoseState:
         since_s += dt_s
         guessed, self._by_sensor, self.T_m_c = self.is_guess, False, T_m_c
         self._measured = (T_m_c, since_s) if repeated else None
-        turned = 0.5 * (float(np.trace(before[:3, :3].T @ T_m_c[:3, :3])) - 1.0)  # cosine
-        if guessed and (since_s > _KNOWN_S or turned < _KNOWN_TURN):
+        if guessed and (since_s > _KNOWN_S or np.vdot(before[:3, :3], T_m_c[:3, :3]) < _KNOWN_TRACE):
             self.reset_motion()
         elif not repeated:
             self._set_step(before, since_s)
