@@ -24,13 +24,13 @@ class PoseState:
         self.moves = False
         self._step_T: F64 = np.eye(4)  # T_c0_c1 of the last frame
         self._step_s: float | None = None  # duration of that motion; None: not known
-        self._measured: tuple[F64, float] | None = None  # T_m_c (4,4) by the last new image, and s since; None: T_m_c
+        self._last_measured: tuple[F64, float] | None = None  # T_m_c (4,4) by the last new image, s since; None: now
         self._by_sensor = False  # since the last pose by images a sensor has told a part of the motion
 
     @property
     def is_guess(self) -> bool:
         """True if neither images nor a sensor have told the motion since a measured pose in this submap."""
-        return self._measured is not None
+        return self._last_measured is not None
 
     @property
     def measured_over_s(self) -> float | None:
@@ -60,15 +60,15 @@ class PoseState:
 
     def guess(self, T_m_c: F64, dt_s: float) -> None:
         """Set a pose (4,4) that nothing measured. dt_s: since the last one."""
-        measured_T_m_c, since_s = self._measured or (self.T_m_c, 0.0)
+        measured_T_m_c, since_s = self._last_measured or (self.T_m_c, 0.0)
         self.T_m_c = T_m_c
         if not self._by_sensor:
-            self._measured = measured_T_m_c, since_s + dt_s
+            self._last_measured = measured_T_m_c, since_s + dt_s
 
     def reckon(self, T_m_c: F64, dt_s: float) -> None:
         """Set a pose (4,4) by a sensor other than the camera. dt_s: since the last one."""
         before, guessed = self.T_m_c, self.is_guess
-        self.T_m_c, self._measured, self._by_sensor = T_m_c, None, True
+        self.T_m_c, self._last_measured, self._by_sensor = T_m_c, None, True
         if not guessed:
             self._set_step(before, dt_s)
 
@@ -77,10 +77,10 @@ class PoseState:
 
         The motion is that since the last pose by a new image.
         """
-        before, since_s = self._measured or (self.T_m_c, 0.0)
+        before, since_s = self._last_measured or (self.T_m_c, 0.0)
         since_s += dt_s
         guessed, self._by_sensor, self.T_m_c = self.is_guess, False, T_m_c
-        self._measured = (T_m_c, since_s) if repeated else None
+        self._last_measured = (T_m_c, since_s) if repeated else None
         if guessed and (since_s > _KNOWN_S or np.vdot(before[:3, :3], T_m_c[:3, :3]) < _KNOWN_TRACE):
             self.reset_motion()
         elif not repeated:
@@ -97,7 +97,7 @@ class PoseState:
     def reset_motion(self) -> None:
         """Forget the motion: the next prediction is the present pose."""
         self._step_T, self.velocity, self.moves = np.eye(4), np.zeros(3), False
-        self._measured, self._by_sensor = None, False
+        self._last_measured, self._by_sensor = None, False
 
     def set_motion(self, step_T: F64, velocity: F64) -> None:
         """Set the motion. step_T: (4,4) T_c0_c1 a frame. velocity: (3,) m/s in m."""
@@ -107,9 +107,9 @@ class PoseState:
         """The map moved under the camera: set its pose in m to T_m_c (4,4), keep that in o."""
         T_o_c = self.T_o_m @ self.T_m_c
         change = T_m_c[:3, :3] @ self.T_m_c[:3, :3].T
-        if self._measured is not None:
-            measured_T_m_c, since_s = self._measured
-            self._measured = se3.orthonormalise(T_m_c @ self.T_c_m @ measured_T_m_c), since_s
+        if self._last_measured is not None:
+            measured_T_m_c, since_s = self._last_measured
+            self._last_measured = se3.orthonormalise(T_m_c @ self.T_c_m @ measured_T_m_c), since_s
         self.velocity = change @ self.velocity
         self.T_m_c = se3.orthonormalise(T_m_c)
         self.T_o_m = se3.orthonormalise(T_o_c @ se3.inverse(self.T_m_c))
@@ -117,7 +117,7 @@ class PoseState:
     def enter_submap(self) -> None:
         """Begin a new submap here; its axes are those of the odometry frame."""
         self.T_m_c = self.T_o_m @ self.T_m_c
-        self.T_o_m, self._measured, self._by_sensor = np.eye(4), None, False
+        self.T_o_m, self._last_measured, self._by_sensor = np.eye(4), None, False
 
     def rescale(self, metres: float) -> F64:
         """Begin a submap in metres here. metres: one unit of the old submap. Returns T_new_old (4,4), lengths in m."""

@@ -63,28 +63,27 @@ def no_depth(frame: Frame) -> Frame:
 # changes of a recording
 
 
+def _each(recording: Recording, change: Callable[[int, Frame], Frame]) -> Recording:
+    """Change each frame by its number."""
+    items = (replace(item, frame=change(k, item.frame)) for k, item in enumerate(recording.items))
+    return replace(recording, items=tuple(items))
+
+
 def changed(recording: Recording, begin: int, end: int, change: Change) -> Recording:
     """Change frames begin..end."""
-    items = list(recording.items)
-    for k in range(begin, min(end, len(items))):
-        items[k] = replace(items[k], frame=change(items[k].frame))
-    return replace(recording, items=tuple(items))
+    return _each(recording, lambda k, frame: change(frame) if begin <= k < end else frame)
 
 
 def some(recording: Recording, share: float, change: Change, seed: int) -> Recording:
     """Change a share of all frames, drawn by chance; the first three are left."""
-    chosen = np.random.default_rng(seed).random(len(recording.items)) < share
-    items = [replace(item, frame=change(item.frame)) if chosen[k] and k >= _FIRST_KEPT else item
-             for k, item in enumerate(recording.items)]  # fmt: skip
-    return replace(recording, items=tuple(items))
+    drawn = np.random.default_rng(seed).random(len(recording.items)) < share
+    return _each(recording, lambda k, frame: change(frame) if drawn[k] and k >= _FIRST_KEPT else frame)
 
 
 def flickering(recording: Recording, deviation: float, seed: int) -> Recording:
     """Multiply each image by a factor of its own; deviation: of its natural logarithm. Bright parts are clipped."""
     factors = np.exp(np.random.default_rng(seed).normal(0.0, deviation, len(recording.items)))
-    items = [replace(item, frame=gain(float(factor))(item.frame))
-             for item, factor in zip(recording.items, factors, strict=True)]  # fmt: skip
-    return replace(recording, items=tuple(items))
+    return _each(recording, lambda k, frame: gain(float(factors[k]))(frame))
 
 
 def without_samples(recording: Recording, every_s: float, length_s: float) -> Recording:
