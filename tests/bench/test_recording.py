@@ -17,6 +17,7 @@ from kiteline_bench.harness.faults import (
     camera_faults_of,
     changed,
     flickering,
+    late_samples,
     rearranged,
     some,
     wall,
@@ -172,7 +173,7 @@ def test_light_that_flickers_and_images_that_show_nothing_are_drawn_by_chance(fl
     assert all(a.frame.right is not None and a.frame.t_ns == b.frame.t_ns for a, b in zip(lit.items, flight.items))
 
 
-def test_samples_of_the_imu_are_left_out(flight: Recording) -> None:
+def test_samples_of_the_imu_are_left_out_or_stamped_late(flight: Recording) -> None:
     def stamps(recording: Recording) -> np.ndarray:
         return np.concatenate([item.imu.t_ns for item in recording.items if item.imu is not None])
 
@@ -181,6 +182,8 @@ def test_samples_of_the_imu_are_left_out(flight: Recording) -> None:
         replace(item, imu=ImuBatch(t, np.zeros((10, 3)), np.ones((10, 3)))) for item, t in zip(flight.items, times)
     ]
     sampled = replace(flight, items=tuple(items))
+    late = stamps(late_samples(sampled, -0.02))
+    np.testing.assert_array_equal(late, stamps(sampled) - 20_000_000)
     left, everything = stamps(without_samples(sampled, 0.5, 0.2)), stamps(sampled)
     gone = np.setdiff1d(everything, left)
     assert len(left) + len(gone) == len(everything)

@@ -9,7 +9,7 @@ import numpy as np
 from kiteline_agent.inertial import initial_alignment
 from kiteline_agent.inertial.fixed_lag import FixedLagSmoother
 from kiteline_agent.inertial.inertial_config import InertialConfig, StartDeviations
-from kiteline_agent.inertial.preintegration import Preintegrated, Samples, preintegrate
+from kiteline_agent.inertial.preintegration import Preintegrated, Samples, TimeOffset, preintegrate
 from kiteline_agent.inertial.sample_buffer import SampleBuffer
 from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuCalibration
@@ -44,7 +44,7 @@ class InertialStartState:
     """A known state at a frame, in any frame w.
 
     T_w_b: (4,4). velocity: (3,) m/s. bias: (6,). gravity: (3,) m/s^2. cov: (17,17) as in InertialState, of full rank.
-    accel_noise: factor on the accelerometer's noise.
+    accel_noise: factor on the accelerometer's noise. offset: of time; None: not found.
     """
 
     T_w_b: F64
@@ -53,6 +53,7 @@ class InertialStartState:
     gravity: F64
     cov: F64
     accel_noise: float = 1.0
+    offset: TimeOffset | None = None
 
 
 class ImuInitialiser:

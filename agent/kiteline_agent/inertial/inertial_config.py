@@ -2,7 +2,9 @@
 
 from dataclasses import dataclass, field
 
-from kiteline_agent.inertial.calibration.self_calibration import SelfCalibrationConfig
+import numpy as np
+
+from kiteline_core.arrays import F64
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,6 +24,27 @@ class FixedLagConfig:
     velocity_floor_m_s: float = 5e-4  # the same of velocity: interpolated ends of the interval
     position_floor_m: float = 2e-5  # the same of position
     tilt_walk_rad: float = 2e-4  # per sqrt(s): the map itself bends while it grows
+
+
+@dataclass(frozen=True, slots=True)
+class SelfCalibrationConfig:
+    """Errors of the calibration before the flight, errors of poses by images, and when an estimate is applied."""
+
+    position_rad: float = 2.3e-4  # error of a position by images, over the depth that they see: a tenth of a pixel
+    sensor_scale_sigma: float = 0.01  # of the scales of gyro and accelerometer; data sheets give 1 to 3 %
+    misalignment_sigma: float = 0.007  # rad; by which a sensing axis leans to another; data sheets give 0.5 to 1 degree
+    significance: float = 25.0  # squared deviations of 9 axes from a true rig, above which they are applied
+    offset_s: float = 0.0  # camera stamp + offset = IMU time, if a calibration gives it
+    offset_sigma_s: float = 0.02  # cameras without a trigger line
+    kept_axes_sigma: float = 1e-3  # of axes between two flights: temperature, and what images are off by in both
+    apply_axes: bool = True  # False: axes are only estimated
+    apply_offset: bool = True  # False: only the configured offset is used
+
+    @property
+    def axes_sigma(self) -> F64:
+        """(9,) deviations of the elements of a sensor's matrix, row-major, before a flight."""
+        scale, misalignment = self.sensor_scale_sigma, self.misalignment_sigma
+        return np.where(np.eye(3, dtype=np.bool_), scale, misalignment).ravel()
 
 
 @dataclass(frozen=True, slots=True)

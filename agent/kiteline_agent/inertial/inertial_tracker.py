@@ -9,7 +9,7 @@ from kiteline_agent.inertial.calibration.self_calibration import SelfCalibration
 from kiteline_agent.inertial.fixed_lag import BodyVelocity, FixedLagSmoother, InertialState, VisualPoints, tilt_of
 from kiteline_agent.inertial.imu_initialisation import ImuInitialiser, InertialStartState, TimedPose
 from kiteline_agent.inertial.inertial_config import InertialConfig, StartDeviations
-from kiteline_agent.inertial.preintegration import BiasPrior, Preintegrated, Samples, preintegrate
+from kiteline_agent.inertial.preintegration import BiasPrior, KnownImu, Preintegrated, Samples, preintegrate
 from kiteline_agent.inertial.sample_buffer import SampleBuffer, without_held
 from kiteline_agent.inertial.scale_filter import INTERVAL_S, ScaleFilter, camera_scaled
 from kiteline_core.arrays import F64
@@ -79,9 +79,10 @@ class InertialTracker:
         return self._smoother.state if self._smoother.running else None
 
     @property
-    def bias_prior(self) -> BiasPrior | None:
-        """Biases of the tracking so far, and how far they may have moved; None if never estimated."""
-        return BiasPrior(self._bias.copy(), _PRIOR_SIGMA) if self.started is not None else None
+    def known(self) -> KnownImu:
+        """What a new map begins with: values that are applied, biases so far, and how far these may have moved."""
+        bias = BiasPrior(self._bias.copy(), _PRIOR_SIGMA) if self.started is not None else None
+        return KnownImu(bias, self.self_calibration.applied_offset, self.self_calibration.correct)
 
     @property
     def applied_offset_s(self) -> float:
@@ -270,6 +271,8 @@ class InertialTracker:
         """Begin a map in metres at this frame, with the body at T_m_b (4,4) by definition, in a known state."""
         self.metric, self.started = True, "motion"
         self._bias = start.bias.copy()
+        if start.offset is not None:
+            self.self_calibration.begin_with_offset(start.offset)
         self._smoother.start(start.T_w_b, start.velocity, start.bias, start.gravity, StartDeviations(), start.cov)
         self.begin_map(t_ns, T_m_b)
         state = self._smoother.state

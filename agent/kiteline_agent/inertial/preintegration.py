@@ -1,5 +1,6 @@
 """Preintegration of IMU samples between two instants, with covariance and bias Jacobians."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,6 +36,26 @@ class BiasPrior:
 
     bias: F64
     sigma: F64
+
+
+@dataclass(frozen=True, slots=True)
+class TimeOffset:
+    """Camera stamp + offset_s = IMU time. sigma_s: its standard deviation."""
+
+    offset_s: float
+    sigma_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class KnownImu:
+    """What is known of an IMU before a map begins.
+
+    bias: None before any was estimated. correct: gives samples with the scales and axes that are applied.
+    """
+
+    bias: BiasPrior | None
+    offset: TimeOffset
+    correct: Callable[[Samples], Samples]
 
 
 @dataclass(frozen=True, slots=True)

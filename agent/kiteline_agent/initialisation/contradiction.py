@@ -4,18 +4,18 @@ import numpy as np
 
 from kiteline_agent.inertial.preintegration import BiasPrior
 from kiteline_agent.inertial_start_config import ContradictionConfig
-from kiteline_agent.initialisation.inertial_window import WindowSolution
+from kiteline_agent.initialisation.window.window_state import WindowSolution
 from kiteline_core.arrays import F64
 
 _WARNING = (
     "imu: images and IMU contradict each other, so that no scale is known: check the camera's place in the IMU's axes "
-    "(T_BS), the time offset, the intrinsics and the units (rad/s, m/s^2)"
+    "(T_BS), the intrinsics, the units (rad/s, m/s^2) and the time offset (one of up to 0.15 s is found)"
 )
-_BOTH_LENS_CHI2 = 12.0  # with _BOTH_GYRO_NOISE: a focal length that is off by a tenth has 13, 20 ms of delay 2
+_BOTH_LENS_CHI2 = 12.0  # with _BOTH_GYRO_NOISE: a focal length that is off by a tenth has 13
 _BOTH_GYRO_NOISE = 1.7  # with _BOTH_LENS_CHI2: a focal length that is off by a tenth has 1.9, worn rigs 1.2
 _ACCEL_BIAS = 5.0  # deviations of the accelerometer's bias: that of missing gravity is 40
 _LENS_CHI2 = 26.0  # squared deviations of the eight errors of a lens: 99.9 % of calibrations have less
-_GYRO_NOISE = 5.0  # times that of single samples, as rotations by images show it: 20 ms of delay have 2.8
+_GYRO_NOISE = 5.0  # times that of single samples, as rotations by images show it
 
 
 def contradicts(

@@ -2,29 +2,30 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.governor.cost_model import Work
 from kiteline_agent.inertial.imu_watch import SILENT_S
-from kiteline_agent.inertial.preintegration import BiasPrior, Samples, preintegrate
-from kiteline_agent.inertial.sample_buffer import SampleBuffer, without_held
-from kiteline_agent.initialisation import corner_tracks, lens_correction
+from kiteline_agent.inertial.preintegration import BiasPrior, KnownImu, Samples, TimeOffset, preintegrate
+from kiteline_agent.inertial.sample_buffer import SampleBuffer
+from kiteline_agent.initialisation import corner_tracks
 from kiteline_agent.initialisation.contradiction import ContradictionWatch, contradicts, exceeds_lens_errors
 from kiteline_agent.initialisation.corner_tracks import CornerObservations, CornerTracks, TrackedKeyframe
-from kiteline_agent.initialisation.inertial_bundle import InertialBundle, lens_prior
-from kiteline_agent.initialisation.inertial_window import (
+from kiteline_agent.initialisation.landmark_realignment import realigned
+from kiteline_agent.initialisation.metric_restart import MetricPoints, metric_points_at
+from kiteline_agent.initialisation.window import lens_correction
+from kiteline_agent.initialisation.window.window_bundle import InertialBundle, lens_prior
+from kiteline_agent.initialisation.window.window_noise import LEAST, MOST, Vibration, WindowNoise, vibration
+from kiteline_agent.initialisation.window.window_samples import WindowSamples
+from kiteline_agent.initialisation.window.window_state import (
     InParts,
     SolvedWindow,
     WarmStart,
     WindowSolution,
     lengths_apart,
 )
-from kiteline_agent.initialisation.landmark_realignment import realigned
-from kiteline_agent.initialisation.metric_restart import MetricPoints, metric_points_at
-from kiteline_agent.initialisation.window_noise import LEAST, MOST, Vibration, WindowNoise, vibration
 from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_agent.tracking.waiting_frames import WaitingFrames
 from kiteline_core.arrays import F64, I64
@@ -86,6 +87,15 @@ class _Solved:
     solution: WindowSolution
     xyz: F64
     first: I64
+
+
+@dataclass(frozen=True, slots=True)
+class _Imu:
+    """Samples of a window, and what is known of the IMU before it: biases and time offset."""
+
+    samples: WindowSamples
+    prior: BiasPrior
+    offset: TimeOffset
 
 
 class InertialStart:
@@ -155,21 +165,18 @@ class InertialStart:
         first_ns = self.waiting.first_t_ns
         return not self.solving and (first_ns is None or not self._tracks.is_due(first_ns))
 
-    def add(self, ctx: FrameContext, prior: BiasPrior | None, offset_s: float) -> InertialMap | None:
-        """Follow the corners into a frame whose samples were taken in. Returns a map once its scale is known.
-
-        prior: biases of earlier tracking. offset_s: frame stamp + offset = IMU time.
-        """
+    def add(self, ctx: FrameContext, imu: KnownImu) -> InertialMap | None:
+        """Follow the corners into a frame whose samples were taken in. Returns a map once its scale is known."""
         every = self._config.governor.cpu_percent <= 0.0  # else the frames between keyframes do not come here
         self._work.followed += int(every)
         shows = not every or self._tracks.follow(ctx.images.left)
         if shows and self._tracks.is_due(ctx.t_ns):
             self._work.followed += 1
-            turn = None if every else self._turn(ctx.t_ns, prior, offset_s)
+            turn = None if every else self._turn(ctx.t_ns, imu)
             if self._tracks.add(ctx.t_ns, ctx.images.left, turn):
                 self._bound_window(ctx.t_ns)
                 if self._attempt is None:
-                    self._attempt = self._begin(ctx, prior, offset_s)
+                    self._attempt = self._begin(ctx, imu)
         return self.go_on()
 
     def go_on(self) -> InertialMap | None:
@@ -183,13 +190,13 @@ class InertialStart:
                 return end.value  # type: ignore[no-any-return]
         return None
 
-    def _turn(self, t_ns: int, prior: BiasPrior | None, offset_s: float) -> F64 | None:
+    def _turn(self, t_ns: int, imu: KnownImu) -> F64 | None:
         """(3,3) rotation of the camera since the last keyframe, by the gyro; None without samples."""
-        keyframes, offset_ns = self._tracks.keyframes, round(offset_s * 1e9)
+        keyframes, offset_ns = self._tracks.keyframes, round(imu.offset.offset_s * 1e9)
         samples = self._buffer.between(keyframes[-1].t_ns + offset_ns, t_ns + offset_ns) if keyframes else None
         if samples is None:
             return None
-        bias = np.zeros(6) if prior is None else prior.bias
+        samples, bias = imu.correct(samples), np.zeros(6) if imu.bias is None else imu.bias.bias
         R_b_c = self._camera.T_b_c[:3, :3]
         return np.asarray(R_b_c.T @ preintegrate(samples, bias, self._calibration).turn @ R_b_c)
 
@@ -200,7 +207,7 @@ class InertialStart:
         if self._tracks.flow_px() < _STILL_FLOW * config.min_flow * self._camera.fx:
             self._tracks.drop_before(t_ns - round(_REST_S * 1e9))
 
-    def _begin(self, ctx: FrameContext, prior: BiasPrior | None, offset_s: float) -> InParts[InertialMap | None] | None:
+    def _begin(self, ctx: FrameContext, imu: KnownImu) -> InParts[InertialMap | None] | None:
         """An attempt with the window that ends with this keyframe; None while none is due."""
         config, keyframes = self._config.inertial_start, list(self._tracks.keyframes)
         span_s = (ctx.t_ns - keyframes[0].t_ns) * 1e-9
@@ -209,13 +216,17 @@ class InertialStart:
         if span_s < _MIN_SPAN_S or not waited or self._tracks.flow_px() < config.min_flow * self._camera.fx:
             return None
         self._tried_ns = ctx.t_ns
-        intervals = self._intervals(keyframes, round(offset_s * 1e9))
-        if intervals is None:
+        samples = WindowSamples(self._buffer, imu.correct, [k.t_ns for k in keyframes])
+        missing = samples.missing(imu.offset.offset_s)
+        if missing is not None:  # the window begins after it
+            self._tracks.drop_before(keyframes[missing + 1].t_ns)
+            self._tried_ns = None
             return None
-        return self._attempting(ctx, keyframes, intervals, self._default_prior() if prior is None else prior)
+        prior = self._default_prior() if imu.bias is None else imu.bias
+        return self._attempting(ctx, keyframes, _Imu(samples, prior, imu.offset))
 
     def _attempting(
-        self, ctx: FrameContext, keyframes: list[TrackedKeyframe], intervals: list[Samples], prior: BiasPrior
+        self, ctx: FrameContext, keyframes: list[TrackedKeyframe], imu: _Imu
     ) -> InParts[InertialMap | None]:
         """Solve the window; align its landmarks again and solve it once more when the scale seems to be known."""
         all_corners = self._tracks.observations()
@@ -224,12 +235,12 @@ class InertialStart:
         columns = corner_tracks.covering(all_corners, _LANDMARKS, _LANDMARKS_EACH)
         observations = all_corners.part(columns)
         before, stamps = self._before, tuple(k.t_ns for k in keyframes)
-        self._measure_vibration(intervals)
+        self._measure_vibration(imu.samples.at(imu.offset.offset_s) or [])
         assert self._noise is not None
         warm = None if before is None else before.warm_start(stamps, observations.ids)
-        found = None if warm is None else (yield from self._solve(observations, intervals, prior, warm))
+        found = None if warm is None else (yield from self._solve(observations, imu, warm))
         if found is None or not found.solution.fits:
-            warm, found = None, (yield from self._solve(observations, intervals, prior, None))
+            warm, found = None, (yield from self._solve(observations, imu, None))
         if found is None:
             self._before = None
             wrong_turns = self._structure_px > _STRUCTURE_PX
@@ -246,9 +257,9 @@ class InertialStart:
             yield
             keep = aligned.seen.sum(axis=0) >= _MIN_VIEWS
             self._noise = noise
-            again = self._bundle(aligned.part(keep), intervals, prior)
+            again = self._bundle(aligned.part(keep), imu)
             warmer = WarmStart(solution.state, found.xyz[keep])
-            solution = (yield from self._counted(again.solving(warmer), intervals)) or solution
+            solution = (yield from self._counted(again.solving(warmer), len(keyframes))) or solution
             noise, sigma = self._seen_noise(solution)
         self._before = SolvedWindow(stamps, observations.ids, found.xyz, solution)
         (wrong, by_imu), fits = self._contradicts(solution, noise), solution.converged and solution.fits
@@ -257,13 +268,13 @@ class InertialStart:
         agrees = before is not None and self._agrees(before, self._before)
         self._noise = modelled
         if known and agrees and warm is not None:
-            if not (yield from self._is_lowest(found, observations, intervals, prior)):
+            if not (yield from self._is_lowest(found, observations, imu)):
                 return None
         self._noise = noise
         if not known or not agrees:
             return None
-        bundle = self._bundle(all_corners, intervals, prior)
-        placed = yield from self._counted(bundle.placing_landmarks(solution.state), intervals)
+        bundle = self._bundle(all_corners, imu)
+        placed = yield from self._counted(bundle.placing_landmarks(solution.state), len(keyframes))
         points = None if placed is None else self._points(ctx, all_corners, placed)
         if points is None or len(points.sigma_rho) < self._config.local_map.first_points:
             self._tried_ns = None  # the next keyframe may see more of the landmarks
@@ -279,32 +290,28 @@ class InertialStart:
             all_corners,
         )  # fmt: skip
 
-    def _solve(
-        self, corners: CornerObservations, intervals: list[Samples], prior: BiasPrior, warm: WarmStart | None
-    ) -> InParts[_Solved | None]:
-        bundle = self._bundle(corners, intervals, prior)
-        solution = yield from self._counted(bundle.solving(warm), intervals)
+    def _solve(self, corners: CornerObservations, imu: _Imu, warm: WarmStart | None) -> InParts[_Solved | None]:
+        bundle = self._bundle(corners, imu)
+        solution = yield from self._counted(bundle.solving(warm), len(corners.seen))
         self._structure_px = bundle.structure_px
         return None if solution is None else _Solved(solution, *bundle.landmarks_of(solution.state))
 
-    def _counted(self, parts: Solving, intervals: list[Samples]) -> Solving:
+    def _counted(self, parts: Solving, keyframes: int) -> Solving:
         """The parts of a solution, each counted as work of the frame in which it is done."""
         while True:
-            self._work.window_keyframes += len(intervals) + 1
+            self._work.window_keyframes += keyframes
             try:
                 next(parts)
             except StopIteration as end:
                 return end.value  # type: ignore[no-any-return]
             yield
 
-    def _is_lowest(
-        self, found: _Solved, corners: CornerObservations, intervals: list[Samples], prior: BiasPrior
-    ) -> InParts[bool]:
+    def _is_lowest(self, found: _Solved, corners: CornerObservations, imu: _Imu) -> InParts[bool]:
         """True if a solution from nothing has no lower cost, or the same scale.
 
         A warm start may stay in a wrong minimum. If so, the other solution is the one to start from.
         """
-        cold = yield from self._solve(corners, intervals, prior, None)
+        cold = yield from self._solve(corners, imu, None)
         if cold is None or cold.solution.cost > found.solution.cost - _LOWER_COST:
             return True
         apart = lengths_apart(found.solution.state.p, cold.solution.state.p)
@@ -376,25 +383,13 @@ class InertialStart:
         true = lens_correction.true_place((found.points.uv - centre) / focal, solution.state.lens)
         return replace(found, points=replace(found.points, uv=true * focal + centre))
 
-    def _bundle(self, corners: CornerObservations, intervals: list[Samples], prior: BiasPrior) -> InertialBundle:
+    def _bundle(self, corners: CornerObservations, imu: _Imu) -> InertialBundle:
         return InertialBundle(
-            corners, intervals, self._calibration, self._camera.T_b_c, self._camera.fx,
-            self._config.inertial.gravity_m_s2, prior, self._config.inertial_start.bundle,
-            self._noise, self._lens_info,
+            corners, imu.samples.at, self._calibration, self._camera.T_b_c, self._camera.fx,
+            self._config.inertial.gravity_m_s2, imu.prior, self._config.inertial_start.bundle,
+            self._noise, self._lens_info, imu.offset,
         )  # fmt: skip
 
     def _default_prior(self) -> BiasPrior:
         bundle = self._config.inertial_start.bundle
         return BiasPrior(np.zeros(6), np.repeat([bundle.gyro_bias_rad_s, bundle.accel_bias_m_s2], 3))
-
-    def _intervals(self, keyframes: list[TrackedKeyframe], offset_ns: int) -> list[Samples] | None:
-        """Samples between the keyframes; None if some are missing: the window then begins with the keyframe after."""
-        found = [self._buffer.between(a.t_ns + offset_ns, b.t_ns + offset_ns) for a, b in pairwise(keyframes)]
-        complete = [samples for samples in found if samples is not None]
-        if len(complete) == len(found):
-            late = self._buffer.lacks(keyframes[-1].t_ns + offset_ns)
-            return [*complete[:-1], without_held(complete[-1])] if late else complete
-        last_missing = max(k for k, samples in enumerate(found) if samples is None)
-        self._tracks.drop_before(keyframes[last_missing + 1].t_ns)
-        self._tried_ns = None
-        return None

@@ -7,10 +7,10 @@ import numpy as np
 from kiteline_agent.governor.governor import Extra, Governor
 from kiteline_agent.inertial.imu_initialisation import InertialStartState
 from kiteline_agent.inertial.inertial_tracker import InertialTracker
-from kiteline_agent.initialisation import lens_correction
 from kiteline_agent.initialisation.inertial_start import InertialMap, InertialStart
 from kiteline_agent.initialisation.metric_restart import MetricPoints, metric_points
 from kiteline_agent.initialisation.two_view_start import TwoViewStart
+from kiteline_agent.initialisation.window import lens_correction
 from kiteline_agent.keyframes.depth_from_motion import DepthFromMotion
 from kiteline_agent.keyframes.keyframe_maker import KeyframeMaker
 from kiteline_agent.local_map.local_map import LocalMap
@@ -146,7 +146,7 @@ class SubmapStage:
 
         An IMU that certainly contradicts the images is ignored from then on; not one that agreed with them before.
         """
-        found = start.add(ctx, inertial.bias_prior, inertial.applied_offset_s)
+        found = start.add(ctx, inertial.known)
         if found is not None:
             return self._open_in_metres(found, start)
         if start.contradicted and not self._camera.submaps.any:
@@ -178,7 +178,13 @@ class SubmapStage:
         found.points.set_sigma(self._map, keyframe)
         self._channel.put(SubmapScale(submap, 1.0))
         state = InertialStartState(
-            solution.T_w_b, solution.velocity, solution.bias, solution.gravity, found.cov, found.accel_noise
+            solution.T_w_b,
+            solution.velocity,
+            solution.bias,
+            solution.gravity,
+            found.cov,
+            found.accel_noise,
+            solution.offset,
         )
         camera.motion.begin_metric_map(ctx.t_ns, state)
         start.clear()

@@ -12,7 +12,7 @@ from kiteline_agent.imaging.alignment_kernels import TEMPLATE, TEMPLATE_LEVELS
 from kiteline_agent.imaging.epipolar_kernels import search_segments
 from kiteline_agent.imaging.features import build_pyramid
 from kiteline_agent.initialisation.two_view import two_view
-from kiteline_agent.initialisation.window_kernels import add_observations
+from kiteline_agent.initialisation.window.window_kernels import add_observations
 from kiteline_agent.keyframes.seed_kernels import intersect, seed_segments
 from kiteline_agent.local_map.disparity_kernels import linearise_pair, move_points
 from kiteline_agent.scan_config import LocalGridConfig

@@ -102,6 +102,15 @@ def without_samples(recording: Recording, every_s: float, length_s: float) -> Re
     return replace(recording, items=tuple(replace(item, imu=kept(item.imu)) for item in recording.items))
 
 
+def late_samples(recording: Recording, late_s: float) -> Recording:
+    """Stamp the inertial samples late; negative: early."""
+
+    def late(imu: ImuBatch | None) -> ImuBatch | None:
+        return None if imu is None else replace(imu, t_ns=imu.t_ns + round(1e9 * late_s))
+
+    return replace(recording, items=tuple(replace(item, imu=late(item.imu)) for item in recording.items))
+
+
 def stuck(recording: Recording, begin: int, end: int) -> Recording:
     """Repeat the image before frame `begin` until frame `end`."""
     last = recording.items[begin - 1].frame

@@ -1,11 +1,11 @@
-"""Flights that begin in motion, cameras that take few images a second, blank images, flickering light, IMU gaps."""
+"""Flights that begin in motion, cameras that take few images a second, blank images, flickering light, faulty IMUs."""
 
 from collections.abc import Callable
 
 import numpy as np
 
 from kiteline_bench.harness.bars import Bar, Bench, at_most, table
-from kiteline_bench.harness.faults import every_nth, flickering, some, wall, without_samples
+from kiteline_bench.harness.faults import every_nth, flickering, late_samples, some, wall, without_samples
 from kiteline_bench.harness.recording import Recording, load
 from kiteline_bench.reality.flown import Flown, flown, spread
 from kiteline_core.geometry import se3
@@ -20,11 +20,15 @@ _STREET_STEPS, _STREET_STARTS, _STREET_FRAMES = (1, 2, 3, 4), tuple(range(12)), 
 _ROOM_STEPS, _ROOM_STARTS_S = (2, 4), (0.0, 5.0)  # the same of FLIGHT, which has 20 a second
 _STREET_M, _ROOM_M = 0.1, 0.02
 _PLAIN, _SAMPLES = "as recorded", "0.3 s without IMU in every 5 s"
+_LATE, _EARLY = "IMU stamps 20 ms late", "IMU stamps 80 ms early"
+_OF_IMU = (_SAMPLES, _LATE, _EARLY)
 _FAULTS: dict[str, Callable[[Recording, int], Recording]] = {
     _PLAIN: lambda recording, _: recording,
     "one image in ten blank": lambda recording, seed: some(recording, 0.1, wall, seed),
     "every image another exposure": lambda recording, seed: flickering(recording, 0.25, seed),
     _SAMPLES: lambda recording, _: without_samples(recording, 5.0, 0.3),
+    _LATE: lambda recording, _: late_samples(recording, 0.02),
+    _EARLY: lambda recording, _: late_samples(recording, -0.08),
 }  # exposures: by a factor whose logarithm has a deviation of a quarter
 _SEEDS = (0, 1, 2)
 _PART_S, _ONE_CAMERA = (5.0, 15.0), "euroc_mh01_air"  # s of FLIGHT; and a flight of one camera and an IMU
@@ -80,7 +84,7 @@ def _slow_cameras(bench: Bench) -> list[Bar]:
 
 
 def _faulty_sensors(bench: Bench) -> list[Bar]:
-    """Odometry of the tracker alone where images show nothing, light flickers, or samples of the IMU are missing.
+    """Odometry of the tracker alone where images show nothing, light flickers, samples are missing or wrongly stamped.
 
     The flight of one camera has no error at all if its scale is never known: infinite.
     """
@@ -96,9 +100,9 @@ def _faulty_sensors(bench: Bench) -> list[Bar]:
     bars = []
     for name, ways, limit in flights:
         for fault, change in _FAULTS.items():
-            if fault == _SAMPLES and ways[0].imu is None:
+            if fault in _OF_IMU and ways[0].imu is None:
                 continue
-            seeds = (0,) if fault in (_PLAIN, _SAMPLES) else bench.chosen(_SEEDS)
+            seeds = (0,) if fault in (_PLAIN, *_OF_IMU) else bench.chosen(_SEEDS)
             found = [flown(bench, f"{name}, {fault}", change(way, seed), base=False) for way in ways for seed in seeds]
             waits = sum(e.initialising for flight in found for e in flight.run.found)
             errors = [flight.ate_m("odometry") for flight in found]

@@ -6,10 +6,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from kiteline_agent.inertial.calibration.self_calibration import SelfCalibrationConfig
 from kiteline_agent.inertial.fixed_lag import InertialState, VisualPoints
 from kiteline_agent.inertial.imu_initialisation import InertialStartState
-from kiteline_agent.inertial.inertial_config import InertialConfig
+from kiteline_agent.inertial.inertial_config import InertialConfig, SelfCalibrationConfig
 from kiteline_agent.inertial.inertial_tracker import InertialTracker
 from kiteline_agent.inertial.scale_filter import camera_scaled
 from kiteline_core.arrays import F64

@@ -10,62 +10,63 @@ import pytest
 
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.governor.cost_model import Work
-from kiteline_agent.inertial.preintegration import Samples
+from kiteline_agent.inertial.preintegration import KnownImu, TimeOffset
 from kiteline_agent.inertial_start_config import ContradictionConfig
 from kiteline_agent.initialisation import inertial_start
 from kiteline_agent.initialisation.contradiction import ContradictionWatch, contradicts, exceeds_lens_errors
 from kiteline_agent.initialisation.corner_tracks import CornerObservations
 from kiteline_agent.initialisation.inertial_start import InertialStart
-from kiteline_agent.initialisation.window_noise import WindowNoise
+from kiteline_agent.initialisation.window.inertial_terms import CutSamples
+from kiteline_agent.initialisation.window.window_noise import WindowNoise
 from kiteline_core.arrays import F64
-from tests.agent.initialisation.test_inertial_bundle import CALIBRATION, PRIOR, window
-from tests.agent.initialisation.test_inertial_start import CAMERA, Tracks
+from tests.agent.initialisation.test_inertial_start import CAMERA, Recorded, Tracks
+from tests.agent.initialisation.test_window_bundle import CALIBRATION, PRIOR, changed, window
 
-Change = Callable[[CornerObservations, list[Samples]], tuple[CornerObservations, list[Samples]]]
+Change = Callable[[CornerObservations, CutSamples], tuple[CornerObservations, CutSamples]]
 
 
 def start_with(monkeypatch: pytest.MonkeyPatch, change: Change, keyframes: int = 36) -> tuple[float, list[str]]:
     """Seconds until a map begins (infinite if none does) on a changed window, and the warnings until then."""
-    corners, samples, _ = window(1, keyframes=keyframes, noise_px=0.2)
-    corners, samples = change(corners, samples)
+    corners, cut, _ = window(1, keyframes=keyframes, noise_px=0.2)
+    corners, cut = change(corners, cut)
     monkeypatch.setattr(InertialStart, "_points", lambda *_: SimpleNamespace(sigma_rho=np.ones(100)))
     monkeypatch.setattr(inertial_start, "realigned", lambda _keyframes, observations, *_: observations)
     start = InertialStart(CAMERA, CALIBRATION, AgentConfig(), Work())
     start._tracks = Tracks(corners)  # type: ignore[assignment]
-    monkeypatch.setattr(start, "_intervals", lambda keyframes, _offset: samples[: len(keyframes) - 1])
+    monkeypatch.setattr(inertial_start, "WindowSamples", lambda _buffer, _correct, stamps: Recorded(cut, len(stamps)))
     monkeypatch.setattr(start, "_measured_noise", WindowNoise)
     warnings: list[str] = []
     for k in range(keyframes):
         ctx: Any = SimpleNamespace(t_ns=250_000_000 * k, images=SimpleNamespace(left=None))
-        found = start.add(ctx, None, 0.0)
+        found = start.add(ctx, KnownImu(None, TimeOffset(0.0, 0.02), lambda samples: samples))
         warnings += start.take_warnings()
         if found is not None:
             return ctx.t_ns * 1e-9, warnings
     return float("inf"), warnings
 
 
-def unchanged(corners: CornerObservations, samples: list[Samples]) -> tuple[CornerObservations, list[Samples]]:
-    return corners, samples
+def unchanged(corners: CornerObservations, cut: CutSamples) -> tuple[CornerObservations, CutSamples]:
+    return corners, cut
 
 
-def longer_focal_length(corners: CornerObservations, samples: list[Samples]) -> Any:
+def longer_focal_length(corners: CornerObservations, cut: CutSamples) -> Any:
     """Corners as a camera shows them whose focal length is a tenth longer than told."""
-    return replace(corners, xy=1.1 * corners.xy), samples
+    return replace(corners, xy=1.1 * corners.xy), cut
 
 
 def turned(R: F64) -> Change:
-    def change(corners: CornerObservations, samples: list[Samples]) -> Any:
-        return corners, [replace(s, gyro=s.gyro @ R.T, accel=s.accel @ R.T) for s in samples]
+    def change(corners: CornerObservations, cut: CutSamples) -> Any:
+        return corners, changed(cut, lambda s: replace(s, gyro=s.gyro @ R.T, accel=s.accel @ R.T))
 
     return change
 
 
-def in_g(corners: CornerObservations, samples: list[Samples]) -> Any:
-    return corners, [replace(s, accel=s.accel / 9.81) for s in samples]
+def in_g(corners: CornerObservations, cut: CutSamples) -> Any:
+    return corners, changed(cut, lambda s: replace(s, accel=s.accel / 9.81))
 
 
-def in_degrees(corners: CornerObservations, samples: list[Samples]) -> Any:
-    return corners, [replace(s, gyro=np.degrees(s.gyro)) for s in samples]
+def in_degrees(corners: CornerObservations, cut: CutSamples) -> Any:
+    return corners, changed(cut, lambda s: replace(s, gyro=np.degrees(s.gyro)))
 
 
 def test_a_rig_as_calibrated_begins_a_map_and_warns_of_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -97,11 +98,11 @@ def test_a_rig_that_is_not_as_calibrated_begins_none_and_says_so_once(
 @pytest.mark.parametrize(
     ("lens_chi2", "gyro_noise", "accel_bias_m_s2", "wrong"),
     [
-        (2.0, 2.8, 0.1, False),  # images that are 20 ms late, which tracking finds
+        (2.0, 2.8, 0.1, False),  # a gyro that is noisier than told
         (17.0, 1.2, 0.3, False),  # worn rigs
         (14.0, 1.9, 0.1, True),  # a focal length that is off by a tenth
         (32.0, 1.2, 0.1, True),
-        (2.0, 7.0, 0.1, True),  # images that are 50 ms late
+        (2.0, 7.0, 0.1, True),  # two axes negated
         (2.0, 0.8, 8.0, True),  # accelerations in g
     ],
 )

@@ -11,21 +11,40 @@ import pytest
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.governor.cost_model import Work
 from kiteline_agent.imaging.features import DetectorConfig, build_pyramid
+from kiteline_agent.inertial.preintegration import KnownImu, Samples, TimeOffset
 from kiteline_agent.inertial_start_config import CornerTracksConfig
 from kiteline_agent.initialisation import inertial_start
 from kiteline_agent.initialisation.corner_tracks import CornerObservations, CornerTracks, TrackedKeyframe, with_found
 from kiteline_agent.initialisation.inertial_start import InertialStart
-from kiteline_agent.initialisation.inertial_window import SolvedWindow, WindowSolution, finished
 from kiteline_agent.initialisation.metric_restart import MetricPoints
-from kiteline_agent.initialisation.window_noise import WindowNoise
+from kiteline_agent.initialisation.window.inertial_terms import CutSamples
+from kiteline_agent.initialisation.window.window_noise import WindowNoise
+from kiteline_agent.initialisation.window.window_state import SolvedWindow, WindowSolution, finished
 from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_agent.tracking.waiting_frames import WaitingFrames
 from kiteline_core.arrays import F64
 from kiteline_core.frame import Frame, ImuBatch
 from kiteline_core.geometry import se3
-from tests.agent.initialisation.test_inertial_bundle import CALIBRATION, FOCAL, T_B_C, window
+from tests.agent.initialisation.test_window_bundle import CALIBRATION, FOCAL, T_B_C, window
 
 CAMERA: Any = SimpleNamespace(fx=FOCAL, fy=FOCAL, cx=376.0, cy=240.0, width=752, height=480, T_b_c=T_B_C)
+
+
+EXACT = KnownImu(None, TimeOffset(0.0, 1e-6), lambda samples: samples)
+
+
+class Recorded:
+    """The recorded samples between the first n keyframes."""
+
+    def __init__(self, cut: CutSamples, n: int) -> None:
+        self._cut, self._n = cut, n
+
+    def at(self, offset_s: float) -> list[Samples] | None:
+        intervals = self._cut(offset_s)
+        return None if intervals is None else intervals[: self._n - 1]
+
+    def missing(self, _offset_s: float) -> None:
+        return None
 
 
 class Tracks:
@@ -61,7 +80,7 @@ class Tracks:
 
 def begins_after(monkeypatch: pytest.MonkeyPatch, poor: int) -> tuple[float, float]:
     """Seconds until the scale is known, and until the map begins, if after that `poor` keyframes see few landmarks."""
-    corners, samples, _ = window(1, keyframes=24, noise_px=0.2)
+    corners, cut, _ = window(1, keyframes=24, noise_px=0.2)
     asked: list[float] = []
 
     def points(
@@ -80,11 +99,11 @@ def begins_after(monkeypatch: pytest.MonkeyPatch, poor: int) -> tuple[float, flo
     config = replace(config, inertial_start=replace(config.inertial_start, bundle=known))  # the scale is known sooner
     start = InertialStart(CAMERA, CALIBRATION, config, Work())
     start._tracks = Tracks(corners)  # type: ignore[assignment]
-    monkeypatch.setattr(start, "_intervals", lambda keyframes, _offset: samples[: len(keyframes) - 1])
+    monkeypatch.setattr(inertial_start, "WindowSamples", lambda _buffer, _correct, stamps: Recorded(cut, len(stamps)))
     monkeypatch.setattr(start, "_measured_noise", WindowNoise)
     for k in range(24):
         ctx: Any = SimpleNamespace(t_ns=250_000_000 * k, images=SimpleNamespace(left=None))
-        if start.add(ctx, None, 0.0) is not None:
+        if start.add(ctx, EXACT) is not None:
             return asked[0], asked[-1]
     raise AssertionError("the map never begins")
 
@@ -144,7 +163,7 @@ def test_a_lower_cost_at_the_same_scale_confirms_it(monkeypatch: pytest.MonkeyPa
         found, start = solved(1.0, 1000.0), InertialStart(CAMERA, CALIBRATION, AgentConfig(), Work())
         start._before = SolvedWindow((0, 1, 2, 3), np.zeros(0, np.int64), found.xyz, found.solution)
         monkeypatch.setattr(start, "_solve", lambda *_: at_once(solved(scale, cost)))
-        stands = finished(start._is_lowest(found, None, [], None))  # type: ignore[arg-type]
+        stands = finished(start._is_lowest(found, None, None))  # type: ignore[arg-type]
         return stands, float(start._before.xyz[0, 0])
 
     assert is_lowest(1.2, 1000.0) == (True, 1.0)
@@ -168,9 +187,9 @@ def test_a_window_begins_after_the_samples_that_are_missing(monkeypatch: pytest.
     start.add_samples(ctx)
     solved: list[int] = []
     monkeypatch.setattr(start, "_attempting", lambda _ctx, keyframes, *_: iter([solved.append(len(keyframes))]))
-    start.add(ctx, None, 0.0)
+    start.add(ctx, EXACT)
     assert [k.t_ns for k in start._tracks.keyframes] == [250_000_000 * k for k in range(3, 20)]  # 0.5 s are bridged
-    start.add(ctx, None, 0.0)
+    start.add(ctx, EXACT)
     assert solved == [17]
 
 
@@ -190,10 +209,9 @@ def test_of_a_long_rest_a_window_holds_the_end(monkeypatch: pytest.MonkeyPatch, 
     monkeypatch.setattr(start._tracks, "add", lambda *_: True)
     monkeypatch.setattr(start._tracks, "follow", lambda _left: True)
     monkeypatch.setattr(start, "_attempting", lambda *_: None)
-    monkeypatch.setattr(start, "_intervals", lambda *_: None)
     start._tracks.keyframes = [SimpleNamespace(t_ns=250_000_000 * k) for k in range(77)]  # type: ignore[misc]
     ctx: Any = SimpleNamespace(t_ns=19_000_000_000, images=SimpleNamespace(left=None))
-    start.add(ctx, None, 0.0)
+    start.add(ctx, EXACT)
     assert len(start._tracks.keyframes) == kept
 
 

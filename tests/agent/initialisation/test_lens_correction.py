@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from kiteline_agent.initialisation.lens_correction import TERMS, moved, rms_px, true_place
+from kiteline_agent.initialisation.window.lens_correction import TERMS, moved, rms_px, true_place
 from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraModel, CameraRig, Lens, Rectifier

@@ -40,6 +40,12 @@ class GyroCalibration(AxesFilter):
         sigma = np.concatenate([axes_sigma.ravel(), [offset_sigma_s]])
         self._cov[:10, :10] = np.diag(np.minimum(sigma**2, np.diag(self._cov)[:10]))
 
+    def begin_with_offset(self, offset_s: float, sigma_s: float) -> None:
+        """Begin with a time offset that was found otherwise, and its deviation."""
+        self._x[_OFFSET] = offset_s
+        self._cov[_OFFSET], self._cov[:, _OFFSET] = 0.0, 0.0
+        self._cov[_OFFSET, _OFFSET] = sigma_s**2
+
     def set_bias(self, bias: F64) -> None:
         """Begin with a bias (3,) rad/s."""
         self._x[_BIAS] = bias

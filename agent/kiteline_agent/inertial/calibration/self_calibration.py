@@ -21,7 +21,8 @@ from kiteline_agent.inertial.calibration.mounting_search import Mounting, Mounti
 from kiteline_agent.inertial.calibration.pose_chain import PoseChain, SampledMotion
 from kiteline_agent.inertial.calibration.turn_scatter import added_variance
 from kiteline_agent.inertial.calibration.window import Window
-from kiteline_agent.inertial.preintegration import Samples
+from kiteline_agent.inertial.inertial_config import SelfCalibrationConfig
+from kiteline_agent.inertial.preintegration import Samples, TimeOffset
 from kiteline_agent.inertial.sample_buffer import SampleBuffer
 from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuCalibration
@@ -45,28 +46,8 @@ _OFFSET_SIGNIFICANCE = 3.0  # deviations from the configured offset below which 
 _OFFSET_RATE = 0.05  # s/s; how fast the applied offset follows
 _KEPT_OFFSET_SIGMA_S = 3e-4  # s; of the time offset between two flights: another exposure
 _REFUTED = 5.0  # log likelihood of an unknown IMU over that of earlier flights, from which those are dropped
+_EXACTLY_S = 1e-6  # s; deviation of a time offset that is used as configured
 _OFFSET_TRUSTED_S = 3e-3  # s; deviation below which the offset is applied
-
-
-@dataclass(frozen=True, slots=True)
-class SelfCalibrationConfig:
-    """Errors of the calibration before the flight, errors of poses by images, and when an estimate is applied."""
-
-    position_rad: float = 2.3e-4  # error of a position by images, over the depth that they see: a tenth of a pixel
-    sensor_scale_sigma: float = 0.01  # of the scales of gyro and accelerometer; data sheets give 1 to 3 %
-    misalignment_sigma: float = 0.007  # rad; by which a sensing axis leans to another; data sheets give 0.5 to 1 degree
-    significance: float = 25.0  # squared deviations of 9 axes from a true rig, above which they are applied
-    offset_s: float = 0.0  # camera stamp + offset = IMU time, if a calibration gives it
-    offset_sigma_s: float = 0.02  # cameras without a trigger line
-    kept_axes_sigma: float = 1e-3  # of axes between two flights: temperature, and what images are off by in both
-    apply_axes: bool = True  # False: axes are only estimated
-    apply_offset: bool = True  # False: only the configured offset is used
-
-    @property
-    def axes_sigma(self) -> F64:
-        """(9,) deviations of the elements of a sensor's matrix, row-major, before a flight."""
-        scale, misalignment = self.sensor_scale_sigma, self.misalignment_sigma
-        return np.where(np.eye(3, dtype=np.bool_), scale, misalignment).ravel()
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,6 +131,21 @@ class SelfCalibration:
             self._test_accel()
         self._gyro_matrix = self.gyro.matrix if self._corrects_gyro else np.eye(3)
         self._accel_matrix = self.accel.matrix if self._corrects_accel else np.eye(3)
+
+    @property
+    def applied_offset(self) -> TimeOffset:
+        """The time offset that is applied, and by how much it may be off; exact where it may not be changed."""
+        off_s = float(np.hypot(self.gyro.offset_sigma_s, self.gyro.offset_s - self.offset_s))
+        return TimeOffset(self.offset_s, off_s if self._config.apply_offset else _EXACTLY_S)
+
+    def begin_with_offset(self, found: TimeOffset) -> None:
+        """Begin a map whose start found the time offset."""
+        sigma_s = float(np.hypot(found.sigma_s, _KEPT_OFFSET_SIGMA_S))
+        for gyro in (self.gyro, self._unprimed_gyro):
+            if gyro is not None:
+                gyro.begin_with_offset(found.offset_s, sigma_s)
+        self._given_offset_s = found.offset_s
+        self._follow_offset(np.inf)
 
     def known(self) -> KnownImuConfig | None:
         """What is known now, for the next flight; None before a rotation was measured, and if no IMU is like that."""

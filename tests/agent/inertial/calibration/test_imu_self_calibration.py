@@ -8,12 +8,14 @@ import pytest
 from kiteline_agent.inertial.calibration.gyro_calibration import GyroCalibration
 from kiteline_agent.inertial.calibration.known_imu import KnownImuConfig
 from kiteline_agent.inertial.calibration.self_calibration import (
+    _EXACTLY_S,
+    _KEPT_OFFSET_SIGMA_S,
     _OFFSET_TRUSTED_S,
     SelfCalibration,
-    SelfCalibrationConfig,
 )
 from kiteline_agent.inertial.calibration.window import Window
-from kiteline_agent.inertial.preintegration import Samples, preintegrate
+from kiteline_agent.inertial.inertial_config import SelfCalibrationConfig
+from kiteline_agent.inertial.preintegration import Samples, TimeOffset, preintegrate
 from kiteline_agent.inertial.sample_buffer import SampleBuffer
 from kiteline_core.arrays import F64, I64
 from kiteline_core.frame import ImuBatch, ImuCalibration
@@ -223,6 +225,19 @@ def test_one_window_that_speaks_against_the_gyro_does_not_correct_it(monkeypatch
     assert not calibrated(flight(8.0)).report()["gyro"]["applied"]
     measured = iter([0.0, 27.7, 26.0, *[0.0] * 1000])
     assert calibrated(flight(8.0)).report()["gyro"]["applied"]
+
+
+def test_a_map_begins_with_the_time_offset_of_its_start() -> None:
+    """One that differs significantly is applied at once; not where only the configured one may be used."""
+    for apply, found_s, applied_s in ((True, 0.02, 0.02), (True, 5e-4, 0.0), (False, 0.02, 0.0)):
+        config = SelfCalibrationConfig(apply_offset=apply)
+        calibration = SelfCalibration(CALIBRATION, config, P_B_C, 9.81, metric=False)
+        assert calibration.applied_offset == TimeOffset(0.0, config.offset_sigma_s if apply else _EXACTLY_S)
+        calibration.begin_with_offset(TimeOffset(found_s, 5e-4))
+        assert calibration.offset_s == applied_s and calibration.gyro.offset_s == found_s
+        assert calibration.gyro.offset_sigma_s == pytest.approx(np.hypot(5e-4, _KEPT_OFFSET_SIGMA_S))
+        if apply:  # what is not applied may be off by that
+            assert calibration.applied_offset.sigma_s >= found_s - applied_s
 
 
 def test_axes_can_be_held() -> None:

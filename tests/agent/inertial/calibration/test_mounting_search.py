@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from kiteline_agent.inertial.calibration.lever_search import LeverSearch
-from kiteline_agent.inertial.calibration.self_calibration import SelfCalibration, SelfCalibrationConfig
+from kiteline_agent.inertial.calibration.self_calibration import SelfCalibration
+from kiteline_agent.inertial.inertial_config import SelfCalibrationConfig
 from kiteline_agent.inertial.preintegration import Samples
 from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from kiteline_agent.initialisation.lens_correction import FARTHEST, TERMS
+from kiteline_agent.initialisation.window.lens_correction import FARTHEST, TERMS
 from kiteline_core.arrays import F64
 from kiteline_core.jit import njit
 

@@ -6,8 +6,9 @@ from typing import TypeVar
 
 import numpy as np
 
-from kiteline_agent.initialisation.lens_correction import TERMS
-from kiteline_agent.initialisation.window_noise import NoiseEvidence
+from kiteline_agent.inertial.preintegration import TimeOffset
+from kiteline_agent.initialisation.window.lens_correction import TERMS
+from kiteline_agent.initialisation.window.window_noise import NoiseEvidence
 from kiteline_core.arrays import F64, I64
 
 T = TypeVar("T")
@@ -22,7 +23,8 @@ class WindowState:
     """Unknowns of the window, in the body frame of its first keyframe, w.
 
     R: (K,3,3) R_w_b. p: (K,3) m. v: (K,3) m/s. accel_bias: (K,3) m/s^2. gyro_bias: (3,) rad/s. gravity: (3,) m/s^2.
-    m: (P,2) and rho: (P,) 1/m: landmark at origin (P,3) m + axes @ (m, 1) / rho. lens: (8,) see lens_correction.
+    offset_s: camera stamp + offset = IMU time. m: (P,2) and rho: (P,) 1/m: landmark at origin (P,3) m + axes @ (m, 1)
+    / rho. lens: (8,) see lens_correction.
     """
 
     R: F64
@@ -31,6 +33,7 @@ class WindowState:
     accel_bias: F64
     gyro_bias: F64
     gravity: F64
+    offset_s: float
     m: F64
     rho: F64
     origin: F64
@@ -49,11 +52,11 @@ class WarmStart:
 class WindowSolution:
     """Result of a window.
 
-    T_w_b: (4,4) of the newest keyframe; velocity: (3,) m/s; bias: (6,); gravity: (3,) m/s^2, in w. cov: (17,17) as in
-    InertialState, of that keyframe. lens_cov: (8,8). scale_sigma: relative deviation of all lengths. reprojection_px:
-    rms of inliers. cost: half the squared errors of all. converged: the solver came to an end. imu_chi2: mean squared
-    error of the inertial factors in deviations. evidence: of the IMU's noise. depth_m: (P,) in the newest camera, and
-    depth_sigma: (P,) its relative deviation with known poses.
+    T_w_b: (4,4) of the newest keyframe; velocity: (3,) m/s; bias: (6,); gravity: (3,) m/s^2, in w. offset: of time.
+    cov: (17,17) as in InertialState, of that keyframe. lens_cov: (8,8). scale_sigma: relative deviation of all lengths.
+    reprojection_px: rms of inliers. cost: half the squared errors of all. converged: the solver came to an end.
+    imu_chi2: mean squared error of the inertial factors in deviations. evidence: of the IMU's noise. depth_m: (P,) in
+    the newest camera, and depth_sigma: (P,) its relative deviation with known poses.
     """
 
     state: WindowState
@@ -61,6 +64,7 @@ class WindowSolution:
     velocity: F64
     bias: F64
     gravity: F64
+    offset: TimeOffset
     cov: F64
     lens_cov: F64
     scale_sigma: float

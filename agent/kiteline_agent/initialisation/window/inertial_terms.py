@@ -1,32 +1,42 @@
 """The inertial part of a window: errors of the IMU's samples and of priors, and how large these errors turn out."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 
-from kiteline_agent.inertial.preintegration import BiasPrior, Preintegrated, Samples, preintegrate
+from kiteline_agent.inertial.preintegration import BiasPrior, Preintegrated, Samples, TimeOffset, preintegrate
 from kiteline_agent.inertial_start_config import InertialBundleConfig
-from kiteline_agent.initialisation.inertial_window import WindowState, tangent
-from kiteline_agent.initialisation.window_noise import NoiseEvidence, WindowNoise, vibration
+from kiteline_agent.initialisation.window.window_noise import NoiseEvidence, WindowNoise, vibration
+from kiteline_agent.initialisation.window.window_state import WindowState, tangent
 from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry import se3
 
 STATE = 12  # unknowns of a keyframe: rotation (right), position, velocity, accelerometer bias
-SHARED = 5  # unknowns of the window: gyro bias, direction of gravity
+SHARED = 6  # unknowns of the window: gyro bias, direction of gravity, time offset
+OFFSET = 5  # the last of these
 _PAIR = 2 * STATE  # unknowns of two keyframes
 _FLOOR = np.diag(np.repeat([2e-5, 5e-4, 2e-5], 3) ** 2)  # of an interval's covariance: rad, m/s, m
+_EXACTLY = TimeOffset(0.0, 1e-6)
+_ENDS_S = 0.012  # s of samples at the ends of an interval that tell the rate and force there: vibration averages out
+_FAR_S = 5e-4  # s; change of the time offset from which samples are cut anew
+
+CutSamples = Callable[[float], list[Samples] | None]  # K - 1 intervals at a time offset in s; None: samples are missing
 
 
 class InertialTerms:
-    """Preintegrated intervals between K keyframes. Call `integrate` first, and again when biases have moved."""
+    """Preintegrated intervals between K keyframes. Call `integrate` first, and again when a state `moved_far`."""
 
     def __init__(
-        self, intervals: list[Samples], calibration: ImuCalibration, gravity_m_s2: float, prior: BiasPrior,
-        config: InertialBundleConfig, noise: WindowNoise,
+        self, cut: CutSamples, offset: TimeOffset | None, calibration: ImuCalibration, gravity_m_s2: float,
+        prior: BiasPrior, config: InertialBundleConfig, noise: WindowNoise,
     ) -> None:  # fmt: skip
-        """intervals: K - 1."""
-        self.intervals = _without_measured_noise(intervals)
+        """offset: of time, known before, at which samples are there; None: zero, exactly."""
+        self._cut, self._offset = cut, offset or _EXACTLY
+        intervals = cut(self._offset.offset_s)
+        assert intervals is not None
+        self._intervals, self._cut_at_s = _without_measured_noise(intervals), self._offset.offset_s
         self._calibration = replace(
             calibration,
             gyro_noise=noise.gyro * config.imu_inflation * calibration.gyro_noise,
@@ -42,6 +52,8 @@ class InertialTerms:
         self._length = gravity_m_s2
         self._prior = prior
         self.motions: list[Preintegrated] = []
+        self._later: list[F64] = []  # (9,) of each interval: its change by the time offset
+        self._integrated_at_s = self._cut_at_s  # time offset of a state; the cut stays where samples are missing
         self._info: list[F64] = []
         self._known: tuple[WindowState, F64, list[F64]] | None = None  # errors and motions of the last state
 
@@ -49,17 +61,30 @@ class InertialTerms:
         """One interval with a bias (6,)."""
         return preintegrate(samples, bias, self._calibration)
 
+    def samples_at(self, offset_s: float) -> list[Samples]:
+        """The samples between the keyframes at a time offset, or at the one before if some are missing there."""
+        if abs(offset_s - self._cut_at_s) > _FAR_S:
+            intervals = self._cut(offset_s)
+            if intervals is not None:
+                self._intervals, self._cut_at_s = _without_measured_noise(intervals), offset_s
+        return self._intervals
+
     def integrate(self, state: WindowState) -> None:
-        """Integrate the samples with the state's biases."""
-        self._known = None
-        self.motions = [
-            preintegrate(samples, np.concatenate([state.gyro_bias, bias]), calibration)
-            for samples, bias, calibration in zip(self.intervals, state.accel_bias, self._calibrations, strict=False)
-        ]
+        """Integrate the samples with the state's biases, at its time offset."""
+        self._known, self._integrated_at_s = None, state.offset_s
+        self.motions, self._later = [], []
+        for samples, bias, calibration in zip(
+            self.samples_at(state.offset_s), state.accel_bias, self._calibrations, strict=False
+        ):
+            both = np.concatenate([state.gyro_bias, bias])
+            self.motions.append(preintegrate(samples, both, calibration))
+            self._later.append(_by_offset(samples, self.motions[-1]))
         self._info = [np.asarray(np.linalg.inv(m.cov + _FLOOR)) for m in self.motions]
 
-    def biases_moved(self, state: WindowState) -> bool:
-        """True if the state's biases are too far from the integrated ones for a linear correction."""
+    def moved_far(self, state: WindowState) -> bool:
+        """True if the state's biases or offset are too far from the integrated ones for a linear correction."""
+        if abs(state.offset_s - self._integrated_at_s) > _FAR_S:
+            return True
         gyro = max(float(np.abs(m.bias[:3] - state.gyro_bias).max()) for m in self.motions)
         accel = max(
             float(np.abs(m.bias[3:] - bias).max()) for m, bias in zip(self.motions, state.accel_bias, strict=False)
@@ -126,9 +151,10 @@ class InertialTerms:
         """`_errors`, and the change of velocity and position (6,) of each interval with the state's biases."""
         if self._known is not None and self._known[0] is state:
             return self._known[1:]
-        rows, moved = [], []
-        for k, motion in enumerate(self.motions):
+        rows, moved, later_s = [], [], state.offset_s - self._cut_at_s
+        for k, (motion, later) in enumerate(zip(self.motions, self._later, strict=True)):
             turn, vp = motion.corrected(np.concatenate([state.gyro_bias, state.accel_bias[k]]))
+            turn, vp = turn @ se3.so3_exp(later_s * later[:3]), vp + later_s * later[3:]
             back, dt = state.R[k].T, motion.dt_s
             dv = state.v[k + 1] - state.v[k] - state.gravity * dt
             dp = state.p[k + 1] - state.p[k] - state.v[k] * dt - 0.5 * dt * dt * state.gravity
@@ -145,7 +171,7 @@ class InertialTerms:
         return np.asarray(self._length * tangent(state.gravity))
 
     def _jacobian(self, state: WindowState, e: F64, k: int, tilt: F64) -> F64:
-        """(9,29) of interval k by its two keyframes and the shared unknowns. tilt: see `_tilt`."""
+        """(9,30) of interval k by its two keyframes and the shared unknowns. tilt: see `_tilt`."""
         motion, back, dt = self.motions[k], state.R[k].T, self.motions[k].dt_s
         vp = self._errors_and_motions(state)[1][k]
         j = np.zeros((9, 2 * STATE + SHARED))
@@ -155,7 +181,8 @@ class InertialTerms:
         j[6:, 6:9] = -dt * back
         j[3:, 9:12] = -motion.jac[3:, 3:]
         j[:, 24:27] = -motion.jac[:, :3]
-        j[3:6, 27:], j[6:, 27:] = -dt * back @ tilt, -0.5 * dt * dt * back @ tilt
+        j[3:6, 27:29], j[6:, 27:29] = -dt * back @ tilt, -0.5 * dt * dt * back @ tilt
+        j[:, 29] = -self._later[k]
         return j
 
     def _used_info(self, *, inertial: bool) -> list[F64]:
@@ -169,13 +196,14 @@ class InertialTerms:
     def _prior_cost(self, state: WindowState) -> float:
         steps = np.diff(state.accel_bias, axis=0) / self._walk_sigma()[:, None]
         off = (np.concatenate([state.gyro_bias, state.accel_bias[0]]) - self._prior.bias) / self._prior.sigma
-        return 0.5 * float((steps**2).sum() + off @ off)
+        late = (state.offset_s - self._offset.offset_s) / self._offset.sigma_s
+        return 0.5 * float((steps**2).sum() + off @ off + late * late)
 
     def _walk_sigma(self) -> F64:
         return np.array([self._walk * np.sqrt(m.dt_s) for m in self.motions])
 
     def _add_priors(self, state: WindowState, h: F64, b: F64) -> float:
-        """Random walk of the accelerometer bias, and priors of the first biases."""
+        """Random walk of the accelerometer bias, and priors of the first biases and of the time offset."""
         for k, sigma in enumerate(self._walk_sigma()):
             rows = STATE * k + 9 + np.arange(3)
             change = (state.accel_bias[k + 1] - state.accel_bias[k]) / sigma**2
@@ -190,7 +218,22 @@ class InertialTerms:
         rows = np.concatenate([STATE * len(state.R) + np.arange(3), 9 + np.arange(3)])
         h[rows, rows] += info
         b[rows] += info * (np.concatenate([state.gyro_bias, state.accel_bias[0]]) - self._prior.bias)
+        offset, known = STATE * len(state.R) + OFFSET, self._offset.sigma_s**-2.0
+        h[offset, offset] += known
+        b[offset] += known * (state.offset_s - self._offset.offset_s)
         return self._prior_cost(state)
+
+
+def _by_offset(samples: Samples, motion: Preintegrated) -> F64:
+    """(9,) derivative of [rotation, on the right, velocity, position] by the time offset, per s: both ends move."""
+    first, last = samples.t_s <= _ENDS_S, samples.t_s >= samples.t_s[-1] - _ENDS_S
+    rate = [samples.gyro[rows].mean(axis=0) - motion.bias[:3] for rows in (first, last)]
+    force = [samples.accel[rows].mean(axis=0) - motion.bias[3:] for rows in (first, last)]
+    dv, dp = motion.vp[:3], motion.vp[3:]
+    turn = rate[1] - motion.turn.T @ rate[0]
+    velocity = motion.turn @ force[1] - force[0] - np.cross(rate[0], dv)
+    position = dv - motion.dt_s * force[0] - np.cross(rate[0], dp)
+    return np.concatenate([turn, velocity, position])
 
 
 def _without_measured_noise(intervals: list[Samples]) -> list[Samples]:

@@ -1,0 +1,39 @@
+"""The IMU samples between the keyframes of a window, at any time offset."""
+
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+
+from kiteline_agent.inertial.preintegration import Samples
+from kiteline_agent.inertial.sample_buffer import SampleBuffer, without_held
+
+_MOST_OFFSET_S = 0.5  # s; a solver that diverges asks for more
+
+
+class WindowSamples:
+    """Samples of K - 1 intervals. Those that come later do not count."""
+
+    def __init__(self, buffer: SampleBuffer, correct: Callable[[Samples], Samples], stamps_ns: Sequence[int]) -> None:
+        """correct: applied to each interval. stamps_ns: K camera stamps."""
+        self._buffer = buffer.extended(None)
+        self._correct = correct
+        self._stamps_ns = stamps_ns
+
+    def at(self, offset_s: float) -> list[Samples] | None:
+        """The samples if camera stamps + offset_s are the IMU's time; None if some are missing."""
+        found = self._between(offset_s)
+        complete = [self._correct(samples) for samples in found if samples is not None]
+        if len(complete) < len(found):
+            return None
+        late = self._buffer.lacks(self._stamps_ns[-1] + round(offset_s * 1e9))
+        return [*complete[:-1], without_held(complete[-1])] if late else complete
+
+    def missing(self, offset_s: float) -> int | None:
+        """The last interval that lacks samples; None if none does."""
+        lacking = [k for k, samples in enumerate(self._between(offset_s)) if samples is None]
+        return lacking[-1] if lacking else None
+
+    def _between(self, offset_s: float) -> list[Samples | None]:
+        if not abs(offset_s) < _MOST_OFFSET_S:
+            return [None]
+        offset_ns = round(offset_s * 1e9)
+        return [self._buffer.between(a + offset_ns, b + offset_ns) for a, b in pairwise(self._stamps_ns)]
