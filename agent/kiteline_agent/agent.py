@@ -141,6 +141,7 @@ class Agent:
         if step_input.imu is not None:
             self._skipped_imu.append(step_input.imu)
         if step_input.frame is not None:
+            self._camera.motion.see(step_input.frame.t_ns)
             tracked, more = self._govern(step_input.frame, step_input)
             events += more
             if tracked:

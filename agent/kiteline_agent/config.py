@@ -3,10 +3,10 @@
 from dataclasses import dataclass, field
 from typing import ClassVar, Literal
 
+from kiteline_agent.controller_imu_config import ControllerImuConfig
 from kiteline_agent.ekf_config import EkfConfig
 from kiteline_agent.imaging.features import DetectorConfig
 from kiteline_agent.imaging.row_alignment import RowConfig
-from kiteline_agent.inertial.controller_imu import ControllerImuConfig
 from kiteline_agent.inertial.inertial_config import InertialConfig
 from kiteline_agent.inertial_start_config import InertialStartConfig
 from kiteline_agent.known_rig import KnownRigConfig

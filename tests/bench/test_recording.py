@@ -19,6 +19,7 @@ from kiteline_bench.harness.faults import (
     flickering,
     late_samples,
     rearranged,
+    scattered_stamps,
     some,
     wall,
     without_samples,
@@ -189,6 +190,14 @@ def test_samples_of_the_imu_are_left_out_or_stamped_late(flight: Recording) -> N
     assert len(left) + len(gone) == len(everything)
     assert ((gone - everything[0]) * 1e-9 % 0.5 >= 0.3 - 1e-9).all() and 0.3 < len(gone) / len(everything) < 0.5
     assert all(item.imu is None for item in without_samples(flight.without_imu(), 0.5, 0.2).items)
+
+
+def test_stamps_scatter_and_keep_their_order(flight: Recording) -> None:
+    shaken = scattered_stamps(flight, 2e-3, 1).items
+    stamps = np.array([item.frame.t_ns for item in shaken])
+    off_s = 1e-9 * (stamps - np.array([item.frame.t_ns for item in flight.items]))
+    assert (np.diff(stamps) > 0).all() and 1e-3 < off_s.std() < 3e-3
+    assert all(np.array_equal(a.T_w_b, b.T_w_b) for a, b in zip(shaken, flight.items))
 
 
 def test_errors_are_counted_from_the_first_pose(flight: Recording) -> None:

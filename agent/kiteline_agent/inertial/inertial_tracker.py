@@ -7,6 +7,7 @@ import numpy as np
 from kiteline_agent.inertial.calibration.known_imu import KnownImuConfig
 from kiteline_agent.inertial.calibration.self_calibration import SelfCalibration
 from kiteline_agent.inertial.fixed_lag import BodyVelocity, FixedLagSmoother, InertialState, VisualPoints, tilt_of
+from kiteline_agent.inertial.frame_clock import FrameClock
 from kiteline_agent.inertial.imu_initialisation import ImuInitialiser, InertialStartState, TimedPose
 from kiteline_agent.inertial.inertial_config import InertialConfig, StartDeviations
 from kiteline_agent.inertial.preintegration import BiasPrior, KnownImu, Preintegrated, Samples, preintegrate
@@ -44,6 +45,7 @@ class InertialTracker:
         self._calibration = calibration
         self._p_b_c, self._bf = camera.T_b_c[:3, 3].copy(), camera.bf
         self._buffer = SampleBuffer(3.0, config.max_gap_s)
+        self.clock = FrameClock()
         self._smoother = FixedLagSmoother(camera, calibration, config.smoother, config.gravity_m_s2)
         self.self_calibration = SelfCalibration(
             calibration, config.calibration, self._p_b_c, config.gravity_m_s2, metric=metric
@@ -82,12 +84,7 @@ class InertialTracker:
     def known(self) -> KnownImu:
         """What a new map begins with: values that are applied, biases so far, and how far these may have moved."""
         bias = BiasPrior(self._bias.copy(), _PRIOR_SIGMA) if self.started is not None else None
-        return KnownImu(bias, self.self_calibration.applied_offset, self.self_calibration.correct)
-
-    @property
-    def applied_offset_s(self) -> float:
-        """Camera stamp + offset = IMU time, as applied now."""
-        return self.self_calibration.offset_s
+        return KnownImu(bias, self.self_calibration.applied_offset, self.self_calibration.correct, self.clock.taken_ns)
 
     @property
     def image_loss_s(self) -> float:
@@ -111,16 +108,17 @@ class InertialTracker:
         return self.self_calibration.gyro.offset_s, self.self_calibration.gyro.offset_sigma_s
 
     def offset_report(self) -> dict[str, float]:
-        """The time offset in ms: the estimate, its standard deviation, and the offset that is applied."""
+        """In ms: time offset, its deviation, what is applied, and the scatter of stamps that is corrected."""
         offset_s, sigma_s = self.time_offset_s
-        values = {"ms": offset_s, "sigma_ms": sigma_s, "applied_ms": self.self_calibration.offset_s}
+        values = {"ms": offset_s, "sigma_ms": sigma_s, "applied_ms": self.self_calibration.offset_s,
+                  "jitter_ms": self.clock.jitter_s}  # fmt: skip
         return {name: round(1e3 * value, 2) for name, value in values.items()}
 
     def take_calibration_events(self) -> list[str]:
         """Lines for the log: the applied offset has changed by a millisecond, a correction of axes began."""
-        events = self.self_calibration.take_events()
-        if abs(self.applied_offset_s - self._reported_s) >= 1e-3:
-            self._reported_s = self.applied_offset_s
+        events = self.self_calibration.take_events() + self.clock.take_events()
+        if abs(self.self_calibration.offset_s - self._reported_s) >= 1e-3:
+            self._reported_s = self.self_calibration.offset_s
             found, sigma = (1e3 * value for value in self.time_offset_s)
             events.append(f"camera stamps + {found:.1f} ms are the IMU's time (deviation {sigma:.1f} ms)")
         return events
@@ -128,21 +126,21 @@ class InertialTracker:
     def begin_with(self, known: KnownImuConfig) -> None:
         """Begin with what earlier flights found of the IMU."""
         self.self_calibration.begin_with(known)
-        self._reported_s = self.applied_offset_s
+        self._reported_s = self.self_calibration.offset_s
 
     # per frame
 
     def predict(self, imu: ImuBatch | None, t_ns: int) -> F64 | None:
         """Buffer samples and predict T_m_b (4,4) at t_ns; None without samples, or while the velocity is unknown."""
         self._buffer.push(imu)
-        samples = self._interval(t_ns)
+        samples = self._interval(self.clock.taken_ns(t_ns))
         if samples is None or self.self_calibration.awaits_search or not self._smoother.running:
             return None
         return self._smoother.predict(samples)
 
     def turn(self, t_ns: int) -> F64 | None:
         """Rotation (3,3) R_b0_b1 of the body from the last frame to t_ns, by the gyro; None without samples."""
-        samples = self._interval(t_ns)
+        samples = self._interval(self.clock.taken_ns(t_ns))
         if samples is None or self.self_calibration.awaits_search:
             return None
         return preintegrate(samples, self._bias, self._calibration).turn
@@ -154,7 +152,8 @@ class InertialTracker:
         """
         if self._last is None or not self._smoother.running:
             return None
-        samples = self._buffer.extended(imu).between(self._interval_end_ns, t_ns + self._offset_ns)
+        end_ns = self.clock.taken_ns(t_ns) + self._offset_ns
+        samples = self._buffer.extended(imu).between(self._interval_end_ns, end_ns)
         if samples is None:
             return None
         state, samples = self._smoother.state, self.self_calibration.correct(samples)
@@ -181,8 +180,10 @@ class InertialTracker:
         T_m_b_visual: (4,4) by images alone, from `points`. velocity: by an odometer. Returns the fused state; None
         before the initialisation and without samples, when the pose from images stands.
         """
+        stamp_ns, t_ns = t_ns, self.clock.taken_ns(t_ns)
         samples, depth_m = self._interval(t_ns), points.depth_m(T_m_b_visual)
         if samples is not None:
+            self.clock.judge(stamp_ns, T_m_b_visual[:3, :3], samples, self._bias, self._calibration)
             self._calibrate(t_ns, T_m_b_visual, depth_m, samples.duration_s)
             if self.self_calibration.awaits_search:
                 self._smoother.stop()
@@ -211,7 +212,9 @@ class InertialTracker:
         Returns the state with its growing covariance; None if it is unknown, samples are missing, or images were lost
         for too long.
         """
+        t_ns = self.clock.taken_ns(t_ns)
         samples = self._interval(t_ns)
+        self.clock.forget()
         self.self_calibration.clear()
         self._initialiser.clear()
         self._scale_from = None
@@ -232,6 +235,7 @@ class InertialTracker:
 
     def move_map(self, T_new_old: F64) -> None:
         """Transform the state after the map moved: p_new = T_new_old p_old."""
+        self.clock.forget()
         self._smoother.move_map(T_new_old)
         self._initialiser.transform(lambda T_m_b: T_new_old @ T_m_b)
         if self._last is not None:
@@ -256,6 +260,8 @@ class InertialTracker:
 
         Velocity, gravity and biases are kept if the smoother runs; else the initialisation begins again.
         """
+        t_ns = self.clock.taken_ns(t_ns)
+        self.clock.forget()
         if self._smoother.running:
             self._smoother.begin_map(T_m_b)
         self.self_calibration.begin_map()
@@ -320,7 +326,8 @@ class InertialTracker:
 
     def samples_between(self, from_ns: int, to_ns: int) -> Samples | None:
         """Corrected samples between two camera stamps; None with a gap."""
-        return self._between(from_ns + self._offset_ns, to_ns + self._offset_ns)
+        begin_ns, end_ns = (self.clock.taken_ns(t_ns) + self._offset_ns for t_ns in (from_ns, to_ns))
+        return self._between(begin_ns, end_ns)
 
     def _between(self, from_ns: int, to_ns: int) -> Samples | None:
         """Corrected samples; cached, as the prediction and the update of a frame need the same ones."""

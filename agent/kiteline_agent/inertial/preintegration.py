@@ -50,12 +50,14 @@ class TimeOffset:
 class KnownImu:
     """What is known of an IMU before a map begins.
 
-    bias: None before any was estimated. correct: gives samples with the scales and axes that are applied.
+    bias: None before any was estimated. correct: gives samples with the scales and axes that are applied. taken_ns:
+    when the frame of a stamp was taken, before the offset.
     """
 
     bias: BiasPrior | None
     offset: TimeOffset
     correct: Callable[[Samples], Samples]
+    taken_ns: Callable[[int], int]
 
 
 @dataclass(frozen=True, slots=True)

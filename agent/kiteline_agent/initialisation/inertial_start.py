@@ -193,7 +193,10 @@ class InertialStart:
     def _turn(self, t_ns: int, imu: KnownImu) -> F64 | None:
         """(3,3) rotation of the camera since the last keyframe, by the gyro; None without samples."""
         keyframes, offset_ns = self._tracks.keyframes, round(imu.offset.offset_s * 1e9)
-        samples = self._buffer.between(keyframes[-1].t_ns + offset_ns, t_ns + offset_ns) if keyframes else None
+        if not keyframes:
+            return None
+        begin_ns, end_ns = (imu.taken_ns(t) + offset_ns for t in (keyframes[-1].t_ns, t_ns))
+        samples = self._buffer.between(begin_ns, end_ns)
         if samples is None:
             return None
         samples, bias = imu.correct(samples), np.zeros(6) if imu.bias is None else imu.bias.bias
@@ -216,7 +219,7 @@ class InertialStart:
         if span_s < _MIN_SPAN_S or not waited or self._tracks.flow_px() < config.min_flow * self._camera.fx:
             return None
         self._tried_ns = ctx.t_ns
-        samples = WindowSamples(self._buffer, imu.correct, [k.t_ns for k in keyframes])
+        samples = WindowSamples(self._buffer, imu.correct, [imu.taken_ns(k.t_ns) for k in keyframes])
         missing = samples.missing(imu.offset.offset_s)
         if missing is not None:  # the window begins after it
             self._tracks.drop_before(keyframes[missing + 1].t_ns)

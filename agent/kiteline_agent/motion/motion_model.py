@@ -111,6 +111,11 @@ class MotionModel:
         """Go on as without an IMU: its samples contradict the images."""
         self.tracker = self._steps = self.loss_motion = None
 
+    def see(self, t_ns: int) -> None:
+        """A frame with this stamp has come, whether or not it is tracked."""
+        if self.tracker is not None:
+            self.tracker.clock.add(t_ns)
+
     def add_odometry(self, odometry: OdometryBatch | None) -> None:
         """Buffer the odometer samples since the last step."""
         self.odometer.add(odometry)

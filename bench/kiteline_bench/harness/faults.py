@@ -111,6 +111,14 @@ def late_samples(recording: Recording, late_s: float) -> Recording:
     return replace(recording, items=tuple(replace(item, imu=late(item.imu)) for item in recording.items))
 
 
+def scattered_stamps(recording: Recording, deviation_s: float, seed: int) -> Recording:
+    """Stamp each image by chance sooner or later than it was taken; true poses stay those of the images."""
+    stamps = [item.frame.t_ns for item in recording.items]
+    off_s = np.random.default_rng(seed).normal(0.0, deviation_s, len(stamps))
+    new = np.maximum.accumulate(stamps + np.round(1e9 * off_s).astype(np.int64) + np.arange(len(stamps)))
+    return _each(recording, lambda k, frame: replace(frame, t_ns=int(new[k])))
+
+
 def stuck(recording: Recording, begin: int, end: int) -> Recording:
     """Repeat the image before frame `begin` until frame `end`."""
     last = recording.items[begin - 1].frame

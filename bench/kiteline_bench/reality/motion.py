@@ -5,7 +5,15 @@ from collections.abc import Callable
 import numpy as np
 
 from kiteline_bench.harness.bars import Bar, Bench, at_most, table
-from kiteline_bench.harness.faults import every_nth, flickering, late_samples, some, wall, without_samples
+from kiteline_bench.harness.faults import (
+    every_nth,
+    flickering,
+    late_samples,
+    scattered_stamps,
+    some,
+    wall,
+    without_samples,
+)
 from kiteline_bench.harness.recording import Recording, load
 from kiteline_bench.reality.flown import Flown, flown, spread
 from kiteline_core.geometry import se3
@@ -20,8 +28,8 @@ _STREET_STEPS, _STREET_STARTS, _STREET_FRAMES = (1, 2, 3, 4), tuple(range(12)), 
 _ROOM_STEPS, _ROOM_STARTS_S = (2, 4), (0.0, 5.0)  # the same of FLIGHT, which has 20 a second
 _STREET_M, _ROOM_M = 0.1, 0.02
 _PLAIN, _SAMPLES = "as recorded", "0.3 s without IMU in every 5 s"
-_LATE, _EARLY = "IMU stamps 20 ms late", "IMU stamps 80 ms early"
-_OF_IMU = (_SAMPLES, _LATE, _EARLY)
+_LATE, _EARLY, _SCATTER = "IMU stamps 20 ms late", "IMU stamps 80 ms early", "camera stamps scatter by 2 ms"
+_OF_IMU = (_SAMPLES, _LATE, _EARLY, _SCATTER)
 _FAULTS: dict[str, Callable[[Recording, int], Recording]] = {
     _PLAIN: lambda recording, _: recording,
     "one image in ten blank": lambda recording, seed: some(recording, 0.1, wall, seed),
@@ -29,6 +37,7 @@ _FAULTS: dict[str, Callable[[Recording, int], Recording]] = {
     _SAMPLES: lambda recording, _: without_samples(recording, 5.0, 0.3),
     _LATE: lambda recording, _: late_samples(recording, 0.02),
     _EARLY: lambda recording, _: late_samples(recording, -0.08),
+    _SCATTER: lambda recording, seed: scattered_stamps(recording, 0.002, seed),
 }  # exposures: by a factor whose logarithm has a deviation of a quarter
 _SEEDS = (0, 1, 2)
 _PART_S, _ONE_CAMERA = (5.0, 15.0), "euroc_mh01_air"  # s of FLIGHT; and a flight of one camera and an IMU
@@ -102,7 +111,7 @@ def _faulty_sensors(bench: Bench) -> list[Bar]:
         for fault, change in _FAULTS.items():
             if fault in _OF_IMU and ways[0].imu is None:
                 continue
-            seeds = (0,) if fault in (_PLAIN, *_OF_IMU) else bench.chosen(_SEEDS)
+            seeds = (0,) if fault in (_PLAIN, _SAMPLES, _LATE, _EARLY) else bench.chosen(_SEEDS)
             found = [flown(bench, f"{name}, {fault}", change(way, seed), base=False) for way in ways for seed in seeds]
             waits = sum(e.initialising for flight in found for e in flight.run.found)
             errors = [flight.ate_m("odometry") for flight in found]

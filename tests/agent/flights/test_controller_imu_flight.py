@@ -5,8 +5,8 @@ import pytest
 
 from kiteline_agent.agent import Agent
 from kiteline_agent.config import AgentConfig
+from kiteline_agent.controller_imu_config import ControllerImuConfig
 from kiteline_agent.exchange.no_base import NoBaseChannel
-from kiteline_agent.inertial.controller_imu import ControllerImuConfig
 from kiteline_agent.step import Estimate, Identity, StepInput
 from kiteline_core.frame import Frame
 from kiteline_core.geometry import se3

@@ -38,7 +38,7 @@ def start_with(monkeypatch: pytest.MonkeyPatch, change: Change, keyframes: int =
     warnings: list[str] = []
     for k in range(keyframes):
         ctx: Any = SimpleNamespace(t_ns=250_000_000 * k, images=SimpleNamespace(left=None))
-        found = start.add(ctx, KnownImu(None, TimeOffset(0.0, 0.02), lambda samples: samples))
+        found = start.add(ctx, KnownImu(None, TimeOffset(0.0, 0.02), lambda samples: samples, lambda t_ns: t_ns))
         warnings += start.take_warnings()
         if found is not None:
             return ctx.t_ns * 1e-9, warnings

@@ -30,7 +30,7 @@ from tests.agent.initialisation.test_window_bundle import CALIBRATION, FOCAL, T_
 CAMERA: Any = SimpleNamespace(fx=FOCAL, fy=FOCAL, cx=376.0, cy=240.0, width=752, height=480, T_b_c=T_B_C)
 
 
-EXACT = KnownImu(None, TimeOffset(0.0, 1e-6), lambda samples: samples)
+EXACT = KnownImu(None, TimeOffset(0.0, 1e-6), lambda samples: samples, lambda t_ns: t_ns)
 
 
 class Recorded:

@@ -1,0 +1,157 @@
+"""When frames were taken. A camera takes them at a constant rate, and a busy computer stamps them late, by chance.
+
+Stamps of the last seconds lie about a straight line over the number of the frame. Where they scatter about it as by
+chance, the line tells when a frame was taken far better than its stamp. Stamps that hardly scatter, as those of a
+trigger or a driver, are left as they are, and so are frames without a constant rate. Rotations by images and gyro
+refute the line where frames are taken as irregularly as they are stamped.
+"""
+
+from collections import deque
+
+import numpy as np
+
+from kiteline_agent.inertial.preintegration import Samples, preintegrate
+from kiteline_core.arrays import F64
+from kiteline_core.frame import ImuCalibration
+from kiteline_core.geometry import se3
+from kiteline_core.order_statistics import median
+
+_FRAMES = 60  # that a line is fitted to: two or three seconds
+_FEWEST = 12  # from which it tells more than a stamp
+_KEPT = 2000  # frames whose times are known: as many as may wait for a monocular map
+_LEAST_S = 2e-4  # s; scatter below which stamps are as good
+_MOST = 0.25  # of the period; with more scatter frames cannot be counted
+_TAIL = 2.5  # deviations from which a stamp counts less
+_TOLD_S = 1e-3  # s; scatter that the user should know of
+_FITS = 2  # each with the weights that the one before gave
+_NEWEST, _CHANGED = 6, 4  # newest stamps, and how many of them are beyond that where the rate has changed
+_WAIT = 8  # frames to the next line after one that did not fit
+_PERIODS = np.linspace(0.88, 1.12, 241)  # that are tried, over the median of the steps
+_RELATED = 0.6  # correlation of neighbours' errors: with more the rate itself has changed
+_TURN_VARIANCE = 2.0 * 4e-4**2  # rad^2; of a rotation by two images
+_REFUTED = 40.0  # squared errors of rotations, in deviations, by which the line must be worse to be given up
+_SHARE = 0.25  # of that, at most, from one frame
+
+
+class FrameClock:
+    """Call `add` with the stamp of each frame, also of those that are not tracked."""
+
+    def __init__(self) -> None:
+        self._stamps_ns: deque[int] = deque(maxlen=_FRAMES)
+        self._begin_ns, self._period_s = 0, 0.0  # a frame of the newest line, and its period; 0: there is none
+        self._events: list[str] = []
+        self._told = False
+        self._wait = 0  # frames until a line is tried again
+        self._taken_ns: dict[int, int] = {}  # by stamp, the newest _KEPT
+        self._evidence = 0.0  # by which rotations speak against the line
+        self._judged: tuple[int, F64] | None = None  # stamp and R_m_b (3,3) of the last frame
+        self.jitter_s = 0.0  # scatter of stamps that are corrected; 0 while none are
+
+    def add(self, stamp_ns: int) -> None:
+        """A frame has come."""
+        if self._stamps_ns and stamp_ns <= self._stamps_ns[-1]:
+            self._begin_again(0)
+        self._stamps_ns.append(stamp_ns)
+        found = None if self.refuted or len(self._stamps_ns) < _FEWEST else self._line()
+        taken_ns, self.jitter_s = (stamp_ns, 0.0) if found is None else found
+        if self.jitter_s > _TOLD_S and not self._told:
+            self._told = True
+            self._events.append(
+                f"camera stamps scatter by {1e3 * self.jitter_s:.1f} ms about a constant rate: it is used"
+            )
+        if self._taken_ns:
+            taken_ns = max(taken_ns, next(reversed(self._taken_ns.values())) + 1)
+        self._taken_ns[stamp_ns] = taken_ns
+        if len(self._taken_ns) > _KEPT:
+            del self._taken_ns[next(iter(self._taken_ns))]
+
+    def take_events(self) -> list[str]:
+        """A line for the log once stamps are corrected by much, and once that turned out to be wrong."""
+        events, self._events = self._events, []
+        return events
+
+    def taken_ns(self, stamp_ns: int) -> int:
+        """When the frame of a stamp was taken; another instant is as it is."""
+        return self._taken_ns.get(stamp_ns, stamp_ns)
+
+    @property
+    def refuted(self) -> bool:
+        """True if rotations by images and gyro have shown that frames are taken when their stamps say."""
+        return self._evidence > _REFUTED
+
+    def judge(self, stamp_ns: int, R_m_b: F64, samples: Samples, bias: F64, calibration: ImuCalibration) -> None:
+        """Compare the rotation since the frame before with the gyro's, by line and by stamps.
+
+        R_m_b: (3,3) by images. samples: between the times by the line. bias: (6,).
+        """
+        before, self._judged = self._judged, (stamp_ns, R_m_b)
+        if before is None or self.jitter_s == 0.0:
+            return
+        first_s, last_s = (1e-9 * (t_ns - self.taken_ns(t_ns)) for t_ns in (before[0], stamp_ns))
+        turn = preintegrate(samples, bias, calibration).turn
+        by_line = se3.so3_log(turn.T @ before[1].T @ R_m_b)
+        rates = samples.gyro[[0, -1]] - bias[:3]
+        by_stamps = by_line - (last_s * rates[1] - first_s * turn.T @ rates[0])
+        worse = float(by_line @ by_line - by_stamps @ by_stamps) / _TURN_VARIANCE
+        most = _SHARE * _REFUTED
+        self._evidence = max(self._evidence + min(max(worse, -most), most), -_REFUTED)
+        if self.refuted:
+            self._events.append("camera stamps are right, though they scatter about a constant rate: used again")
+
+    def forget(self) -> None:
+        """The next rotation is not relative to the last one: a loss, or a map that moved."""
+        self._judged = None
+
+    def _begin_again(self, keep: int) -> None:
+        """Forget all but the newest frames."""
+        while len(self._stamps_ns) > keep:
+            self._stamps_ns.popleft()
+        self._period_s, self._wait = 0.0, 0
+
+    def _line(self) -> tuple[int, float] | None:
+        """When the newest frame was taken, and the scatter of stamps, s; None if the stamps are as good."""
+        stamps_ns = np.array(self._stamps_ns, np.int64)
+        steps_ns = stamps_ns[1:] - stamps_ns[:-1]
+        if int(steps_ns.max()) - int(steps_ns.min()) < 1e9 * _LEAST_S:
+            return None
+        t_s = 1e-9 * (stamps_ns - stamps_ns[0]).astype(np.float64)
+        begin_s, period_s = 1e-9 * (self._begin_ns - int(stamps_ns[0])), self._period_s
+        if period_s == 0.0:
+            if self._wait > 0:
+                self._wait -= 1
+                return None
+            begin_s, period_s = _rhythm(t_s, median(1e-9 * steps_ns.astype(np.float64)))
+        n, weight = np.round((t_s - begin_s) / period_s), np.ones(len(t_s))
+        n -= n[-1]
+        for _ in range(_FITS):
+            begin_s, period_s = _fitted(n, t_s, weight)
+            off = t_s - begin_s - period_s * n
+            usual = 1.48 * median(np.abs(off))
+            weight = 1.0 / np.maximum(1.0, np.abs(off) / max(_TAIL * usual, 1e-9)) ** 2
+        if int((np.abs(off[-_NEWEST:]) > _TAIL * usual).sum()) >= _CHANGED:
+            self._begin_again(_CHANGED)
+            return None
+        near = np.clip(off, -_TAIL * usual, _TAIL * usual)
+        related = float(near[1:] @ near[:-1]) > _RELATED * float(near @ near)
+        if related or not 0.5 * _LEAST_S < usual < _MOST * period_s or int((n[1:] == n[:-1]).sum()) > 0:
+            self._begin_again(_FRAMES // 2)
+            self._wait = _WAIT
+            return None
+        self._begin_ns, self._period_s = int(stamps_ns[0]) + round(1e9 * begin_s), period_s
+        return self._begin_ns, usual
+
+
+def _rhythm(t_s: F64, about_s: float) -> tuple[float, float]:
+    """Phase and period, about_s or near it, to which times t_s (n,) fit best, whatever frames are missing."""
+    periods_s = about_s * _PERIODS
+    waves = np.exp(2j * np.pi * t_s / periods_s[:, None]).mean(axis=1)
+    best = int(np.argmax(np.abs(waves)))
+    return float(np.angle(waves[best]) / (2.0 * np.pi) * periods_s[best]), float(periods_s[best])
+
+
+def _fitted(n: F64, t_s: F64, weight: F64) -> tuple[float, float]:
+    """Weighted line through t_s (k,) over n (k,): its value at n = 0, and its slope."""
+    share = weight / weight.sum()
+    mean_n, mean_t = float(share @ n), float(share @ t_s)
+    slope = float(share @ ((n - mean_n) * (t_s - mean_t))) / float(share @ (n - mean_n) ** 2)
+    return mean_t - slope * mean_n, slope
