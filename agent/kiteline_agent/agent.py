@@ -138,8 +138,9 @@ class Agent:
         events = self._take_corrections(self._channel.receive(step_input.packets, now_ns))
         self._camera.motion.add_odometry(step_input.odometry)
         estimate = predicted = None
-        if step_input.imu is not None:
-            self._skipped_imu.append(step_input.imu)
+        imu = self._camera.motion.timed(step_input.imu)
+        if imu is not None:
+            self._skipped_imu.append(imu)
         if step_input.frame is not None:
             self._camera.motion.see(step_input.frame.t_ns)
             tracked, more = self._govern(step_input.frame, step_input)

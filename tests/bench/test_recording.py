@@ -193,6 +193,7 @@ def test_samples_of_the_imu_are_left_out_or_stamped_late(flight: Recording) -> N
 
 
 def test_stamps_scatter_and_keep_their_order(flight: Recording) -> None:
+    assert (np.diff([item.frame.t_ns for item in scattered_stamps(flight, 0.1, 1).items]) > 0).all()
     shaken = scattered_stamps(flight, 2e-3, 1).items
     stamps = np.array([item.frame.t_ns for item in shaken])
     off_s = 1e-9 * (stamps - np.array([item.frame.t_ns for item in flight.items]))

@@ -6,11 +6,12 @@ import numpy as np
 
 from kiteline_agent.inertial.calibration.known_imu import KnownImuConfig
 from kiteline_agent.inertial.calibration.self_calibration import SelfCalibration
+from kiteline_agent.inertial.clocks.frame_clock import FrameClock
 from kiteline_agent.inertial.fixed_lag import BodyVelocity, FixedLagSmoother, InertialState, VisualPoints, tilt_of
-from kiteline_agent.inertial.frame_clock import FrameClock
 from kiteline_agent.inertial.imu_initialisation import ImuInitialiser, InertialStartState, TimedPose
+from kiteline_agent.inertial.imu_prior import ImuPrior
 from kiteline_agent.inertial.inertial_config import InertialConfig, StartDeviations
-from kiteline_agent.inertial.preintegration import BiasPrior, KnownImu, Preintegrated, Samples, preintegrate
+from kiteline_agent.inertial.preintegration import BiasPrior, Preintegrated, Samples, preintegrate
 from kiteline_agent.inertial.sample_buffer import SampleBuffer, without_held
 from kiteline_agent.inertial.scale_filter import INTERVAL_S, ScaleFilter, camera_scaled
 from kiteline_core.arrays import F64
@@ -56,9 +57,8 @@ class InertialTracker:
         self._reported_s = config.calibration.offset_s
         self.scale = ScaleFilter(calibration, config.gravity_m_s2, self._p_b_c)  # of a monocular map
         self._scale_from: tuple[int, F64] | None = None  # stamp and pose by images at which its interval begins
-        self._cached: tuple[tuple[int, int, int | None], Samples | None] | None = (
-            None  # interval that was asked for last
-        )
+        # the interval that was asked for last
+        self._cached: tuple[tuple[int, int, int | None], Samples | None] | None = None
         self._incomplete: tuple[int, int] | None = None  # the last interval, if samples at its end were missing
         self._bias = np.zeros(6)
         self._last: tuple[int, F64] | None = None  # stamp and T_m_b of the last frame
@@ -81,10 +81,10 @@ class InertialTracker:
         return self._smoother.state if self._smoother.running else None
 
     @property
-    def known(self) -> KnownImu:
+    def known(self) -> ImuPrior:
         """What a new map begins with: values that are applied, biases so far, and how far these may have moved."""
         bias = BiasPrior(self._bias.copy(), _PRIOR_SIGMA) if self.started is not None else None
-        return KnownImu(bias, self.self_calibration.applied_offset, self.self_calibration.correct, self.clock.taken_ns)
+        return ImuPrior(bias, self.self_calibration.applied_offset, self.self_calibration.correct, self.clock)
 
     @property
     def image_loss_s(self) -> float:
@@ -109,9 +109,8 @@ class InertialTracker:
 
     def offset_report(self) -> dict[str, float]:
         """In ms: time offset, its deviation, what is applied, and the scatter of stamps that is corrected."""
-        offset_s, sigma_s = self.time_offset_s
-        values = {"ms": offset_s, "sigma_ms": sigma_s, "applied_ms": self.self_calibration.offset_s,
-                  "jitter_ms": self.clock.jitter_s}  # fmt: skip
+        (offset_s, sigma_s), applied_s = self.time_offset_s, self.self_calibration.offset_s
+        values = {"ms": offset_s, "sigma_ms": sigma_s, "applied_ms": applied_s, "jitter_ms": self.clock.jitter_s}
         return {name: round(1e3 * value, 2) for name, value in values.items()}
 
     def take_calibration_events(self) -> list[str]:
@@ -152,7 +151,8 @@ class InertialTracker:
         """
         if self._last is None or not self._smoother.running:
             return None
-        end_ns = self.clock.taken_ns(t_ns) + self._offset_ns
+        # a frame may have been taken later than it is stamped
+        end_ns = max(self.clock.taken_ns(t_ns) + self._offset_ns, self._interval_end_ns + 1)
         samples = self._buffer.extended(imu).between(self._interval_end_ns, end_ns)
         if samples is None:
             return None
@@ -182,8 +182,9 @@ class InertialTracker:
         """
         stamp_ns, t_ns = t_ns, self.clock.taken_ns(t_ns)
         samples, depth_m = self._interval(t_ns), points.depth_m(T_m_b_visual)
+        compared = None if self.self_calibration.awaits_search else samples
+        self.clock.judge(stamp_ns, T_m_b_visual[:3, :3], compared, self._bias, self._calibration)
         if samples is not None:
-            self.clock.judge(stamp_ns, T_m_b_visual[:3, :3], samples, self._bias, self._calibration)
             self._calibrate(t_ns, T_m_b_visual, depth_m, samples.duration_s)
             if self.self_calibration.awaits_search:
                 self._smoother.stop()
@@ -288,6 +289,7 @@ class InertialTracker:
         """Begin a new map at an unknown pose relative to the old one. Biases are kept."""
         self._smoother.stop()
         self._initialiser.clear()
+        self.clock.forget()
         self._last = None
         self.self_calibration.begin_map()
         self._incomplete = None
@@ -370,7 +372,7 @@ class InertialTracker:
             self.scale.resume(state.velocity)
             self._scale_from = (t_ns, T_m_b)
         elif (t_ns - self._scale_from[0]) * 1e-9 >= INTERVAL_S:
-            samples = self.samples_between(self._scale_from[0], t_ns)
+            samples = self._between(self._scale_from[0] + self._offset_ns, t_ns + self._offset_ns)
             if samples is not None and depth_m > 0.0:
                 self.scale.add(self._scale_from[1], T_m_b, samples, state.bias[:3], depth_m)
             else:

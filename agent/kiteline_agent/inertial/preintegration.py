@@ -1,6 +1,5 @@
 """Preintegration of IMU samples between two instants, with covariance and bias Jacobians."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -44,20 +43,6 @@ class TimeOffset:
 
     offset_s: float
     sigma_s: float
-
-
-@dataclass(frozen=True, slots=True)
-class KnownImu:
-    """What is known of an IMU before a map begins.
-
-    bias: None before any was estimated. correct: gives samples with the scales and axes that are applied. taken_ns:
-    when the frame of a stamp was taken, before the offset.
-    """
-
-    bias: BiasPrior | None
-    offset: TimeOffset
-    correct: Callable[[Samples], Samples]
-    taken_ns: Callable[[int], int]
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,15 +7,16 @@ import numpy as np
 
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.governor.cost_model import Work
+from kiteline_agent.inertial.clocks.frame_clock import FrameClock
+from kiteline_agent.inertial.imu_prior import ImuPrior
 from kiteline_agent.inertial.imu_watch import SILENT_S
-from kiteline_agent.inertial.preintegration import BiasPrior, KnownImu, Samples, TimeOffset, preintegrate
+from kiteline_agent.inertial.preintegration import BiasPrior, Samples, TimeOffset, preintegrate
 from kiteline_agent.inertial.sample_buffer import SampleBuffer
 from kiteline_agent.initialisation import corner_tracks
 from kiteline_agent.initialisation.contradiction import ContradictionWatch, contradicts, exceeds_lens_errors
 from kiteline_agent.initialisation.corner_tracks import CornerObservations, CornerTracks, TrackedKeyframe
 from kiteline_agent.initialisation.landmark_realignment import realigned
-from kiteline_agent.initialisation.metric_restart import MetricPoints, metric_points_at
-from kiteline_agent.initialisation.window import lens_correction
+from kiteline_agent.initialisation.metric_restart import MetricPoints, window_points
 from kiteline_agent.initialisation.window.window_bundle import InertialBundle, lens_prior
 from kiteline_agent.initialisation.window.window_noise import LEAST, MOST, Vibration, WindowNoise, vibration
 from kiteline_agent.initialisation.window.window_samples import WindowSamples
@@ -41,7 +42,6 @@ _LOWER_COST = 1.0  # by which a solution from nothing must be better: a deviatio
 _SAME_SCALE = 0.5  # deviations of the scale: solutions that differ by less left out other corners
 _MIN_COMMON = 3  # keyframes of two windows whose distances are compared
 _BEHIND_SHARE = 0.25  # of the time by which tracking is behind: then fewer windows are solved
-_MIN_DEPTH_M = 0.1  # m of a landmark in the newest camera
 _MIN_SPAN_S = 2.4  # s before which a window tells no scale
 _MAX_SPAN_S = 24.0  # s; longest window: older keyframes are dropped
 _REST_S = 4.0  # s of a rest before the flight that a window holds: enough for the biases
@@ -52,7 +52,6 @@ _LANDMARKS_EACH = 70  # in each keyframe: in fast turns no track is long
 _AGREEMENT = 0.04  # relative difference of the scale to that of the solution before, on its keyframes
 _LEAST_ACCEL_NOISE = 0.5  # times the noise of single samples: vibration averages out to half of it
 _STATE_INFLATION = 2.0  # of the deviations of the state with which tracking begins
-_DEPTH_SIGMA = 0.25  # relative deviation above which a landmark has no depth yet
 _STRUCTURE_PX = 1.2  # px; median error of corners with the gyro's rotations: 0.3 if these are right, else 2
 _SCALE_SIGMA = 0.02  # relative deviation of the scale below which it is metric
 _LANDMARKS = 220  # of the window, with the longest tracks: errors of few add up to a wrong turn and motion
@@ -91,11 +90,12 @@ class _Solved:
 
 @dataclass(frozen=True, slots=True)
 class _Imu:
-    """Samples of a window, and what is known of the IMU before it: biases and time offset."""
+    """Samples of a window, and what is known of the IMU before it: biases and time offset. clock: of the frames."""
 
     samples: WindowSamples
     prior: BiasPrior
     offset: TimeOffset
+    clock: FrameClock
 
 
 class InertialStart:
@@ -127,6 +127,7 @@ class InertialStart:
         self._lens_info = self._lens_prior  # of what is left of the lens's errors
         self._contradiction = ContradictionWatch(start.contradiction)
         self._warnings: list[str] = []
+        self._by_stamps = False  # windows fit by stamps, and not by the camera's rate
         self._structure_px = 0.0  # of the newest solution from nothing
         self._tried_ns: int | None = None
         self._last_samples_ns: int | None = None  # stamp of the last frame with samples
@@ -143,6 +144,7 @@ class InertialStart:
         self._tracks.clear()
         self._attempt = self._before = self._tried_ns = None
         self._noise = self._vibration = None
+        self._by_stamps = False
 
     @property
     def contradicted(self) -> bool:
@@ -165,7 +167,7 @@ class InertialStart:
         first_ns = self.waiting.first_t_ns
         return not self.solving and (first_ns is None or not self._tracks.is_due(first_ns))
 
-    def add(self, ctx: FrameContext, imu: KnownImu) -> InertialMap | None:
+    def add(self, ctx: FrameContext, imu: ImuPrior) -> InertialMap | None:
         """Follow the corners into a frame whose samples were taken in. Returns a map once its scale is known."""
         every = self._config.governor.cpu_percent <= 0.0  # else the frames between keyframes do not come here
         self._work.followed += int(every)
@@ -190,18 +192,22 @@ class InertialStart:
                 return end.value  # type: ignore[no-any-return]
         return None
 
-    def _turn(self, t_ns: int, imu: KnownImu) -> F64 | None:
+    def _turn(self, t_ns: int, imu: ImuPrior) -> F64 | None:
         """(3,3) rotation of the camera since the last keyframe, by the gyro; None without samples."""
-        keyframes, offset_ns = self._tracks.keyframes, round(imu.offset.offset_s * 1e9)
+        keyframes, offset = self._tracks.keyframes, imu.offset if self._before is None else self._before.solution.offset
         if not keyframes:
             return None
-        begin_ns, end_ns = (imu.taken_ns(t) + offset_ns for t in (keyframes[-1].t_ns, t_ns))
+        begin_ns, end_ns = (self._time_ns(t, imu) + round(offset.offset_s * 1e9) for t in (keyframes[-1].t_ns, t_ns))
         samples = self._buffer.between(begin_ns, end_ns)
         if samples is None:
             return None
         samples, bias = imu.correct(samples), np.zeros(6) if imu.bias is None else imu.bias.bias
         R_b_c = self._camera.T_b_c[:3, :3]
         return np.asarray(R_b_c.T @ preintegrate(samples, bias, self._calibration).turn @ R_b_c)
+
+    def _time_ns(self, stamp_ns: int, imu: ImuPrior) -> int:
+        """When a frame was taken, by its stamp or by the camera's rate."""
+        return stamp_ns if self._by_stamps else imu.clock.taken_ns(stamp_ns)
 
     def _bound_window(self, t_ns: int) -> None:
         """Forget keyframes that the newest window no longer holds."""
@@ -210,7 +216,7 @@ class InertialStart:
         if self._tracks.flow_px() < _STILL_FLOW * config.min_flow * self._camera.fx:
             self._tracks.drop_before(t_ns - round(_REST_S * 1e9))
 
-    def _begin(self, ctx: FrameContext, imu: KnownImu) -> InParts[InertialMap | None] | None:
+    def _begin(self, ctx: FrameContext, imu: ImuPrior) -> InParts[InertialMap | None] | None:
         """An attempt with the window that ends with this keyframe; None while none is due."""
         config, keyframes = self._config.inertial_start, list(self._tracks.keyframes)
         span_s = (ctx.t_ns - keyframes[0].t_ns) * 1e-9
@@ -219,14 +225,15 @@ class InertialStart:
         if span_s < _MIN_SPAN_S or not waited or self._tracks.flow_px() < config.min_flow * self._camera.fx:
             return None
         self._tried_ns = ctx.t_ns
-        samples = WindowSamples(self._buffer, imu.correct, [imu.taken_ns(k.t_ns) for k in keyframes])
+        times_ns = [self._time_ns(k.t_ns, imu) for k in keyframes]
+        samples = WindowSamples(self._buffer, imu.correct, times_ns, imu.offset.offset_s)
         missing = samples.missing(imu.offset.offset_s)
         if missing is not None:  # the window begins after it
             self._tracks.drop_before(keyframes[missing + 1].t_ns)
             self._tried_ns = None
             return None
         prior = self._default_prior() if imu.bias is None else imu.bias
-        return self._attempting(ctx, keyframes, _Imu(samples, prior, imu.offset))
+        return self._attempting(ctx, keyframes, _Imu(samples, prior, imu.offset, imu.clock))
 
     def _attempting(
         self, ctx: FrameContext, keyframes: list[TrackedKeyframe], imu: _Imu
@@ -245,6 +252,7 @@ class InertialStart:
         if found is None or not found.solution.fits:
             warm, found = None, (yield from self._solve(observations, imu, None))
         if found is None:
+            self._doubt(imu.clock)
             self._before = None
             wrong_turns = self._structure_px > _STRUCTURE_PX
             self._note_contradiction(ctx.t_ns, contradicts=True if wrong_turns else None)
@@ -267,6 +275,8 @@ class InertialStart:
         self._before = SolvedWindow(stamps, observations.ids, found.xyz, solution)
         (wrong, by_imu), fits = self._contradicts(solution, noise), solution.converged and solution.fits
         self._note_contradiction(ctx.t_ns, contradicts=wrong if wrong or fits else None, by_imu=by_imu)
+        if not fits:
+            self._doubt(imu.clock)
         known = fits and sigma < _SCALE_SIGMA and not wrong
         agrees = before is not None and self._agrees(before, self._before)
         self._noise = modelled
@@ -278,10 +288,12 @@ class InertialStart:
             return None
         bundle = self._bundle(all_corners, imu)
         placed = yield from self._counted(bundle.placing_landmarks(solution.state), len(keyframes))
-        points = None if placed is None else self._points(ctx, all_corners, placed)
+        points = None if placed is None else window_points(ctx, all_corners, placed, self._camera)
         if points is None or len(points.sigma_rho) < self._config.local_map.first_points:
             self._tried_ns = None  # the next keyframe may see more of the landmarks
             return None
+        if self._by_stamps:
+            imu.clock.refute()
         cov = _STATE_INFLATION**2 * solution.cov
         duration_s = (stamps[-1] - stamps[0]) * 1e-9
         self._lens_info = np.asarray(np.linalg.inv(solution.lens_cov), np.float64)
@@ -292,6 +304,10 @@ class InertialStart:
             ctx, points, solution, cov, solution.scale_sigma, duration_s, accel_noise, lens, tuple(keyframes),
             all_corners,
         )  # fmt: skip
+
+    def _doubt(self, clock: FrameClock) -> None:
+        """Place the frames of the next window otherwise: by the camera's rate, or by their stamps."""
+        self._by_stamps = clock.jitter_s > 0.0 and not self._by_stamps
 
     def _solve(self, corners: CornerObservations, imu: _Imu, warm: WarmStart | None) -> InParts[_Solved | None]:
         bundle = self._bundle(corners, imu)
@@ -371,20 +387,6 @@ class InertialStart:
             return False
         a, b = (w.solution.state.p[[w.t_ns.index(t) for t in common]] for w in (before, now))
         return lengths_apart(a, b) < _AGREEMENT
-
-    def _points(self, ctx: FrameContext, corners: CornerObservations, solution: WindowSolution) -> MetricPoints | None:
-        """The corners of the newest keyframe whose depth is known."""
-        seen = corners.seen[-1] & (solution.depth_m > _MIN_DEPTH_M) & (solution.depth_sigma < _DEPTH_SIGMA)
-        fits = bool(seen.any()) and np.isfinite(solution.depth_sigma[seen]).all()
-        if not fits:
-            return None
-        camera = self._camera
-        uv = corners.xy[-1, seen] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
-        octave = np.zeros(len(uv), np.uint8)
-        found = metric_points_at(ctx, uv, octave, solution.depth_m[seen], solution.depth_sigma[seen], self._camera)
-        focal, centre = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
-        true = lens_correction.true_place((found.points.uv - centre) / focal, solution.state.lens)
-        return replace(found, points=replace(found.points, uv=true * focal + centre))
 
     def _bundle(self, corners: CornerObservations, imu: _Imu) -> InertialBundle:
         return InertialBundle(

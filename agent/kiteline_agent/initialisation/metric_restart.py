@@ -1,14 +1,17 @@
-"""Restarts a monocular map in metres: the landmarks tracked now become new landmarks of a new submap.
+"""New landmarks of a monocular map in metres: of a window of corners, or of those tracked in a map of another unit.
 
 Shared values keep their unit, so a scale found late begins a new submap instead of rescaling the old one.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from kiteline_agent.imaging import features
 from kiteline_agent.imaging.feature_kernels import BORDER
+from kiteline_agent.initialisation.corner_tracks import CornerObservations
+from kiteline_agent.initialisation.window import lens_correction
+from kiteline_agent.initialisation.window.window_state import WindowSolution
 from kiteline_agent.keyframes.new_landmarks import NewPoints
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.tracking.frame_context import FrameContext
@@ -18,6 +21,8 @@ from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import KeyframeId
 from kiteline_core.order_statistics import median
 
+_MIN_DEPTH_M = 0.1  # m of a landmark in the newest camera of a window
+_DEPTH_SIGMA = 0.25  # relative deviation above which a landmark of a window has no depth yet
 _MIN_SIGMA_PX = 0.06  # px of virtual disparity, of depths that many frames have sharpened
 
 
@@ -47,6 +52,21 @@ def metric_points(ctx: FrameContext, track: Track, local_map: LocalMap, unit_m: 
     octave = local_map.octave[track.rows[keep]]
     uv = track.observed[keep, :2]
     return metric_points_at(ctx, uv, octave, unit_m * depth, relative, local_map.camera)
+
+
+def window_points(
+    ctx: FrameContext, corners: CornerObservations, solution: WindowSolution, camera: RectifiedCamera
+) -> MetricPoints | None:
+    """The corners of a window's newest keyframe, at ctx, whose depth is known, as the corrected lens shows them."""
+    seen = corners.seen[-1] & (solution.depth_m > _MIN_DEPTH_M) & (solution.depth_sigma < _DEPTH_SIGMA)
+    if not (bool(seen.any()) and np.isfinite(solution.depth_sigma[seen]).all()):
+        return None
+    focal, centre = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
+    uv = corners.xy[-1, seen] * focal + centre
+    octave = np.zeros(len(uv), np.uint8)
+    found = metric_points_at(ctx, uv, octave, solution.depth_m[seen], solution.depth_sigma[seen], camera)
+    true = lens_correction.true_place((found.points.uv - centre) / focal, solution.state.lens)
+    return replace(found, points=replace(found.points, uv=true * focal + centre))
 
 
 def metric_points_at(

@@ -8,6 +8,7 @@ import numpy as np
 from kiteline_agent.config import OdometerConfig
 from kiteline_agent.covariance.calibration_error_kernels import adjoint
 from kiteline_agent.inertial.calibration.known_imu import KnownImuConfig
+from kiteline_agent.inertial.clocks.sample_clock import SampleClock
 from kiteline_agent.inertial.fixed_lag import VisualPoints
 from kiteline_agent.inertial.gravity_alignment import up_of
 from kiteline_agent.inertial.imu_initialisation import InertialStartState
@@ -67,6 +68,7 @@ class MotionModel:
         if self.tracker is not None and imu is not None and metric:
             self.loss_motion = LossMotionEstimator(self.tracker, imu, config.gravity_m_s2)
         self.odometer = Odometer(camera.T_b_c, odometer, metric=metric)
+        self._sample_clock = SampleClock()
         self._watch = ImuWatch(SILENT_S, config.gravity_m_s2)
         self._events: list[str] = []
         self.has_false_vertical = False  # it came from an IMU that never agreed with the images
@@ -115,6 +117,10 @@ class MotionModel:
         """A frame with this stamp has come, whether or not it is tracked."""
         if self.tracker is not None:
             self.tracker.clock.add(t_ns)
+
+    def timed(self, imu: ImuBatch | None) -> ImuBatch | None:
+        """New samples with the times at which they were taken."""
+        return imu if self.tracker is None else self._sample_clock.timed(imu)
 
     def add_odometry(self, odometry: OdometryBatch | None) -> None:
         """Buffer the odometer samples since the last step."""
@@ -201,6 +207,7 @@ class MotionModel:
         return (
             events
             + self.odometer.take_events()
+            + self._sample_clock.take_events()
             + ([] if self.tracker is None else self.tracker.take_calibration_events())
         )
 

@@ -115,7 +115,7 @@ def scattered_stamps(recording: Recording, deviation_s: float, seed: int) -> Rec
     """Stamp each image by chance sooner or later than it was taken; true poses stay those of the images."""
     stamps = [item.frame.t_ns for item in recording.items]
     off_s = np.random.default_rng(seed).normal(0.0, deviation_s, len(stamps))
-    new = np.maximum.accumulate(stamps + np.round(1e9 * off_s).astype(np.int64) + np.arange(len(stamps)))
+    new = np.maximum.accumulate(stamps + np.round(1e9 * off_s).astype(np.int64)) + np.arange(len(stamps))
     return _each(recording, lambda k, frame: replace(frame, t_ns=int(new[k])))
 
 

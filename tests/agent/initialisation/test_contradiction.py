@@ -10,7 +10,9 @@ import pytest
 
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.governor.cost_model import Work
-from kiteline_agent.inertial.preintegration import KnownImu, TimeOffset
+from kiteline_agent.inertial.clocks.frame_clock import FrameClock
+from kiteline_agent.inertial.imu_prior import ImuPrior
+from kiteline_agent.inertial.preintegration import TimeOffset
 from kiteline_agent.inertial_start_config import ContradictionConfig
 from kiteline_agent.initialisation import inertial_start
 from kiteline_agent.initialisation.contradiction import ContradictionWatch, contradicts, exceeds_lens_errors
@@ -29,16 +31,16 @@ def start_with(monkeypatch: pytest.MonkeyPatch, change: Change, keyframes: int =
     """Seconds until a map begins (infinite if none does) on a changed window, and the warnings until then."""
     corners, cut, _ = window(1, keyframes=keyframes, noise_px=0.2)
     corners, cut = change(corners, cut)
-    monkeypatch.setattr(InertialStart, "_points", lambda *_: SimpleNamespace(sigma_rho=np.ones(100)))
+    monkeypatch.setattr(inertial_start, "window_points", lambda *_: SimpleNamespace(sigma_rho=np.ones(100)))
     monkeypatch.setattr(inertial_start, "realigned", lambda _keyframes, observations, *_: observations)
     start = InertialStart(CAMERA, CALIBRATION, AgentConfig(), Work())
     start._tracks = Tracks(corners)  # type: ignore[assignment]
-    monkeypatch.setattr(inertial_start, "WindowSamples", lambda _buffer, _correct, stamps: Recorded(cut, len(stamps)))
+    monkeypatch.setattr(inertial_start, "WindowSamples", lambda *args: Recorded(cut, len(args[2])))
     monkeypatch.setattr(start, "_measured_noise", WindowNoise)
     warnings: list[str] = []
     for k in range(keyframes):
         ctx: Any = SimpleNamespace(t_ns=250_000_000 * k, images=SimpleNamespace(left=None))
-        found = start.add(ctx, KnownImu(None, TimeOffset(0.0, 0.02), lambda samples: samples, lambda t_ns: t_ns))
+        found = start.add(ctx, ImuPrior(None, TimeOffset(0.0, 0.02), lambda samples: samples, FrameClock()))
         warnings += start.take_warnings()
         if found is not None:
             return ctx.t_ns * 1e-9, warnings

@@ -11,7 +11,9 @@ import pytest
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.governor.cost_model import Work
 from kiteline_agent.imaging.features import DetectorConfig, build_pyramid
-from kiteline_agent.inertial.preintegration import KnownImu, Samples, TimeOffset
+from kiteline_agent.inertial.clocks.frame_clock import FrameClock
+from kiteline_agent.inertial.imu_prior import ImuPrior
+from kiteline_agent.inertial.preintegration import Samples, TimeOffset
 from kiteline_agent.inertial_start_config import CornerTracksConfig
 from kiteline_agent.initialisation import inertial_start
 from kiteline_agent.initialisation.corner_tracks import CornerObservations, CornerTracks, TrackedKeyframe, with_found
@@ -19,7 +21,7 @@ from kiteline_agent.initialisation.inertial_start import InertialStart
 from kiteline_agent.initialisation.metric_restart import MetricPoints
 from kiteline_agent.initialisation.window.inertial_terms import CutSamples
 from kiteline_agent.initialisation.window.window_noise import WindowNoise
-from kiteline_agent.initialisation.window.window_state import SolvedWindow, WindowSolution, finished
+from kiteline_agent.initialisation.window.window_state import SolvedWindow, finished
 from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_agent.tracking.waiting_frames import WaitingFrames
 from kiteline_core.arrays import F64
@@ -30,7 +32,7 @@ from tests.agent.initialisation.test_window_bundle import CALIBRATION, FOCAL, T_
 CAMERA: Any = SimpleNamespace(fx=FOCAL, fy=FOCAL, cx=376.0, cy=240.0, width=752, height=480, T_b_c=T_B_C)
 
 
-EXACT = KnownImu(None, TimeOffset(0.0, 1e-6), lambda samples: samples, lambda t_ns: t_ns)
+EXACT = ImuPrior(None, TimeOffset(0.0, 1e-6), lambda samples: samples, FrameClock())
 
 
 class Recorded:
@@ -83,14 +85,12 @@ def begins_after(monkeypatch: pytest.MonkeyPatch, poor: int) -> tuple[float, flo
     corners, cut, _ = window(1, keyframes=24, noise_px=0.2)
     asked: list[float] = []
 
-    def points(
-        self: InertialStart, ctx: FrameContext, corners: CornerObservations, solution: WindowSolution
-    ) -> MetricPoints:
+    def points(ctx: FrameContext, *_: object) -> MetricPoints:
         asked.append(ctx.t_ns * 1e-9)
         few: Any = SimpleNamespace(sigma_rho=np.ones(5 if len(asked) <= poor else 100))
         return few  # type: ignore[no-any-return]
 
-    monkeypatch.setattr(InertialStart, "_points", points)
+    monkeypatch.setattr(inertial_start, "window_points", points)
     monkeypatch.setattr(inertial_start, "realigned", lambda _keyframes, observations, *_: observations)
     config = AgentConfig()
     known = replace(
@@ -99,13 +99,40 @@ def begins_after(monkeypatch: pytest.MonkeyPatch, poor: int) -> tuple[float, flo
     config = replace(config, inertial_start=replace(config.inertial_start, bundle=known))  # the scale is known sooner
     start = InertialStart(CAMERA, CALIBRATION, config, Work())
     start._tracks = Tracks(corners)  # type: ignore[assignment]
-    monkeypatch.setattr(inertial_start, "WindowSamples", lambda _buffer, _correct, stamps: Recorded(cut, len(stamps)))
+    monkeypatch.setattr(inertial_start, "WindowSamples", lambda *args: Recorded(cut, len(args[2])))
     monkeypatch.setattr(start, "_measured_noise", WindowNoise)
     for k in range(24):
         ctx: Any = SimpleNamespace(t_ns=250_000_000 * k, images=SimpleNamespace(left=None))
         if start.add(ctx, EXACT) is not None:
             return asked[0], asked[-1]
     raise AssertionError("the map never begins")
+
+
+@pytest.mark.parametrize("taken_as_stamped", [True, False])
+def test_frames_that_are_taken_as_irregularly_as_they_are_stamped_begin_a_map_by_their_stamps(
+    monkeypatch: pytest.MonkeyPatch, taken_as_stamped: bool
+) -> None:
+    """By the line through the stamps no window fits; and the other way round."""
+    uneven_s = 8e-3
+    corners, cut, _ = window(1, keyframes=36, noise_px=0.2, uneven_s=uneven_s if taken_as_stamped else 0.0)
+    even_ns = 500_000_000 + 250_000_000 * np.arange(36)
+    stamps = even_ns + np.round(1e9 * uneven_s * np.random.default_rng(51).normal(size=36)).astype(np.int64)
+    clock = FrameClock()
+    clock.jitter_s = uneven_s  # as the frames between keyframes have shown it
+    clock._taken_ns = dict(zip(stamps.tolist(), even_ns.tolist()))
+    monkeypatch.setattr(inertial_start, "window_points", lambda *_: SimpleNamespace(sigma_rho=np.ones(100)))
+    monkeypatch.setattr(inertial_start, "realigned", lambda _keyframes, observations, *_: observations)
+    start = InertialStart(CAMERA, CALIBRATION, AgentConfig(), Work())
+    start._tracks = Tracks(corners)  # type: ignore[assignment]
+    start._buffer = cut.__self__._buffer  # type: ignore[attr-defined]
+    prior = ImuPrior(None, TimeOffset(0.0, 0.02), lambda samples: samples, clock)
+    for stamp_ns in stamps.tolist():
+        ctx: Any = SimpleNamespace(t_ns=stamp_ns, images=SimpleNamespace(left=None))
+        if start.add(ctx, prior) is not None:
+            break
+    else:
+        raise AssertionError("the map never begins")
+    assert clock.refuted is taken_as_stamped
 
 
 def test_a_map_that_lacks_landmarks_begins_at_one_of_the_next_keyframes(monkeypatch: pytest.MonkeyPatch) -> None:

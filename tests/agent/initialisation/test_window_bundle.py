@@ -34,16 +34,18 @@ CALIBRATION = ImuCalibration()
 
 def window(
     seed: int, keyframes: int = 13, haste: float = 0.4, noise_px: float = 0.5, still: bool = False,
-    lost_s: tuple[float, float] = (0.0, 0.0), late_s: float = 0.0,
+    lost_s: tuple[float, float] = (0.0, 0.0), late_s: float = 0.0, uneven_s: float = 0.0,
 ) -> tuple[CornerObservations, CutSamples, F64]:  # fmt: skip
     """Corners, samples and true poses T_w_b (K,4,4) of keyframes 0.25 s apart.
 
-    lost_s: between these are no samples. late_s: by which samples are stamped late.
+    lost_s: between these are no samples. late_s: by which samples are stamped late. uneven_s: deviation of the times
+    of keyframes from a constant rate.
     """
     rng = np.random.default_rng(seed)
     path = built_in_path("room", 12.0 / haste, T_B_C, seed)
     path = Path(path.coefficients, path.knot_s * haste, path.length_s * haste, 0.7, 8.0 if still else 0.0)
     t_ns = 500_000_000 + 250_000_000 * np.arange(keyframes, dtype=np.int64)
+    t_ns += np.round(1e9 * uneven_s * np.random.default_rng(seed + 50).normal(size=keyframes)).astype(np.int64)
     imu_t = np.arange(0, int(t_ns[-1]) + 200_000_000, 5_000_000, dtype=np.int64)
     samples = sim_imu.measure(path, imu_t, 0, CALIBRATION, seed)
     here = (imu_t * 1e-9 < lost_s[0]) | (imu_t * 1e-9 >= lost_s[1])
@@ -60,7 +62,7 @@ def window(
         xy[k] = p[:, :2] / z + noise_px / FOCAL * rng.normal(size=(len(cloud), 2))
     corners = CornerObservations(xy, seen, np.arange(len(cloud)))
     corners = corners.part(np.flatnonzero(seen.sum(axis=0) >= 3)[:120])
-    return corners, WindowSamples(buffer, lambda s: s, [int(t) for t in t_ns]).at, truth
+    return corners, WindowSamples(buffer, lambda s: s, [int(t) for t in t_ns], 0.0).at, truth
 
 
 def changed(cut: CutSamples, change: Callable[[Samples], Samples]) -> CutSamples:

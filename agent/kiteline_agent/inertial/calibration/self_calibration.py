@@ -135,15 +135,18 @@ class SelfCalibration:
     @property
     def applied_offset(self) -> TimeOffset:
         """The time offset that is applied, and by how much it may be off; exact where it may not be changed."""
+        if not self._config.apply_offset:
+            return TimeOffset(self.offset_s, _EXACTLY_S)
         off_s = float(np.hypot(self.gyro.offset_sigma_s, self.gyro.offset_s - self.offset_s))
-        return TimeOffset(self.offset_s, off_s if self._config.apply_offset else _EXACTLY_S)
+        if self._unprimed_gyro is not None:  # what earlier flights found may be of another IMU
+            off_s = max(off_s, self._config.offset_sigma_s)
+        return TimeOffset(self.offset_s, max(off_s, _EXACTLY_S))
 
     def begin_with_offset(self, found: TimeOffset) -> None:
-        """Begin a map whose start found the time offset."""
-        sigma_s = float(np.hypot(found.sigma_s, _KEPT_OFFSET_SIGMA_S))
-        for gyro in (self.gyro, self._unprimed_gyro):
-            if gyro is not None:
-                gyro.begin_with_offset(found.offset_s, sigma_s)
+        """Begin a map whose start found the time offset. One that may not be changed was not found."""
+        if not self._config.apply_offset:
+            return
+        self.gyro.begin_with_offset(found.offset_s, float(np.hypot(found.sigma_s, _KEPT_OFFSET_SIGMA_S)))
         self._given_offset_s = found.offset_s
         self._follow_offset(np.inf)
 

@@ -69,6 +69,10 @@ class InertialTerms:
                 self._intervals, self._cut_at_s = _without_measured_noise(intervals), offset_s
         return self._intervals
 
+    def has_samples_at(self, offset_s: float) -> bool:
+        """True if the samples were cut near this time offset: none are missing there."""
+        return abs(offset_s - self._cut_at_s) < 2.0 * _FAR_S
+
     def integrate(self, state: WindowState) -> None:
         """Integrate the samples with the state's biases, at its time offset."""
         self._known, self._integrated_at_s = None, state.offset_s

@@ -239,6 +239,8 @@ class InertialBundle:
         variance = float(along @ cov @ along)
         if not (np.isfinite(cov).all() and variance > 0.0 and np.isfinite(state.p).all()):
             return None
+        if not self._terms.has_samples_at(state.offset_s):
+            return None
         last = STATE * (n - 1)
         order = np.concatenate(
             [last + np.arange(9), STATE * n + np.arange(3), last + np.arange(9, 12), STATE * n + 3 + np.arange(2)]

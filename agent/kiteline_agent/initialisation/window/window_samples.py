@@ -6,14 +6,17 @@ from itertools import pairwise
 from kiteline_agent.inertial.preintegration import Samples
 from kiteline_agent.inertial.sample_buffer import SampleBuffer, without_held
 
-_MOST_OFFSET_S = 0.5  # s; a solver that diverges asks for more
+_MOST_S = 0.5  # s; change of the time offset: a solver that diverges asks for more
 
 
 class WindowSamples:
     """Samples of K - 1 intervals. Those that come later do not count."""
 
-    def __init__(self, buffer: SampleBuffer, correct: Callable[[Samples], Samples], stamps_ns: Sequence[int]) -> None:
-        """correct: applied to each interval. stamps_ns: K camera stamps."""
+    def __init__(
+        self, buffer: SampleBuffer, correct: Callable[[Samples], Samples], stamps_ns: Sequence[int], about_s: float
+    ) -> None:  # fmt: skip
+        """correct: applied to each interval. stamps_ns: K camera stamps. about_s: a time offset near the right one."""
+        self._about_s = about_s
         self._buffer = buffer.extended(None)
         self._correct = correct
         self._stamps_ns = stamps_ns
@@ -33,7 +36,7 @@ class WindowSamples:
         return lacking[-1] if lacking else None
 
     def _between(self, offset_s: float) -> list[Samples | None]:
-        if not abs(offset_s) < _MOST_OFFSET_S:
+        if not abs(offset_s - self._about_s) < _MOST_S:
             return [None]
         offset_ns = round(offset_s * 1e9)
         return [self._buffer.between(a + offset_ns, b + offset_ns) for a, b in pairwise(self._stamps_ns)]

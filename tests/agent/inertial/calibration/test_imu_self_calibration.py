@@ -234,10 +234,22 @@ def test_a_map_begins_with_the_time_offset_of_its_start() -> None:
         calibration = SelfCalibration(CALIBRATION, config, P_B_C, 9.81, metric=False)
         assert calibration.applied_offset == TimeOffset(0.0, config.offset_sigma_s if apply else _EXACTLY_S)
         calibration.begin_with_offset(TimeOffset(found_s, 5e-4))
-        assert calibration.offset_s == applied_s and calibration.gyro.offset_s == found_s
-        assert calibration.gyro.offset_sigma_s == pytest.approx(np.hypot(5e-4, _KEPT_OFFSET_SIGMA_S))
+        assert calibration.offset_s == applied_s and calibration.gyro.offset_s == (found_s if apply else 0.0)
+        sigma_s = np.hypot(5e-4, _KEPT_OFFSET_SIGMA_S) if apply else config.offset_sigma_s
+        assert calibration.gyro.offset_sigma_s == pytest.approx(sigma_s)
         if apply:  # what is not applied may be off by that
             assert calibration.applied_offset.sigma_s >= found_s - applied_s
+
+
+def test_the_offset_of_a_rig_file_is_doubted_until_a_flight_has_shown_it() -> None:
+    config = SelfCalibrationConfig()
+    calibration = SelfCalibration(CALIBRATION, config, P_B_C, 9.81, metric=False)
+    calibration.begin_with(KnownImuConfig((0.01, 2e-4), *(tuple(np.eye(3).ravel()), (1e-3,) * 9)))
+    assert calibration.applied_offset == TimeOffset(0.01, config.offset_sigma_s)
+    calibration.begin_with_offset(TimeOffset(0.0, 5e-4))
+    assert calibration.offset_s == 0.0
+    assert calibration._unprimed_gyro is not None  # it knows nothing of the file, nor of a start that began with it
+    assert calibration._unprimed_gyro.offset_sigma_s == config.offset_sigma_s
 
 
 def test_axes_can_be_held() -> None:

@@ -1,0 +1,110 @@
+"""When samples of an IMU were taken, from stamps of their arrival.
+
+An IMU takes samples at a constant rate. Over a serial line or a bus they arrive late by chance, often several at once,
+and many drivers stamp them then. The samples are counted, and a robust line through their stamps over that count tells
+when each was taken, apart from a constant delay, which the time offset holds. Even stamps are left as they are.
+"""
+
+import numpy as np
+
+from kiteline_agent.inertial.clocks.stamp_line import stamp_line
+from kiteline_core.arrays import I64
+from kiteline_core.frame import ImuBatch
+from kiteline_core.order_statistics import median
+
+_SAMPLES = 400  # that a line is fitted to: one or two seconds
+_FEWEST = 80  # from which it tells more than a stamp
+_EVEN = 0.1  # of a step, by which it may differ from a multiple of the usual one
+_FILLED = 2.0  # times the usual step: the mean one, where half of the samples are missing
+_UNEVEN = 0.05  # share of steps that differ by more, from which a line is used
+_MOST_S = 0.03  # s; scatter beyond which nothing is counted on
+_SILENT_S = 0.5  # s without a sample: it begins again
+_MISSED = 3.0, 4.0  # deviations of the scatter, and periods: a sample that is later follows missing ones
+_TOLD_S = 1e-3  # s; scatter that the user should know of
+
+
+class SampleClock:
+    """Call `timed` with each batch."""
+
+    def __init__(self) -> None:
+        self._stamps_ns: I64 = np.zeros(0, np.int64)  # of the newest samples
+        self._numbers: I64 = np.zeros(0, np.int64)
+        self._begin_ns, self._period_ns, self._scatter_ns = 0.0, 0.0, 0.0  # the line, at number 0; period 0: none
+        self._newest_ns: int | None = None  # the last time that was given
+        self._told = False
+        self._events: list[str] = []
+
+    @property
+    def jitter_s(self) -> float:
+        """Scatter of stamps that are corrected; 0 while none are."""
+        return 1e-9 * self._scatter_ns
+
+    def take_events(self) -> list[str]:
+        """A line for the log once stamps are corrected by much."""
+        events, self._events = self._events, []
+        return events
+
+    def timed(self, imu: ImuBatch | None) -> ImuBatch | None:
+        """The samples with the times at which they were taken; without those that cannot be later than the last."""
+        if imu is None or len(imu.t_ns) == 0:
+            return imu
+        times_ns = self._taken_ns(imu.t_ns)
+        newest_ns, self._newest_ns = self._newest_ns, int(times_ns[-1])
+        if times_ns is imu.t_ns and (newest_ns is None or times_ns[0] > newest_ns):
+            return imu
+        newest_ns = int(times_ns[0]) - 1 if newest_ns is None else newest_ns
+        later, self._newest_ns = times_ns > newest_ns, max(newest_ns, self._newest_ns)
+        if not later.any():
+            return None
+        return ImuBatch(times_ns[later], imu.gyro[later], imu.accel[later])
+
+    def _taken_ns(self, stamps_ns: I64) -> I64:
+        """Times (n,) of new samples; the stamps (n,) themselves where they are even or tell no rate."""
+        old = self._stamps_ns
+        if len(old) and not 0 < int(stamps_ns[0]) - int(old[-1]) < 1e9 * _SILENT_S:
+            self._begin_again()
+        self._number(stamps_ns)
+        if len(self._stamps_ns) < _FEWEST or self._is_even():
+            self._period_ns = self._scatter_ns = 0.0
+            return stamps_ns
+        first_ns, newest = int(self._stamps_ns[0]), int(self._numbers[-1])
+        n = (self._numbers - newest).astype(np.float64)
+        line = stamp_line(n, 1e-9 * (self._stamps_ns - first_ns).astype(np.float64))
+        if not (line.scatter_s < _MOST_S and line.period_s > 0.0):
+            self._period_ns = self._scatter_ns = 0.0
+            return stamps_ns
+        self._period_ns, self._scatter_ns = 1e9 * line.period_s, 1e9 * line.scatter_s
+        self._begin_ns = first_ns + 1e9 * line.begin_s - self._period_ns * newest
+        if line.scatter_s > _TOLD_S and not self._told:
+            self._told = True
+            self._events.append(f"imu: stamps scatter by {1e3 * line.scatter_s:.1f} ms: samples are counted instead")
+        new = self._numbers[-len(stamps_ns) :]
+        return np.round(self._begin_ns + self._period_ns * new).astype(np.int64)
+
+    def _begin_again(self) -> None:
+        self._stamps_ns, self._numbers, self._newest_ns = self._stamps_ns[:0], self._numbers[:0], None
+        self._period_ns = self._scatter_ns = 0.0
+
+    def _number(self, stamps_ns: I64) -> None:
+        """Count new samples, and those that are missing before them."""
+        last = int(self._numbers[-1]) if len(self._numbers) else -1
+        if self._period_ns == 0.0:
+            numbers = last + 1 + np.arange(len(stamps_ns), dtype=np.int64)
+        else:
+            found, most_ns = [], max(_MISSED[0] * self._scatter_ns, _MISSED[1] * self._period_ns)
+            for stamp_ns in stamps_ns.tolist():
+                late_ns = stamp_ns - self._begin_ns - self._period_ns * (last + 1)
+                last += 1 + (round(late_ns / self._period_ns) if late_ns > most_ns else 0)
+                found.append(last)
+            numbers = np.array(found, np.int64)
+        self._stamps_ns = np.concatenate([self._stamps_ns, stamps_ns])[-_SAMPLES:]
+        self._numbers = np.concatenate([self._numbers, numbers])[-_SAMPLES:]
+
+    def _is_even(self) -> bool:
+        """True if nearly all steps are whole multiples of the usual one: samples may be missing."""
+        steps = np.diff(self._stamps_ns).astype(np.float64)
+        usual = median(steps)
+        if not 0.0 < float(steps.mean()) < _FILLED * usual:  # several come at once
+            return False
+        off = np.abs(steps / usual - np.maximum(np.round(steps / usual), 1.0))
+        return int((off > _EVEN).sum()) <= _UNEVEN * len(off)

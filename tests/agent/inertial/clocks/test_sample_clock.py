@@ -1,0 +1,85 @@
+"""When samples were taken, from stamps of their arrival."""
+
+import numpy as np
+import pytest
+
+from kiteline_agent.inertial.clocks.sample_clock import SampleClock
+from kiteline_core.arrays import F64, I64
+from kiteline_core.frame import ImuBatch
+
+PERIOD_NS = 5_000_000
+SETTLED = 400
+
+
+def batches(stamps_ns: I64, size: int = 10) -> list[ImuBatch]:
+    """Samples whose values are their numbers."""
+    n = np.arange(len(stamps_ns), dtype=np.float64)
+    values = np.stack([n, n, n], axis=1)
+    return [ImuBatch(stamps_ns[k : k + size], values[k : k + size], values[k : k + size])
+            for k in range(0, len(stamps_ns), size)]  # fmt: skip
+
+
+def timed(clock: SampleClock, stamps_ns: I64) -> tuple[F64, I64]:
+    """Numbers and times that the clock gives."""
+    out = [clock.timed(batch) for batch in batches(stamps_ns)]
+    kept = [batch for batch in out if batch is not None]
+    return np.concatenate([b.gyro[:, 0] for b in kept]), np.concatenate([b.t_ns for b in kept])
+
+
+def true_ns(count: int = 3000) -> I64:
+    return 7_000_000_000 + PERIOD_NS * np.arange(count, dtype=np.int64)
+
+
+def scattered(sigma_ns: float, seed: int) -> I64:
+    off = np.random.default_rng(seed).normal(0.0, sigma_ns, 3000).astype(np.int64)
+    return np.maximum.accumulate(np.sort(true_ns() + off) + np.arange(3000))
+
+
+def in_bursts(every_ns: int) -> I64:
+    """Samples that arrive together, 50 us apart, as a serial converter with a latency timer delivers them."""
+    stamps = (true_ns() + every_ns - 1) // every_ns * every_ns
+    for k in range(1, len(stamps)):
+        stamps[k] = max(stamps[k], stamps[k - 1] + 50_000)
+    return stamps
+
+
+@pytest.mark.parametrize("stamps", [scattered(1e6, 1), scattered(2e6, 2), in_bursts(8_000_000), in_bursts(16_000_000)])
+def test_samples_are_counted_where_stamps_scatter(stamps: I64) -> None:
+    clock = SampleClock()
+    numbers, times = timed(clock, stamps)
+    assert (np.diff(times) > 0).all() and len(times) > 2950
+    off = times - true_ns()[numbers.astype(np.int64)]
+    raw = stamps - true_ns()
+    assert off[SETTLED:].std() < 0.25 * raw[SETTLED:].std()  # a constant delay is left to the time offset
+    assert np.diff(off)[SETTLED:].std() < 0.1 * np.diff(raw)[SETTLED:].std()
+    assert clock.jitter_s > 5e-4
+    assert len(clock.take_events()) == 1
+
+
+def test_even_stamps_are_left_as_they_are_also_where_samples_are_missing() -> None:
+    rng = np.random.default_rng(3)
+    kept = true_ns()[(rng.random(3000) > 0.25) & ((np.arange(3000) < 900) | (np.arange(3000) > 960))]
+    for stamps in (true_ns(), kept, true_ns() + rng.integers(-200_000, 200_000, 3000)):
+        clock = SampleClock()
+        for batch in batches(stamps):
+            assert clock.timed(batch) is batch
+        assert clock.jitter_s == 0.0 and clock.take_events() == []
+
+
+def test_samples_that_are_missing_are_not_counted_away() -> None:
+    there = np.ones(3000, np.bool_)
+    there[1500:1600] = False  # 0.45 s are lost
+    stamps = scattered(1e6, 4)[there]
+    numbers, times = timed(SampleClock(), stamps)
+    off = times - true_ns()[there][numbers.astype(np.int64)]
+    assert np.abs(off[SETTLED:]).max() < 5e6  # half a sample, where stamps scatter by 1 ms
+
+
+def test_after_a_silence_or_a_clock_that_was_set_back_it_begins_again() -> None:
+    clock = SampleClock()
+    for shift_ns in (0, 20_000_000_000, -60_000_000_000):
+        numbers, times = timed(clock, scattered(1e6, 5) + shift_ns)
+        assert len(times) > 2950
+        off = times - shift_ns - true_ns()[numbers.astype(np.int64)]
+        assert off[SETTLED:].std() < 3e5
+    assert clock.timed(None) is None
