@@ -19,6 +19,7 @@ from kiteline_bench.harness.faults import (
     flickering,
     late_samples,
     rearranged,
+    samples_in_bursts,
     scattered_stamps,
     some,
     wall,
@@ -185,6 +186,8 @@ def test_samples_of_the_imu_are_left_out_or_stamped_late(flight: Recording) -> N
     sampled = replace(flight, items=tuple(items))
     late = stamps(late_samples(sampled, -0.02))
     np.testing.assert_array_equal(late, stamps(sampled) - 20_000_000)
+    arrived = np.diff(stamps(samples_in_bursts(sampled, 0.016)))
+    assert set(np.unique(np.round(arrived * 1e-6))) <= {0.0, 16.0} | set(np.arange(14.0, 16.1)) and (arrived > 0).all()
     left, everything = stamps(without_samples(sampled, 0.5, 0.2)), stamps(sampled)
     gone = np.setdiff1d(everything, left)
     assert len(left) + len(gone) == len(everything)

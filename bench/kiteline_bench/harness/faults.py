@@ -111,6 +111,23 @@ def late_samples(recording: Recording, late_s: float) -> Recording:
     return replace(recording, items=tuple(replace(item, imu=late(item.imu)) for item in recording.items))
 
 
+def samples_in_bursts(recording: Recording, every_s: float) -> Recording:
+    """Stamp the inertial samples when they arrive: all of some milliseconds together, 50 us apart."""
+    every_ns, newest_ns = round(1e9 * every_s), -(1 << 62)
+
+    def arrived(imu: ImuBatch | None) -> ImuBatch | None:
+        nonlocal newest_ns
+        if imu is None:
+            return None
+        stamps = []
+        for t_ns in imu.t_ns.tolist():
+            newest_ns = max(-(-t_ns // every_ns) * every_ns, newest_ns + 50_000)
+            stamps.append(newest_ns)
+        return replace(imu, t_ns=np.array(stamps, np.int64))
+
+    return replace(recording, items=tuple(replace(item, imu=arrived(item.imu)) for item in recording.items))
+
+
 def scattered_stamps(recording: Recording, deviation_s: float, seed: int) -> Recording:
     """Stamp each image by chance sooner or later than it was taken; true poses stay those of the images."""
     stamps = [item.frame.t_ns for item in recording.items]

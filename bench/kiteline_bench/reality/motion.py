@@ -9,6 +9,7 @@ from kiteline_bench.harness.faults import (
     every_nth,
     flickering,
     late_samples,
+    samples_in_bursts,
     scattered_stamps,
     some,
     wall,
@@ -29,7 +30,8 @@ _ROOM_STEPS, _ROOM_STARTS_S = (2, 4), (0.0, 5.0)  # the same of FLIGHT, which ha
 _STREET_M, _ROOM_M = 0.1, 0.02
 _PLAIN, _SAMPLES = "as recorded", "0.3 s without IMU in every 5 s"
 _LATE, _EARLY, _SCATTER = "IMU stamps 20 ms late", "IMU stamps 80 ms early", "camera stamps scatter by 2 ms"
-_OF_IMU = (_SAMPLES, _LATE, _EARLY, _SCATTER)
+_BURSTS = "IMU samples stamped in bursts of 16 ms"
+_OF_IMU = (_SAMPLES, _LATE, _EARLY, _BURSTS, _SCATTER)
 _FAULTS: dict[str, Callable[[Recording, int], Recording]] = {
     _PLAIN: lambda recording, _: recording,
     "one image in ten blank": lambda recording, seed: some(recording, 0.1, wall, seed),
@@ -37,6 +39,7 @@ _FAULTS: dict[str, Callable[[Recording, int], Recording]] = {
     _SAMPLES: lambda recording, _: without_samples(recording, 5.0, 0.3),
     _LATE: lambda recording, _: late_samples(recording, 0.02),
     _EARLY: lambda recording, _: late_samples(recording, -0.08),
+    _BURSTS: lambda recording, _: samples_in_bursts(recording, 0.016),
     _SCATTER: lambda recording, seed: scattered_stamps(recording, 0.002, seed),
 }  # exposures: by a factor whose logarithm has a deviation of a quarter
 _SEEDS = (0, 1, 2)
@@ -111,7 +114,7 @@ def _faulty_sensors(bench: Bench) -> list[Bar]:
         for fault, change in _FAULTS.items():
             if fault in _OF_IMU and ways[0].imu is None:
                 continue
-            seeds = (0,) if fault in (_PLAIN, _SAMPLES, _LATE, _EARLY) else bench.chosen(_SEEDS)
+            seeds = (0,) if fault in (_PLAIN, _SAMPLES, _LATE, _EARLY, _BURSTS) else bench.chosen(_SEEDS)
             found = [flown(bench, f"{name}, {fault}", change(way, seed), base=False) for way in ways for seed in seeds]
             waits = sum(e.initialising for flight in found for e in flight.run.found)
             errors = [flight.ate_m("odometry") for flight in found]
