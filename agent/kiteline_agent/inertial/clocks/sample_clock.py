@@ -14,6 +14,7 @@ from kiteline_core.order_statistics import median
 
 _SAMPLES = 400  # that a line is fitted to: one or two seconds
 _FEWEST = 80  # from which it tells more than a stamp
+_JUDGED = 40  # samples after which stamps are judged again
 _EVEN = 0.1  # of a step, by which it may differ from a multiple of the usual one
 _FILLED = 2.0  # times the usual step: the mean one, where half of the samples are missing
 _UNEVEN = 0.05  # share of steps that differ by more, from which a line is used
@@ -31,6 +32,7 @@ class SampleClock:
         self._numbers: I64 = np.zeros(0, np.int64)
         self._begin_ns, self._period_ns, self._scatter_ns = 0.0, 0.0, 0.0  # the line, at number 0; period 0: none
         self._newest_ns: int | None = None  # the last time that was given
+        self._even, self._unjudged = True, 0  # and samples since that was judged
         self._told = False
         self._events: list[str] = []
 
@@ -64,7 +66,10 @@ class SampleClock:
         if len(old) and not 0 < int(stamps_ns[0]) - int(old[-1]) < 1e9 * _SILENT_S:
             self._begin_again()
         self._number(stamps_ns)
-        if len(self._stamps_ns) < _FEWEST or self._is_even():
+        self._unjudged += len(stamps_ns)
+        if len(self._stamps_ns) >= _FEWEST and self._unjudged >= _JUDGED:
+            self._even, self._unjudged = self._is_even(), 0
+        if self._even:
             self._period_ns = self._scatter_ns = 0.0
             return stamps_ns
         first_ns, newest = int(self._stamps_ns[0]), int(self._numbers[-1])
@@ -83,6 +88,7 @@ class SampleClock:
 
     def _begin_again(self) -> None:
         self._stamps_ns, self._numbers, self._newest_ns = self._stamps_ns[:0], self._numbers[:0], None
+        self._even, self._unjudged = True, 0
         self._period_ns = self._scatter_ns = 0.0
 
     def _number(self, stamps_ns: I64) -> None:
