@@ -22,7 +22,7 @@ from kiteline_agent.initialisation.window.inertial_terms import CutSamples
 from kiteline_agent.initialisation.window.window_noise import WindowNoise
 from kiteline_core.arrays import F64
 from tests.agent.initialisation.test_inertial_start import CAMERA, Recorded, Tracks
-from tests.agent.initialisation.test_window_bundle import CALIBRATION, PRIOR, changed, window
+from tests.agent.initialisation.window.test_window_bundle import CALIBRATION, PRIOR, changed, window
 
 Change = Callable[[CornerObservations, CutSamples], tuple[CornerObservations, CutSamples]]
 

@@ -27,7 +27,7 @@ from kiteline_agent.tracking.waiting_frames import WaitingFrames
 from kiteline_core.arrays import F64
 from kiteline_core.frame import Frame, ImuBatch
 from kiteline_core.geometry import se3
-from tests.agent.initialisation.test_window_bundle import CALIBRATION, FOCAL, T_B_C, window
+from tests.agent.initialisation.window.test_window_bundle import CALIBRATION, FOCAL, T_B_C, window
 
 CAMERA: Any = SimpleNamespace(fx=FOCAL, fy=FOCAL, cx=376.0, cy=240.0, width=752, height=480, T_b_c=T_B_C)
 

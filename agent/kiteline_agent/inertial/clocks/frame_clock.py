@@ -29,7 +29,7 @@ _MOST_LATE = 0.1  # share of stamps that are late by half a period or more
 _NEWEST, _CHANGED = 6, 4  # newest stamps, and how many of them are beyond that where the rate has changed
 _WAIT = 8  # frames to the next line after one that did not fit
 _PERIODS = np.linspace(0.88, 1.12, 241)  # that are tried, over the median of the steps
-_CHANCE = 7.0  # squared sum of unit vectors over their number, which random times exceed once in a thousand draws
+_CHANCE = 7.0  # squared sum of unit vectors over their number, which random ones exceed once in a thousand draws
 _RELATED = 0.6  # correlation of neighbours' errors: with more the rate itself has changed
 _TURN_VARIANCE = 2.0 * 4e-4**2  # rad^2; of a rotation by two images
 _REFUTED = 40.0  # squared errors of rotations, in deviations, by which the line must be worse to be given up
@@ -141,49 +141,55 @@ class FrameClock:
         self._off.clear()
 
     def _line(self) -> tuple[int, float] | None:
-        """When the newest frame was taken, and the scatter of stamps, s; None if the stamps are as good."""
-        stamps_ns = np.array(self._stamps_ns, np.int64)
-        steps_ns = stamps_ns[1:] - stamps_ns[:-1]
+        """When the newest frame was taken, and the scatter of stamps, s; None if its stamp is as good."""
+        steps_ns = np.diff(np.array(self._stamps_ns, np.int64))
         if int(steps_ns.max()) - int(steps_ns.min()) < 1e9 * _LEAST_S:
             return None
-        t_s = 1e-9 * (stamps_ns - stamps_ns[0]).astype(np.float64)
-        begin_s, period_s = 1e-9 * (self._begin_ns - int(stamps_ns[0])), self._period_s
-        if period_s == 0.0:
-            if self._wait > 0:
-                self._wait -= 1
-                return None
-            found = _rhythm(t_s, median(1e-9 * steps_ns.astype(np.float64)))
-            if found is None:
-                self._fail()
-                return None
-            begin_s, period_s = found
-        n = np.round((t_s - begin_s) / period_s)
-        n -= n[-1]
-        once = np.append(n[1:] != n[:-1], True)  # of two with one number the first came late, by half a period or more
-        if int((~once).sum()) > _MOST_LATE * len(once):
-            self._fail()
+        n = self._numbers(1e-9 * steps_ns.astype(np.float64))
+        if n is None or len(n) < _FEWEST:
             return None
-        if not once.all():
-            self._stamps_ns = deque(stamps_ns[once].tolist(), maxlen=_FRAMES)
-            n, t_s = n[once], t_s[once]
-        if len(n) < _FEWEST:
-            return None
-        line = stamp_line(n, t_s)
-        begin_s, period_s, off, usual = line.begin_s, line.period_s, line.off_s, line.scatter_s
-        most = TAIL * usual
+        first_ns = self._stamps_ns[0]
+        line = stamp_line(n, 1e-9 * (np.array(self._stamps_ns, np.int64) - first_ns).astype(np.float64))
+        off, most = line.off_s, TAIL * line.scatter_s
         self._off[-1] = abs(off[-1]) > most
-        if min(abs(off[-1]), abs(off[-2])) > 2.0 * most and abs(off[-1] - off[-2]) < 2.0 * usual:
+        if min(abs(off[-1]), abs(off[-2])) > 2.0 * most and abs(off[-1] - off[-2]) < 2.0 * line.scatter_s:
             self._begin_again(2)  # another phase: late ones are not late by the same
             return None
         near = np.clip(off, -most, most)
         related = float(near[1:] @ near[:-1]) > _RELATED * float(near @ near)
-        if related or not usual < _MOST * period_s:
+        if related or not line.scatter_s < _MOST * line.period_s:
             self._fail()
             return None
-        self._begin_ns, self._period_s, self._scatter_s = int(stamps_ns[0]) + round(1e9 * begin_s), period_s, usual
+        self._begin_ns, self._period_s = first_ns + round(1e9 * line.begin_s), line.period_s
+        self._scatter_s = line.scatter_s
         early = off[-1] < -2.0 * most  # none is stamped before it was taken
-        as_good = usual < _GOOD_S and abs(off[-1]) < _LEAST_S
-        return None if early or as_good else (self._begin_ns, usual)
+        as_good = line.scatter_s < _GOOD_S and abs(off[-1]) < _LEAST_S
+        return None if early or as_good else (self._begin_ns, line.scatter_s)
+
+    def _numbers(self, steps_s: F64) -> F64 | None:
+        """Numbers (k,) of the frames, 0 for the newest, by the line before or the rhythm of the stamps; None: unknown.
+
+        Of two stamps with one number the first came late, by half a period or more: it is forgotten. steps_s: between
+        the stamps.
+        """
+        t_s = np.append(0.0, np.cumsum(steps_s))
+        begin_s, period_s = 1e-9 * (self._begin_ns - self._stamps_ns[0]), self._period_s
+        if period_s == 0.0:
+            self._wait -= 1
+            found = _rhythm(t_s, median(steps_s)) if self._wait < 0 else None
+            if found is None:
+                if self._wait < 0:
+                    self._fail()
+                return None
+            begin_s, period_s = found
+        n = np.round((t_s - begin_s) / period_s)
+        once = np.append(n[1:] != n[:-1], True)
+        if int((~once).sum()) > _MOST_LATE * len(once):
+            self._fail()
+            return None
+        if not once.all():
+            self._stamps_ns = deque(np.array(self._stamps_ns)[once].tolist(), maxlen=_FRAMES)
+        return np.asarray(n[once] - n[-1])
 
     def _fail(self) -> None:
         """No line fits: try again later, with newer stamps."""
