@@ -184,8 +184,9 @@ def test_samples_of_the_imu_are_left_out_or_stamped_late(flight: Recording) -> N
         replace(item, imu=ImuBatch(t, np.zeros((10, 3)), np.ones((10, 3)))) for item, t in zip(flight.items, times)
     ]
     sampled = replace(flight, items=tuple(items))
-    late = stamps(late_samples(sampled, -0.02))
-    np.testing.assert_array_equal(late, stamps(sampled) - 20_000_000)
+    late = stamps(late_samples(sampled, 0.02))
+    assert np.isin(late - 20_000_000, stamps(sampled)).all() and len(late) > 0.8 * len(stamps(sampled))
+    assert late_samples(flight.without_imu(), 0.02).imu is None
     arrived = np.diff(stamps(samples_in_bursts(sampled, 0.016)))
     assert set(np.unique(np.round(arrived * 1e-6))) <= {0.0, 16.0} | set(np.arange(14.0, 16.1)) and (arrived > 0).all()
     left, everything = stamps(without_samples(sampled, 0.5, 0.2)), stamps(sampled)

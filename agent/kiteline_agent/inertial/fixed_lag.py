@@ -80,6 +80,20 @@ class InertialState:
         return np.asarray(self.cov[np.ix_(order, order)])
 
 
+@dataclass(frozen=True, slots=True)
+class InertialMotion:
+    """The body at an instant after the last frame.
+
+    T_m_b: (4,4). velocity: (3,) m/s in m. rate: (3,) rad/s in b. growth: (6,6) covariance of the motion since that
+    frame, [translation in m, rotation about the body's axes].
+    """
+
+    T_m_b: F64
+    velocity: F64
+    rate: F64
+    growth: F64
+
+
 class FixedLagSmoother:
     """Fixed-lag smoother with a dense prior. Call `start` first, then `add` once a frame."""
 

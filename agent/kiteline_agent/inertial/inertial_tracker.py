@@ -1,13 +1,18 @@
 """Inertial tracking: initialisation, prediction, fusion with poses from images, and dead reckoning without them."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from kiteline_agent.inertial.calibration.known_imu import KnownImuConfig
 from kiteline_agent.inertial.calibration.self_calibration import SelfCalibration
 from kiteline_agent.inertial.clocks.frame_clock import FrameClock
-from kiteline_agent.inertial.fixed_lag import BodyVelocity, FixedLagSmoother, InertialState, VisualPoints, tilt_of
+from kiteline_agent.inertial.fixed_lag import (
+    BodyVelocity,
+    FixedLagSmoother,
+    InertialMotion,
+    InertialState,
+    VisualPoints,
+    tilt_of,
+)
 from kiteline_agent.inertial.imu_initialisation import ImuInitialiser, InertialStartState, TimedPose
 from kiteline_agent.inertial.imu_prior import ImuPrior
 from kiteline_agent.inertial.inertial_config import InertialConfig, StartDeviations
@@ -20,20 +25,6 @@ from kiteline_core.geometry import disparity_offset, se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 
 _PRIOR_SIGMA = np.repeat([0.005, 0.1], 3)  # rad/s, m/s^2: of biases of earlier tracking, after a loss
-
-
-@dataclass(frozen=True, slots=True)
-class InertialMotion:
-    """The body at an instant after the last frame.
-
-    T_m_b: (4,4). velocity: (3,) m/s in m. rate: (3,) rad/s in b. growth: (6,6) covariance of the motion since that
-    frame, [translation in m, rotation about the body's axes].
-    """
-
-    T_m_b: F64
-    velocity: F64
-    rate: F64
-    growth: F64
 
 
 class InertialTracker:
@@ -327,9 +318,12 @@ class InertialTracker:
         return (self._interval_end_ns, end_ns) if self._buffer.lacks(end_ns) else None
 
     def samples_between(self, from_ns: int, to_ns: int) -> Samples | None:
-        """Corrected samples between two camera stamps; None with a gap."""
-        begin_ns, end_ns = (self.clock.taken_ns(t_ns) + self._offset_ns for t_ns in (from_ns, to_ns))
-        return self._between(begin_ns, end_ns)
+        """Corrected samples between two camera stamps; None with a gap, and before the last ones have come."""
+        return self._come_between(self.clock.taken_ns(from_ns), self.clock.taken_ns(to_ns))
+
+    def _come_between(self, from_ns: int, to_ns: int) -> Samples | None:
+        begin_ns, end_ns = from_ns + self._offset_ns, to_ns + self._offset_ns
+        return None if self._buffer.lacks_some(end_ns) else self._between(begin_ns, end_ns)
 
     def _between(self, from_ns: int, to_ns: int) -> Samples | None:
         """Corrected samples; cached, as the prediction and the update of a frame need the same ones."""
@@ -372,7 +366,7 @@ class InertialTracker:
             self.scale.resume(state.velocity)
             self._scale_from = (t_ns, T_m_b)
         elif (t_ns - self._scale_from[0]) * 1e-9 >= INTERVAL_S:
-            samples = self._between(self._scale_from[0] + self._offset_ns, t_ns + self._offset_ns)
+            samples = self._come_between(self._scale_from[0], t_ns)
             if samples is not None and depth_m > 0.0:
                 self.scale.add(self._scale_from[1], T_m_b, samples, state.bias[:3], depth_m)
             else:

@@ -21,6 +21,7 @@ _EVEN = 1.5  # longest over shortest step of three samples whose second differen
 _GAP = 2.5  # of the usual step: a longer one misses samples
 _GAP_GYRO_RAD_S, _GAP_ACCEL_M_S2 = 0.3, 2.0  # error of interpolation over missing samples
 _HELD_NS = 25_000_000  # for which the newest sample may stand in for those that have not come yet
+_FEW = 2.5  # usual steps
 _HELD = 2.0, 20.0  # rad/s and m/s^2, error of samples that have not come yet: next to nothing beside images
 _CLIPPED_GYRO_RAD_S, _CLIPPED_ACCEL_M_S2 = 1.0, 10.0  # error of a sample at the end of the range
 _RANGE_GYRO_RAD_S, _RANGE_ACCEL_M_S2 = 2.0, 15.0  # no IMU has a smaller range
@@ -93,6 +94,10 @@ class SampleBuffer:
     def lacks(self, to_ns: int) -> bool:
         """True if samples before an instant have not come yet; what `between` gives in their place is a guess."""
         return len(self._t) == 0 or to_ns - int(self._t[-1]) > _HELD_NS
+
+    def lacks_some(self, to_ns: int) -> bool:
+        """True if more than a sample or two have not come yet: a held one is no acceleration that tells lengths."""
+        return len(self._t) == 0 or to_ns - int(self._t[-1]) > _FEW * (self._step_ns or 0.0)
 
     def between(self, from_ns: int, to_ns: int) -> Samples | None:
         """Samples from one instant to another, ends interpolated (held beyond the newest); None with a gap."""

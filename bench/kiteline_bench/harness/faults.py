@@ -103,12 +103,11 @@ def without_samples(recording: Recording, every_s: float, length_s: float) -> Re
 
 
 def late_samples(recording: Recording, late_s: float) -> Recording:
-    """Stamp the inertial samples late; negative: early."""
-
-    def late(imu: ImuBatch | None) -> ImuBatch | None:
-        return None if imu is None else replace(imu, t_ns=imu.t_ns + round(1e9 * late_s))
-
-    return replace(recording, items=tuple(replace(item, imu=late(item.imu)) for item in recording.items))
+    """Stamp the inertial samples late, so that a recording gives them after their frames; negative: early."""
+    samples = _joined_imu(recording.items)
+    if samples is None:
+        return recording
+    return recording.with_imu(replace(samples, t_ns=samples.t_ns + round(1e9 * late_s)))
 
 
 def samples_in_bursts(recording: Recording, every_s: float) -> Recording:

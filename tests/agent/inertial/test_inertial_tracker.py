@@ -212,6 +212,16 @@ def test_samples_that_come_late_start_the_state_and_do_no_harm(late_ns: int) -> 
     assert up is not None and np.linalg.norm(up.tilt) < 0.01
 
 
+def test_accelerations_that_have_not_come_tell_no_lengths() -> None:
+    """The newest sample, held for 50 ms, is no acceleration: a scale by such intervals is percents off."""
+    steps = flight(60, 6)
+    tracker, _ = run(steps)
+    before, last = steps[-9].t_ns, steps[-1].t_ns
+    assert tracker.samples_between(before, last) is not None
+    assert tracker.samples_between(before, last + 10_000_000) is not None
+    assert tracker.samples_between(before, last + 50_000_000) is None
+
+
 def mono_start(tracker: InertialTracker, step: Step, velocity: F64, unit: float) -> F64:
     """Start at a step, in a map of which one unit is `unit` metres. Returns the body's pose there."""
     pose = camera_scaled(step.truth, 1.0 / unit, T_B_C[:3, 3])
