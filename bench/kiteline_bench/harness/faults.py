@@ -69,6 +69,12 @@ def _each(recording: Recording, change: Callable[[int, Frame], Frame]) -> Record
     return replace(recording, items=tuple(items))
 
 
+def _each_batch(recording: Recording, change: Callable[[ImuBatch], ImuBatch | None]) -> Recording:
+    """Change each batch of inertial samples; None: it is left out."""
+    items = (replace(item, imu=None if item.imu is None else change(item.imu)) for item in recording.items)
+    return replace(recording, items=tuple(items))
+
+
 def changed(recording: Recording, begin: int, end: int, change: Change) -> Recording:
     """Change frames begin..end."""
     return _each(recording, lambda k, frame: change(frame) if begin <= k < end else frame)
@@ -93,13 +99,11 @@ def without_samples(recording: Recording, every_s: float, length_s: float) -> Re
         return recording
     begin_ns = int(batches[0].t_ns[0])
 
-    def kept(imu: ImuBatch | None) -> ImuBatch | None:
-        if imu is None:
-            return None
+    def kept(imu: ImuBatch) -> ImuBatch | None:
         keep = (imu.t_ns - begin_ns) * 1e-9 % every_s < every_s - length_s
         return ImuBatch(imu.t_ns[keep], imu.gyro[keep], imu.accel[keep]) if keep.any() else None
 
-    return replace(recording, items=tuple(replace(item, imu=kept(item.imu)) for item in recording.items))
+    return _each_batch(recording, kept)
 
 
 def late_samples(recording: Recording, late_s: float) -> Recording:
@@ -114,17 +118,15 @@ def samples_in_bursts(recording: Recording, every_s: float) -> Recording:
     """Stamp the inertial samples when they arrive: all of some milliseconds together, 50 us apart."""
     every_ns, newest_ns = round(1e9 * every_s), -(1 << 62)
 
-    def arrived(imu: ImuBatch | None) -> ImuBatch | None:
+    def arrived(imu: ImuBatch) -> ImuBatch:
         nonlocal newest_ns
-        if imu is None:
-            return None
         stamps = []
         for t_ns in imu.t_ns.tolist():
             newest_ns = max(-(-t_ns // every_ns) * every_ns, newest_ns + 50_000)
             stamps.append(newest_ns)
         return replace(imu, t_ns=np.array(stamps, np.int64))
 
-    return replace(recording, items=tuple(replace(item, imu=arrived(item.imu)) for item in recording.items))
+    return _each_batch(recording, arrived)
 
 
 def scattered_stamps(recording: Recording, deviation_s: float, seed: int) -> Recording:

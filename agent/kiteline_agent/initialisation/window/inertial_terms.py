@@ -18,7 +18,7 @@ SHARED = 6  # unknowns of the window: gyro bias, direction of gravity, time offs
 OFFSET = 5  # the last of these
 _PAIR = 2 * STATE  # unknowns of two keyframes
 _FLOOR = np.diag(np.repeat([2e-5, 5e-4, 2e-5], 3) ** 2)  # of an interval's covariance: rad, m/s, m
-_EXACTLY = TimeOffset(0.0, 1e-6)
+NO_OFFSET = TimeOffset(0.0, 1e-6)  # for certain
 _ENDS_S = 0.012  # s of samples at the ends of an interval that tell the rate and force there: vibration averages out
 _FAR_S = 5e-4  # s; change of the time offset from which samples are cut anew
 
@@ -29,11 +29,11 @@ class InertialTerms:
     """Preintegrated intervals between K keyframes. Call `integrate` first, and again when a state `moved_far`."""
 
     def __init__(
-        self, cut: CutSamples, offset: TimeOffset | None, calibration: ImuCalibration, gravity_m_s2: float,
+        self, cut: CutSamples, offset: TimeOffset, calibration: ImuCalibration, gravity_m_s2: float,
         prior: BiasPrior, config: InertialBundleConfig, noise: WindowNoise,
     ) -> None:  # fmt: skip
-        """offset: of time, known before, at which samples are there; None: zero, exactly."""
-        self._cut, self._offset = cut, offset or _EXACTLY
+        """offset: of time, known before, at which samples are there."""
+        self._cut, self._offset = cut, offset
         intervals = cut(self._offset.offset_s)
         assert intervals is not None
         self._intervals, self._cut_at_s = _without_measured_noise(intervals), self._offset.offset_s

@@ -15,7 +15,14 @@ from kiteline_agent.inertial.preintegration import BiasPrior, TimeOffset
 from kiteline_agent.inertial_start_config import InertialBundleConfig
 from kiteline_agent.initialisation.corner_tracks import CornerObservations
 from kiteline_agent.initialisation.window.corner_terms import CornerTerms, ReducedCorners
-from kiteline_agent.initialisation.window.inertial_terms import OFFSET, SHARED, STATE, CutSamples, InertialTerms
+from kiteline_agent.initialisation.window.inertial_terms import (
+    NO_OFFSET,
+    OFFSET,
+    SHARED,
+    STATE,
+    CutSamples,
+    InertialTerms,
+)
 from kiteline_agent.initialisation.window.lens_correction import TERMS
 from kiteline_agent.initialisation.window.window_noise import WindowNoise
 from kiteline_agent.initialisation.window.window_state import (
@@ -66,14 +73,13 @@ class InertialBundle:
         config: InertialBundleConfig,
         noise: WindowNoise | None = None,
         lens_info: F64 | None = None,
-        offset: TimeOffset | None = None,
+        offset: TimeOffset = NO_OFFSET,
     ) -> None:
         """cut: gives the samples between the keyframes. noise: factors on the inertial error model.
 
-        lens_info: (8,8) inverse covariance of the lens before this window; None: by the options. offset: known before;
-        None: zero, exactly.
+        lens_info: (8,8) inverse covariance of the lens before this window; None: by the options. offset: known before.
         """
-        self._offset_s = 0.0 if offset is None else offset.offset_s
+        self._offset_s = offset.offset_s
         self._terms = InertialTerms(cut, offset, calibration, gravity_m_s2, prior, config, noise or WindowNoise())
         lens_info = lens_prior(config, focal_px) if lens_info is None else lens_info
         self._corners = CornerTerms(observations, T_b_c, focal_px, config, lens_info)

@@ -20,6 +20,7 @@ class WindowSamples:
         self._buffer = buffer.extended(None)
         self._correct = correct
         self._stamps_ns = stamps_ns
+        self._cut: dict[int, list[Samples | None]] = {}  # by offset in ns: several solutions ask for it
 
     def at(self, offset_s: float) -> list[Samples] | None:
         """The samples if camera stamps + offset_s are the IMU's time; None if some are missing."""
@@ -39,4 +40,7 @@ class WindowSamples:
         if not abs(offset_s - self._about_s) < _MOST_S:
             return [None]
         offset_ns = round(offset_s * 1e9)
-        return [self._buffer.between(a + offset_ns, b + offset_ns) for a, b in pairwise(self._stamps_ns)]
+        if offset_ns not in self._cut:
+            found = [self._buffer.between(a + offset_ns, b + offset_ns) for a, b in pairwise(self._stamps_ns)]
+            self._cut[offset_ns] = found
+        return self._cut[offset_ns]

@@ -11,7 +11,7 @@ from kiteline_agent.inertial.sample_buffer import SampleBuffer
 from kiteline_agent.inertial_start_config import InertialBundleConfig
 from kiteline_agent.initialisation.corner_tracks import CornerObservations
 from kiteline_agent.initialisation.window.corner_terms import _MAX_RMS, CornerTerms
-from kiteline_agent.initialisation.window.inertial_terms import CutSamples, InertialTerms
+from kiteline_agent.initialisation.window.inertial_terms import NO_OFFSET, CutSamples, InertialTerms
 from kiteline_agent.initialisation.window.lens_correction import TERMS, moved
 from kiteline_agent.initialisation.window.window_bundle import InertialBundle
 from kiteline_agent.initialisation.window.window_kernels import add_observations
@@ -75,7 +75,7 @@ def changed(cut: CutSamples, change: Callable[[Samples], Samples]) -> CutSamples
     return at
 
 
-def bundle(corners: CornerObservations, cut: CutSamples, offset: TimeOffset | None = None) -> InertialBundle:
+def bundle(corners: CornerObservations, cut: CutSamples, offset: TimeOffset = NO_OFFSET) -> InertialBundle:
     return InertialBundle(corners, cut, CALIBRATION, T_B_C, FOCAL, 9.81, PRIOR, CONFIG, offset=offset)
 
 
