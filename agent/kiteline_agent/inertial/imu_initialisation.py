@@ -10,7 +10,7 @@ from kiteline_agent.inertial import initial_alignment
 from kiteline_agent.inertial.fixed_lag import FixedLagSmoother
 from kiteline_agent.inertial.inertial_config import InertialConfig, StartDeviations
 from kiteline_agent.inertial.preintegration import Preintegrated, Samples, TimeOffset, preintegrate
-from kiteline_agent.inertial.sample_buffer import SampleBuffer
+from kiteline_agent.inertial.samples.sample_buffer import SampleBuffer
 from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuCalibration
 

@@ -17,7 +17,7 @@ from kiteline_agent.inertial.imu_initialisation import ImuInitialiser, InertialS
 from kiteline_agent.inertial.imu_prior import ImuPrior
 from kiteline_agent.inertial.inertial_config import InertialConfig, StartDeviations
 from kiteline_agent.inertial.preintegration import BiasPrior, Preintegrated, Samples, preintegrate
-from kiteline_agent.inertial.sample_buffer import SampleBuffer, without_held
+from kiteline_agent.inertial.samples.sample_buffer import SampleBuffer, without_held
 from kiteline_agent.inertial.scale_filter import INTERVAL_S, ScaleFilter, camera_scaled
 from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuBatch, ImuCalibration

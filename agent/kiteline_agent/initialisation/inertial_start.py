@@ -9,9 +9,9 @@ from kiteline_agent.config import AgentConfig
 from kiteline_agent.governor.cost_model import Work
 from kiteline_agent.inertial.clocks.frame_clock import FrameClock
 from kiteline_agent.inertial.imu_prior import ImuPrior
-from kiteline_agent.inertial.imu_watch import SILENT_S
 from kiteline_agent.inertial.preintegration import BiasPrior, Samples, TimeOffset, preintegrate
-from kiteline_agent.inertial.sample_buffer import SampleBuffer
+from kiteline_agent.inertial.samples.imu_watch import SILENT_S
+from kiteline_agent.inertial.samples.sample_buffer import SampleBuffer
 from kiteline_agent.initialisation import corner_tracks
 from kiteline_agent.initialisation.contradiction import ContradictionWatch, contradicts, exceeds_lens_errors
 from kiteline_agent.initialisation.corner_tracks import CornerObservations, CornerTracks, TrackedKeyframe

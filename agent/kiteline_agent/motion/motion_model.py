@@ -12,9 +12,10 @@ from kiteline_agent.inertial.clocks.sample_clock import SampleClock
 from kiteline_agent.inertial.fixed_lag import VisualPoints
 from kiteline_agent.inertial.gravity_alignment import up_of
 from kiteline_agent.inertial.imu_initialisation import InertialStartState
-from kiteline_agent.inertial.imu_watch import SILENT_S, ImuWatch
 from kiteline_agent.inertial.inertial_config import InertialConfig
 from kiteline_agent.inertial.inertial_tracker import InertialTracker
+from kiteline_agent.inertial.samples.imu_watch import SILENT_S, ImuWatch
+from kiteline_agent.inertial.samples.sample_check import SampleCheck
 from kiteline_agent.inertial.scale_filter import INTERVAL_S
 from kiteline_agent.motion.extrapolation import Extrapolation, MotionSource, along_twist
 from kiteline_agent.motion.loss_motion import LossMotionEstimator
@@ -68,7 +69,7 @@ class MotionModel:
         if self.tracker is not None and imu is not None and metric:
             self.loss_motion = LossMotionEstimator(self.tracker, imu, config.gravity_m_s2)
         self.odometer = Odometer(camera.T_b_c, odometer, metric=metric)
-        self._sample_clock = SampleClock()
+        self._sample_clock, self._sample_check = SampleClock(), SampleCheck()
         self._watch = ImuWatch(SILENT_S, config.gravity_m_s2)
         self._events: list[str] = []
         self.has_false_vertical = False  # it came from an IMU that never agreed with the images
@@ -119,8 +120,8 @@ class MotionModel:
             self.tracker.clock.add(t_ns)
 
     def timed(self, imu: ImuBatch | None) -> ImuBatch | None:
-        """New samples with the times at which they were taken."""
-        return imu if self.tracker is None else self._sample_clock.timed(imu)
+        """New samples that a motion explains, with the times at which they were taken."""
+        return imu if self.tracker is None else self._sample_check.checked(self._sample_clock.timed(imu))
 
     def add_odometry(self, odometry: OdometryBatch | None) -> None:
         """Buffer the odometer samples since the last step."""
@@ -208,6 +209,7 @@ class MotionModel:
             events
             + self.odometer.take_events()
             + self._sample_clock.take_events()
+            + self._sample_check.take_events()
             + ([] if self.tracker is None else self.tracker.take_calibration_events())
         )
 

@@ -15,6 +15,8 @@ Fault = Callable[[Recording], Recording]
 
 _WALL_GREY, _BLACK_GREY = 120.0, 6.0
 _NOISE_GREY = 1.3  # deviation of a camera's noise
+_GYRO, _STUCK = 3, 20  # axes of a gyro; samples that a stuck bus repeats
+_MOST_RAD_S, _MOST_M_S2 = 15.0, 100.0  # that a bus with bit errors reads
 _FIRST_KEPT = 3  # first frames of a flight that no chance changes
 
 
@@ -127,6 +129,21 @@ def samples_in_bursts(recording: Recording, every_s: float) -> Recording:
         return replace(imu, t_ns=np.array(stamps, np.int64))
 
     return _each_batch(recording, arrived)
+
+
+def wrong_samples(recording: Recording, share: float, seed: int) -> Recording:
+    """Spoil inertial samples by chance: one axis reads anything, all read zero, or a tenth of a second is repeated."""
+    samples = _joined_imu(recording.items)
+    if samples is None:
+        return recording
+    rng, values = np.random.default_rng(seed), np.concatenate([samples.gyro, samples.accel], axis=1)
+    for k in np.flatnonzero(rng.random(len(values)) < share).tolist():
+        kind, axis = rng.choice(["peak", "zeros", "stuck"], p=[0.8, 0.1, 0.1]), int(rng.integers(6))
+        if kind == "peak":
+            values[k, axis] = rng.uniform(-1.0, 1.0) * (_MOST_RAD_S if axis < _GYRO else _MOST_M_S2)
+        else:
+            values[k : k + (1 if kind == "zeros" else _STUCK)] = 0.0 if kind == "zeros" else values[k]
+    return recording.with_imu(ImuBatch(samples.t_ns, values[:, :_GYRO].copy(), values[:, _GYRO:].copy()))
 
 
 def scattered_stamps(recording: Recording, deviation_s: float, seed: int) -> Recording:

@@ -14,6 +14,7 @@ from kiteline_bench.harness.faults import (
     some,
     wall,
     without_samples,
+    wrong_samples,
 )
 from kiteline_bench.harness.recording import Recording, load
 from kiteline_bench.reality.flown import Flown, flown, spread
@@ -31,7 +32,8 @@ _STREET_M, _ROOM_M = 0.1, 0.02
 _PLAIN, _SAMPLES = "as recorded", "0.3 s without IMU in every 5 s"
 _LATE, _EARLY, _SCATTER = "IMU stamps 20 ms late", "IMU stamps 80 ms early", "camera stamps scatter by 2 ms"
 _BURSTS = "IMU samples stamped in bursts of 16 ms"
-_OF_IMU = (_SAMPLES, _LATE, _EARLY, _BURSTS)
+_WRONG = "one IMU sample in a hundred wrong"
+_OF_IMU = (_SAMPLES, _LATE, _EARLY, _BURSTS, _WRONG)
 _FAULTS: dict[str, Callable[[Recording, int], Recording]] = {
     _PLAIN: lambda recording, _: recording,
     "one image in ten blank": lambda recording, seed: some(recording, 0.1, wall, seed),
@@ -40,6 +42,7 @@ _FAULTS: dict[str, Callable[[Recording, int], Recording]] = {
     _LATE: lambda recording, _: late_samples(recording, 0.02),
     _EARLY: lambda recording, _: late_samples(recording, -0.08),
     _BURSTS: lambda recording, _: samples_in_bursts(recording, 0.016),
+    _WRONG: lambda recording, seed: wrong_samples(recording, 0.01, seed),
     _SCATTER: lambda recording, seed: scattered_stamps(recording, 0.002, seed),
 }  # exposures: by a factor whose logarithm has a deviation of a quarter
 _SEEDS = (0, 1, 2)
@@ -114,7 +117,7 @@ def _faulty_sensors(bench: Bench) -> list[Bar]:
         for fault, change in _FAULTS.items():
             if fault in (*_OF_IMU, _SCATTER) and ways[0].imu is None:
                 continue
-            seeds = (0,) if fault in (_PLAIN, *_OF_IMU) else bench.chosen(_SEEDS)
+            seeds = (0,) if fault in (_PLAIN, *_OF_IMU[:-1]) else bench.chosen(_SEEDS)
             found = [flown(bench, f"{name}, {fault}", change(way, seed), base=False) for way in ways for seed in seeds]
             waits = sum(e.initialising for flight in found for e in flight.run.found)
             errors = [flight.ate_m("odometry") for flight in found]

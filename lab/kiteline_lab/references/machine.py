@@ -9,16 +9,17 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from llvmlite import binding
 
 _LIBRARIES = ("numpy", "numba", "opencv-python-headless", "gtsam")
 
 
 @cache
 def machine() -> str:
-    """Processor type, versions, and the kernels of OpenBLAS, numpy and OpenCV, as one line."""
+    """Processor type, versions, the kernels of OpenBLAS, numpy and OpenCV, and numba's CPU, as one line."""
     versions = [f"{name} {_version(name)}" for name in _LIBRARIES]
     kernels = f"OpenBLAS for {_blas_core()}", f"numpy for {_numpy_features()}", f"OpenCV for {_opencv_features()}"
-    return "; ".join((platform.machine(), *versions, *kernels))
+    return "; ".join((platform.machine(), *versions, *kernels, f"numba for {binding.get_host_cpu_name()}"))
 
 
 def _version(name: str) -> str:

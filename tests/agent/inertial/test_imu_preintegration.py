@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from kiteline_agent.inertial import imu_kernels
 from kiteline_agent.inertial.preintegration import Preintegrated, Samples, preintegrate
-from kiteline_agent.inertial.sample_buffer import SampleBuffer
+from kiteline_agent.inertial.samples.sample_buffer import SampleBuffer
 from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuBatch, ImuCalibration
 from kiteline_core.geometry import se3

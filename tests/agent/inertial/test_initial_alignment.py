@@ -11,7 +11,7 @@ from kiteline_agent.inertial import initial_alignment as imu_alignment
 from kiteline_agent.inertial.imu_initialisation import ImuInitialiser, TimedPose
 from kiteline_agent.inertial.inertial_config import InertialConfig
 from kiteline_agent.inertial.preintegration import Preintegrated, Samples, preintegrate
-from kiteline_agent.inertial.sample_buffer import SampleBuffer
+from kiteline_agent.inertial.samples.sample_buffer import SampleBuffer
 from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry import se3

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kiteline_agent.inertial.sample_buffer import SampleBuffer
+from kiteline_agent.inertial.samples.sample_buffer import SampleBuffer
 from kiteline_core.arrays import F64, I64
 from kiteline_core.geometry import se3
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from kiteline_agent.inertial.preintegration import Samples
-from kiteline_agent.inertial.sample_buffer import SampleBuffer
+from kiteline_agent.inertial.samples.sample_buffer import SampleBuffer
 from kiteline_core.arrays import F64
 
 _RATE_NS = 12_000_000  # to either side of an instant, averaged for the rate there

@@ -23,7 +23,7 @@ from kiteline_agent.inertial.calibration.turn_scatter import added_variance
 from kiteline_agent.inertial.calibration.window import Window
 from kiteline_agent.inertial.inertial_config import SelfCalibrationConfig
 from kiteline_agent.inertial.preintegration import Samples, TimeOffset
-from kiteline_agent.inertial.sample_buffer import SampleBuffer
+from kiteline_agent.inertial.samples.sample_buffer import SampleBuffer
 from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry import se3

@@ -7,7 +7,7 @@ import numpy as np
 
 from kiteline_agent.inertial.calibration.pose_chain import SampledMotion, rate_at
 from kiteline_agent.inertial.calibration.window import Window
-from kiteline_agent.inertial.sample_buffer import SampleBuffer
+from kiteline_agent.inertial.samples.sample_buffer import SampleBuffer
 from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from kiteline_agent.inertial.clocks.stamp_line import stamp_line
 from kiteline_core.arrays import I64
-from kiteline_core.frame import ImuBatch
+from kiteline_core.frame import ImuBatch, joined
 from kiteline_core.order_statistics import median
 
 _SAMPLES = 400  # that a line is fitted to: one or two seconds
@@ -32,6 +32,7 @@ class SampleClock:
         self._numbers: I64 = np.zeros(0, np.int64)
         self._begin_ns, self._period_ns, self._scatter_ns = 0.0, 0.0, 0.0  # the line, at number 0; period 0: none
         self._newest_ns: int | None = None  # the last time that was given
+        self._last: ImuBatch | None = None  # the last sample, with its stamp
         self._even, self._unjudged = True, 0  # and samples since that was judged
         self._told = False
         self._events: list[str] = []
@@ -50,22 +51,36 @@ class SampleClock:
         """The samples with the times at which they were taken; without those that cannot be later than the last."""
         if imu is None or len(imu.t_ns) == 0:
             return imu
-        times_ns = self._taken_ns(imu.t_ns)
-        newest_ns, self._newest_ns = self._newest_ns, int(times_ns[-1])
-        if times_ns is imu.t_ns and (newest_ns is None or times_ns[0] > newest_ns):
-            return imu
-        newest_ns = int(times_ns[0]) - 1 if newest_ns is None else newest_ns
-        later, self._newest_ns = times_ns > newest_ns, max(newest_ns, self._newest_ns)
-        if not later.any():
+        imu = self._without_copies(imu)
+        if len(imu.t_ns) == 0:
             return None
-        return ImuBatch(times_ns[later], imu.gyro[later], imu.accel[later])
+        times_ns = self._taken_ns(imu.t_ns)
+        newest_ns = self._newest_ns
+        before_ns = np.concatenate([[times_ns[0] - 1 if newest_ns is None else newest_ns], times_ns[:-1]])
+        before_ns = np.maximum.accumulate(before_ns)
+        later, self._newest_ns = times_ns > before_ns, max(int(before_ns[-1]), int(times_ns[-1]))
+        if later.all():
+            return imu if times_ns is imu.t_ns else ImuBatch(times_ns, imu.gyro, imu.accel)
+        return ImuBatch(times_ns[later], imu.gyro[later], imu.accel[later]) if later.any() else None
+
+    def _without_copies(self, imu: ImuBatch) -> ImuBatch:
+        """The samples without those that are the same as the one before, stamp included: some links send twice."""
+        before = imu if self._last is None else joined([self._last, imu])
+        self._last = ImuBatch(imu.t_ns[-1:], imu.gyro[-1:], imu.accel[-1:])
+        assert before is not None
+        same = before.t_ns[1:] == before.t_ns[:-1]
+        if not same.any():
+            return imu
+        same &= (before.gyro[1:] == before.gyro[:-1]).all(axis=1) & (before.accel[1:] == before.accel[:-1]).all(axis=1)
+        first = np.concatenate([[True], ~same])[-len(imu.t_ns) :]
+        return ImuBatch(imu.t_ns[first], imu.gyro[first], imu.accel[first])
 
     def _taken_ns(self, stamps_ns: I64) -> I64:
         """Times (n,) of new samples; the stamps (n,) themselves where they are even or tell no rate."""
         old = self._stamps_ns
         if len(old) and not 0 < int(stamps_ns[0]) - int(old[-1]) < 1e9 * _SILENT_S:
             self._begin_again()
-        self._number(stamps_ns)
+        new = self._number(stamps_ns)
         self._unjudged += len(stamps_ns)
         if len(self._stamps_ns) >= _FEWEST and self._unjudged >= _JUDGED:
             self._even, self._unjudged = self._is_even(), 0
@@ -83,7 +98,6 @@ class SampleClock:
         if line.scatter_s > _TOLD_S and not self._told:
             self._told = True
             self._events.append(f"imu: stamps scatter by {1e3 * line.scatter_s:.1f} ms: samples are counted instead")
-        new = self._numbers[-len(stamps_ns) :]
         return np.round(self._begin_ns + self._period_ns * new).astype(np.int64)
 
     def _begin_again(self) -> None:
@@ -91,8 +105,8 @@ class SampleClock:
         self._even, self._unjudged = True, 0
         self._period_ns = self._scatter_ns = 0.0
 
-    def _number(self, stamps_ns: I64) -> None:
-        """Count new samples, and those that are missing before them."""
+    def _number(self, stamps_ns: I64) -> I64:
+        """Count new samples, and those that are missing before them. Returns their numbers (n,)."""
         last = int(self._numbers[-1]) if len(self._numbers) else -1
         if self._period_ns == 0.0:
             numbers = last + 1 + np.arange(len(stamps_ns), dtype=np.int64)
@@ -105,6 +119,7 @@ class SampleClock:
             numbers = np.array(found, np.int64)
         self._stamps_ns = np.concatenate([self._stamps_ns, stamps_ns])[-_SAMPLES:]
         self._numbers = np.concatenate([self._numbers, numbers])[-_SAMPLES:]
+        return numbers
 
     def _is_even(self) -> bool:
         """True if nearly all steps are whole multiples of the usual one: samples may be missing."""

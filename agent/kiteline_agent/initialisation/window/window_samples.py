@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from itertools import pairwise
 
 from kiteline_agent.inertial.preintegration import Samples
-from kiteline_agent.inertial.sample_buffer import SampleBuffer, without_held
+from kiteline_agent.inertial.samples.sample_buffer import SampleBuffer, without_held
 
 _MOST_S = 0.5  # s; change of the time offset: a solver that diverges asks for more
 

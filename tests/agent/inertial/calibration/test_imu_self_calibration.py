@@ -16,7 +16,7 @@ from kiteline_agent.inertial.calibration.self_calibration import (
 from kiteline_agent.inertial.calibration.window import Window
 from kiteline_agent.inertial.inertial_config import SelfCalibrationConfig
 from kiteline_agent.inertial.preintegration import Samples, TimeOffset, preintegrate
-from kiteline_agent.inertial.sample_buffer import SampleBuffer
+from kiteline_agent.inertial.samples.sample_buffer import SampleBuffer
 from kiteline_core.arrays import F64, I64
 from kiteline_core.frame import ImuBatch, ImuCalibration
 from kiteline_core.geometry import se3

@@ -6,7 +6,7 @@ import pytest
 from kiteline_agent.inertial.calibration import self_calibration
 from kiteline_agent.inertial.calibration.pose_chain import PoseChain, SampledMotion
 from kiteline_agent.inertial.calibration.turn_scatter import added_variance
-from kiteline_agent.inertial.sample_buffer import SampleBuffer
+from kiteline_agent.inertial.samples.sample_buffer import SampleBuffer
 from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuBatch
 from kiteline_core.geometry import se3

@@ -83,3 +83,26 @@ def test_after_a_silence_or_a_clock_that_was_set_back_it_begins_again() -> None:
         off = times - shift_ns - true_ns()[numbers.astype(np.int64)]
         assert off[SETTLED:].std() < 3e5
     assert clock.timed(None) is None
+
+
+def test_a_batch_of_many_uneven_samples() -> None:
+    clock, stamps = SampleClock(), in_bursts(16_000_000)
+    values = np.zeros((len(stamps), 3))
+    out = clock.timed(ImuBatch(stamps, values, values))  # the samples before the first frame
+    assert out is not None and len(out.t_ns) > 0.9 * len(stamps) and (np.diff(out.t_ns) > 0).all()
+
+
+def test_samples_sent_twice_or_out_of_order_are_left_out() -> None:
+    clock, stamps = SampleClock(), true_ns(1000)
+    twice = np.sort(np.concatenate([stamps, stamps[::20]]))
+    numbers, times = (twice - stamps[0]) // PERIOD_NS, []
+    for k in range(0, len(twice), 10):
+        values = np.tile(numbers[k : k + 10, None].astype(np.float64), (1, 3))
+        batch = clock.timed(ImuBatch(twice[k : k + 10], values, values))
+        times += [] if batch is None else batch.t_ns.tolist()
+    assert times == stamps.tolist()
+    swapped = true_ns(10)
+    swapped[[4, 5]] = swapped[[5, 4]]
+    values = np.arange(30.0).reshape(10, 3)
+    batch = SampleClock().timed(ImuBatch(swapped, values, values))
+    assert batch is not None and batch.t_ns.tolist() == sorted({*swapped.tolist()} - {int(swapped[5])})

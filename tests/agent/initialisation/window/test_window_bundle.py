@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from kiteline_agent.inertial.preintegration import BiasPrior, Samples, TimeOffset
-from kiteline_agent.inertial.sample_buffer import SampleBuffer
+from kiteline_agent.inertial.samples.sample_buffer import SampleBuffer
 from kiteline_agent.inertial_start_config import InertialBundleConfig
 from kiteline_agent.initialisation.corner_tracks import CornerObservations
 from kiteline_agent.initialisation.window.corner_terms import _MAX_RMS, CornerTerms

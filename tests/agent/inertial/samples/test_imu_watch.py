@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from kiteline_agent.inertial.imu_watch import ImuWatch
+from kiteline_agent.inertial.samples.imu_watch import ImuWatch
 from kiteline_core.frame import ImuBatch
 
 _FRAME_NS = 50_000_000

@@ -5,7 +5,7 @@ import pytest
 
 from kiteline_agent.inertial import imu_kernels
 from kiteline_agent.inertial.preintegration import Samples, preintegrate
-from kiteline_agent.inertial.sample_buffer import SampleBuffer, without_held
+from kiteline_agent.inertial.samples.sample_buffer import SampleBuffer, without_held
 from kiteline_agent.initialisation.window.window_noise import vibration
 from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuBatch, ImuCalibration
