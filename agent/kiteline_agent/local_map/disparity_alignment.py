@@ -5,8 +5,8 @@ far landmarks, and of different parts of the image, contradict it. Each keyframe
 tells most: disparities of one keyframe have the same errors in all frames.
 
 A worn rig gets the estimate of a wide prior once it is sure to be worn. A good calibration is off by a tenth of a pixel
-all the same, 3 % of lengths at 20 m: unless the rig is worn, it gets the most probable offset under the prior of good
-calibrations, about what earlier flights found.
+all the same, 3 % of lengths at 20 m: unless the rig is worn, it has the most probable offset under the prior of good
+calibrations, about what earlier flights found, from the first pair on.
 """
 
 import math
@@ -31,7 +31,8 @@ _KNOWN_PX = 0.1  # px; by which each number of an offset changes between two fli
 _PRIOR_PX = 0.9  # px; standard deviation of a constant offset of a worn rig: both centres moved
 _PRIOR_SLOPE_RAD = 1.1e-3  # rad; the same of the other terms: a right camera that is turned by 0.06 degrees
 _BENT, _BENT_LOG_ODDS = 8.0, -4.0  # times these of a mount that was bent by a degree; one worn rig in fifty is
-_LEAST_CHANGE_PX = 0.04  # px, rms over the image; of a later change that is applied
+_LEAST_CHANGE_PX = 0.04  # px, rms over the image; of a later change of a worn rig's offset that is applied
+_LEAST_GOOD_CHANGE_PX = 0.015  # the same of a good calibration's: depths follow, and the base is told
 _ROWS_SURE = 0.99  # probability of a worn rig by rows alone, above which its offset is applied in any motion
 _INFLATION = 2.0  # factor on variances: templates and lens errors are common to neighbouring points
 _ITERATIONS = 3  # Gauss-Newton steps; two converge from a scale that is off by a tenth
@@ -41,7 +42,6 @@ _MIN_SIDEWAYS = 0.2  # share of the motion across the optical axis below which e
 _FORWARD_SHARE = 1.0 / 9.0  # of the information about a worn rig that is believed then: errors were three deviations
 _FORWARD_KEYFRAMES = 12  # that tell something of their own then; more of them repeat errors of lens and tracks
 _FORWARD_GOOD_KEYFRAMES = 3  # the same of a good calibration's offset, which is no larger than these errors are
-_FORWARD_TOLD = 6  # keyframes from which on that offset is applied, be it likelier than the expected one or not
 _PAIR_EVERY_S = 0.18  # s between two pairs, at most: slow cameras, and frames that the governor skips
 _PARALLAX_GROWTH = 1.2  # of the parallax between two pairs of the same keyframe
 _WORN_SHARE = 0.2  # probability of a worn rig before the flight
@@ -78,9 +78,8 @@ class DisparityAlignment:
         self._pair_t_ns: int | None = None  # of that one
         self.pairs = 0  # compared so far
         self._estimate, self.cov = none(), np.linalg.inv(self._prior)
-        # If the rig is not worn: what was expected of it, its most probable offset, and whether another one than the
-        # expected is likelier, and differs from that by more than its deviation.
-        self.expected_px, self._good_estimate, self._good_is_known = none(), none(), False
+        # If the rig is not worn: what was expected of it, and its most probable offset.
+        self.expected_px, self._good_estimate = none(), none()
         self._prior_log_odds = math.log(_WORN_SHARE / (1.0 - _WORN_SHARE))  # of a worn rig
         self._log_odds = self._prior_log_odds  # by disparities alone
         self.worn = self.rig_worn = _WORN_SHARE  # probability of it: by disparities alone, and with rows
@@ -278,14 +277,7 @@ class DisparityAlignment:
 
     def _solve_good(self, h: F64, b: F64) -> None:
         """Estimate the offset if the calibration is good: about the expected one, from information h (5,5), b (5,)."""
-        beyond = b - h @ self.expected_px
-        cov: F64 = np.asarray(np.linalg.inv(h + self._good), np.float64)
-        difference = cov @ beyond
-        self._good_estimate = self.expected_px + difference
-        is_larger = self._rms_px(np.outer(difference, difference)) > self._rms_px(cov)
-        is_likelier = bool(is_larger and log_evidence(h, beyond, self._good) > 0.0)
-        # In forward motion, where little counts, a small offset stays below its deviation however often it was told.
-        self._good_is_known = is_likelier or (self._keyframes >= _FORWARD_TOLD and not self._moves_sideways())
+        self._good_estimate = self.expected_px + np.linalg.solve(h + self._good, b - h @ self.expected_px)
 
     def _is_sure(self) -> bool:
         """True if the rig is worn though pairs tell less whose landmarks fit badly: some may be on people who walk.
@@ -370,10 +362,8 @@ class DisparityAlignment:
         return change
 
     def _apply_good(self) -> F64 | None:
-        """Set the most probable offset of a good calibration, if it is known."""
-        if not (self._good_is_known or self._refuted):
-            return None
-        change = self._set(self._good_estimate, _LEAST_CHANGE_PX)
+        """Set the most probable offset of a good calibration."""
+        change = self._set(self._good_estimate, _LEAST_GOOD_CHANGE_PX)
         if change is not None:
             self.is_good_offset, self._refuted, self._base_sigma_px = True, False, None
         return change

@@ -21,6 +21,12 @@ from kiteline_core.ids import AgentId
 from tests.agent.disparity_flights import AHEAD, CAMERA, NOTHING, SIDEWAYS, WORN, Flight, normalised
 
 
+def off_px(offset: F64) -> float:
+    """Rms over the image of an offset (5,)."""
+    grid = terms(normalised(np.array([[x, y] for x in (60.0, 376.0, 690.0) for y in (60.0, 240.0, 420.0)])))
+    return float(np.sqrt(np.mean((grid @ offset) ** 2)))
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_the_offset_of_a_worn_rig_is_found_and_corrects_the_map(seed: int) -> None:
     flight = Flight(WORN, seed, SIDEWAYS)
@@ -28,9 +34,8 @@ def test_the_offset_of_a_worn_rig_is_found_and_corrects_the_map(seed: int) -> No
     changes = flight.fly(80)
     assert changes and flight.alignment.worn > 0.95
     assert np.allclose(np.sum(changes, 0), flight.map.disparity_offset)
-    grid = terms(normalised(np.array([[x, y] for x in (60.0, 376.0, 690.0) for y in (60.0, 240.0, 420.0)])))
-    left = np.sqrt(np.mean((grid @ (WORN - flight.map.disparity_offset)) ** 2))
-    assert left < 0.3 * np.sqrt(np.mean((grid @ WORN) ** 2))
+    left = off_px(WORN - flight.map.disparity_offset)
+    assert left < 0.3 * off_px(WORN)
     worn_rig = np.trace(before) / _WORN_SHARE
     assert np.trace(flight.alignment.expected_cov) < 0.08 * worn_rig
     off = flight.map.rho[0, :160] - 1.0 / flight.depth
@@ -46,9 +51,8 @@ def test_an_offset_beyond_any_wear_is_found_as_well(seed: int) -> None:
     flight, worn = Flight(BENT, seed, SIDEWAYS), Flight(1.5 * WORN, seed, SIDEWAYS)
     wear = np.trace(flight.alignment.cov)
     flight.fly(80), worn.fly(80)
-    grid = terms(normalised(np.array([[x, y] for x in (60.0, 376.0, 690.0) for y in (60.0, 240.0, 420.0)])))
-    left = np.sqrt(np.mean((grid @ (BENT - flight.map.disparity_offset)) ** 2))
-    assert left < 0.06 * np.sqrt(np.mean((grid @ BENT) ** 2))
+    left = off_px(BENT - flight.map.disparity_offset)
+    assert left < 0.06 * off_px(BENT)
     assert np.trace(np.linalg.inv(flight.alignment._prior)) == pytest.approx(64.0 * wear)
     assert np.trace(np.linalg.inv(worn.alignment._prior)) == pytest.approx(wear)  # wear keeps its own prior
 
@@ -65,23 +69,25 @@ def test_frames_that_are_skipped_do_not_make_pairs_rarer() -> None:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_people_in_a_third_of_the_view_are_no_offset(seed: int) -> None:
+def test_people_in_a_third_of_the_view_are_hardly_an_offset(seed: int) -> None:
     """A third of the landmarks walk at the middle of the view while the first pairs of a true rig are compared."""
     flight = Flight(NOTHING, seed, SIDEWAYS)
     across, still = flight.xyz[:, 0] / flight.xyz[:, 2], flight.xyz.copy()
     walks = np.abs(across - np.median(across)) < np.quantile(np.abs(across - np.median(across)), 0.35)
     for k, frame in enumerate(flight.frames(12)):
-        assert flight.alignment.add(*frame) is None
+        flight.alignment.add(*frame)
         flight.xyz = still + walks[:, None] * np.array([0.01 * (k + 2), 0.0, 0.0])
-    assert not flight.map.disparity_offset.any()
+    assert not flight.alignment.applied  # as that of a worn rig
+    assert off_px(flight.map.disparity_offset) < 0.6 * GOOD_PX
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_true_rig_is_left_alone(seed: int) -> None:
+def test_a_true_rig_is_left_nearly_alone(seed: int) -> None:
     flight = Flight(NOTHING, seed, SIDEWAYS)
     begin = np.trace(flight.alignment.expected_cov)
-    assert flight.fly(80) == []
-    assert flight.alignment.worn < 0.05
+    flight.fly(80)
+    assert off_px(flight.map.disparity_offset) < 0.5 * GOOD_PX
+    assert flight.alignment.worn < 0.05 and not flight.alignment.applied
     assert np.trace(flight.alignment.expected_cov) < 0.05 * begin
 
 
@@ -142,9 +148,8 @@ def test_forward_motion_tells_of_a_worn_rig_that_is_far_off(seed: int) -> None:
     flight = Flight(2.0 * WORN, seed, AHEAD)
     flight.fly(80)
     assert flight.alignment.applied and not flight.alignment.is_good_offset
-    grid = terms(normalised(np.array([[x, y] for x in (60.0, 376.0, 690.0) for y in (60.0, 240.0, 420.0)])))
-    left = np.sqrt(np.mean((grid @ (2.0 * WORN - flight.map.disparity_offset)) ** 2))
-    assert left < 0.3 * np.sqrt(np.mean((grid @ (2.0 * WORN)) ** 2))
+    left = off_px(2.0 * WORN - flight.map.disparity_offset)
+    assert left < 0.3 * off_px(2.0 * WORN)
 
 
 def test_in_forward_motion_many_keyframes_tell_no_more_than_a_dozen() -> None:
@@ -188,34 +193,30 @@ def test_an_offset_that_a_good_calibration_may_have_is_reduced(seed: int, way: F
     flight = Flight(off, seed, way)
     assert flight.fly(80)
     assert flight.alignment.is_good_offset and not flight.alignment.applied
-    grid = terms(normalised(np.array([[x, y] for x in (60.0, 376.0, 690.0) for y in (60.0, 240.0, 420.0)])))
-    left = np.sqrt(np.mean((grid @ (off - flight.map.disparity_offset)) ** 2))
-    assert left < share * np.sqrt(np.mean((grid @ off) ** 2))
+    left = off_px(off - flight.map.disparity_offset)
+    assert left < share * off_px(off)
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_a_small_offset_is_applied_once_several_keyframes_told_it_ahead(seed: int) -> None:
+@pytest.mark.parametrize("way", [AHEAD, SIDEWAYS])
+def test_a_small_offset_is_found_by_several_keyframes(seed: int, way: F64) -> None:
     """Forward motion leads to what is far away, where hundredths of a pixel are percents of the depth."""
     off = np.array([0.05, 0.0, 0.0, 0.0, 0.0])
-    changed = {}
-    for name, way in (("ahead", AHEAD), ("sideways", SIDEWAYS)):
-        flight = Flight(off, seed, way)
-        changed[name] = [len(flight.fly(40))]
-        for n in range(8):  # further keyframes that see the same
-            flight.alignment._begin(0)
-            flight.alignment._keyframe[0] = -1 - n
-            changed[name].append(len(flight.fly(40)))
-        if name == "ahead":
-            assert flight.alignment.is_good_offset and abs(flight.map.disparity_offset[0] - off[0]) < 0.02
-    assert changed["ahead"] == [0, 0, 0, 0, 0, 1, 0, 0, 0] and not any(changed["sideways"])
+    flight = Flight(off, seed, way)
+    flight.fly(40)
+    for n in range(8):  # further keyframes that see the same
+        flight.alignment._begin(0)
+        flight.alignment._keyframe[0] = -1 - n
+        flight.fly(40)
+    assert flight.alignment.is_good_offset and off_px(flight.map.disparity_offset - off) < 0.8 * off_px(off)
 
 
 def test_a_good_calibration_s_offset_begins_at_what_the_base_tells() -> None:
     off = np.array([-0.15, -0.1, 0.1, -0.15, 0.0])
     flight = Flight(off, 0, AHEAD)
     assert flight.alignment.take_base(off, None)
-    assert flight.fly(80) == []
-    assert np.array_equal(flight.map.disparity_offset, off)
+    flight.fly(80)
+    assert off_px(flight.map.disparity_offset - off) < 0.3 * off_px(off)
     wrong = Flight(off, 0, AHEAD)
     assert wrong.alignment.take_base(-off, None)
     assert wrong.fly(80) and wrong.alignment.is_good_offset
@@ -230,14 +231,13 @@ def test_a_good_calibration_s_offset_begins_at_what_the_base_tells() -> None:
 
 
 def test_forward_motion_is_believed_where_rows_are_those_of_a_worn_rig() -> None:
-    grid = terms(normalised(np.array([[x, y] for x in (60.0, 376.0, 690.0) for y in (60.0, 240.0, 420.0)])))
     for evidence, corrected in ((4.0, False), (9.0, True)):
         flight = Flight(WORN, 1, AHEAD)
         flight.alignment.add_row_evidence(evidence)
         flight.fly(60)
         assert flight.alignment.applied == corrected
-        left = np.sqrt(np.mean((grid @ (WORN - flight.map.disparity_offset)) ** 2))
-        assert (left < 0.3 * np.sqrt(np.mean((grid @ WORN) ** 2))) == corrected
+        left = off_px(WORN - flight.map.disparity_offset)
+        assert (left < 0.3 * off_px(WORN)) == corrected
     good = Flight(NOTHING, 1, AHEAD)
     good.alignment.add_row_evidence(9.0)
     good.fly(60)
@@ -257,8 +257,7 @@ def test_what_earlier_flights_found_is_where_it_begins() -> None:
     known.alignment.begin_with(WORN, 0.03)
     assert np.trace(known.alignment.expected_cov) < 0.1 * np.trace(fresh.alignment.cov)  # of a rig known to be worn
     known.fly(12)
-    grid = terms(normalised(np.array([[x, y] for x in (60.0, 376.0, 690.0) for y in (60.0, 240.0, 420.0)])))
-    assert np.sqrt(np.mean((grid @ (WORN - known.map.disparity_offset)) ** 2)) < 0.1
+    assert off_px(WORN - known.map.disparity_offset) < 0.1
 
 
 class Camera:
@@ -309,8 +308,7 @@ def test_a_rig_that_was_repaired_is_found_anew() -> None:
     assert good.alignment.worn < 0.2
     bent = begun(-WORN, 2, SIDEWAYS)
     bent.fly(80)
-    grid = terms(normalised(np.array([[x, y] for x in (60.0, 376.0, 690.0) for y in (60.0, 240.0, 420.0)])))
-    assert np.sqrt(np.mean((grid @ (-WORN - bent.map.disparity_offset)) ** 2)) < 0.15
+    assert off_px(-WORN - bent.map.disparity_offset) < 0.15
     ahead = begun(NOTHING, 2, AHEAD)  # forward motion alone does not tell
     assert ahead.fly(60) == []
     assert np.array_equal(ahead.map.disparity_offset, WORN)
