@@ -18,7 +18,8 @@ from kiteline_agent.inertial.imu_prior import ImuPrior
 from kiteline_agent.inertial.inertial_config import InertialConfig, StartDeviations
 from kiteline_agent.inertial.preintegration import BiasPrior, Preintegrated, Samples, preintegrate
 from kiteline_agent.inertial.samples.sample_buffer import SampleBuffer, without_held
-from kiteline_agent.inertial.scale_filter import INTERVAL_S, ScaleFilter, camera_scaled
+from kiteline_agent.inertial.scale_filter import ScaleFilter, camera_scaled
+from kiteline_agent.inertial.scale_watch import ScaleWatch
 from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuBatch, ImuCalibration
 from kiteline_core.geometry import disparity_offset, se3
@@ -47,7 +48,7 @@ class InertialTracker:
         )
         self._reported_s = config.calibration.offset_s
         self.scale = ScaleFilter(calibration, config.gravity_m_s2, self._p_b_c)  # of a monocular map
-        self._scale_from: tuple[int, F64] | None = None  # stamp and pose by images at which its interval begins
+        self._scale_watch = ScaleWatch(self.scale, self._p_b_c, self._has_come, self._between_frames)
         # the interval that was asked for last
         self._cached: tuple[tuple[int, int, int | None], Samples | None] | None = None
         self._incomplete: tuple[int, int] | None = None  # the last interval, if samples at its end were missing
@@ -187,7 +188,7 @@ class InertialTracker:
             held = without_held(samples) if samples and awaits else samples
             length_error = disparity_offset.GOOD_PX * depth_m / self._bf if self._images_have_scale else 0.0
             state = self._advance(held, points, velocity, length_error)
-        self._watch_scale(t_ns, T_m_b_visual, depth_m, state)
+        self._scale_watch.see(t_ns, T_m_b_visual, depth_m, state)
         if state is None:
             self._initialiser.add(TimedPose(t_ns, T_m_b_visual.copy(), samples, self._awaited(samples)))
             self._set_last(t_ns, T_m_b_visual)
@@ -209,7 +210,7 @@ class InertialTracker:
         self.clock.forget()
         self.self_calibration.clear()
         self._initialiser.clear()
-        self._scale_from = None
+        self._scale_watch.forget()
         if self._last is not None:
             self._image_loss_s += (t_ns - self._last[0]) * 1e-9
         state = None
@@ -233,9 +234,7 @@ class InertialTracker:
         if self._last is not None:
             self._last = (self._last[0], T_new_old @ self._last[1])
         self.self_calibration.move_map(T_new_old)
-        if self._scale_from is not None:
-            self._scale_from = (self._scale_from[0], T_new_old @ self._scale_from[1])
-        self.scale.rotate_map(T_new_old[:3, :3])
+        self._scale_watch.move_map(T_new_old)
 
     def scale_map(self, factor: float) -> None:
         """Lengths in a monocular map were multiplied by `factor` about the camera of the last frame."""
@@ -243,9 +242,7 @@ class InertialTracker:
             return
         camera = self._last[1][:3, 3] + self._last[1][:3, :3] @ self._p_b_c
         self._smoother.scale_map(factor, camera)
-        self.scale.scale_map(factor)
-        if self._scale_from is not None:
-            self._scale_from = self._scale_from[0], camera_scaled(self._scale_from[1], factor, self._p_b_c, camera)
+        self._scale_watch.scale_map(factor, camera)
 
     def begin_map(self, t_ns: int, T_m_b: F64) -> None:
         """Begin a new map at this frame, with the body at T_m_b (4,4) by definition.
@@ -257,7 +254,7 @@ class InertialTracker:
         if self._smoother.running:
             self._smoother.begin_map(T_m_b)
         self.self_calibration.begin_map()
-        self._scale_from = None
+        self._scale_watch.forget()
         self._incomplete = None
         self._initialiser.clear()
         self._set_last(t_ns, T_m_b)
@@ -293,7 +290,7 @@ class InertialTracker:
         if self._last is None:
             return
         self._last = (self._last[0], camera_scaled(self._last[1], scale, self._p_b_c))
-        self._scale_from = None
+        self._scale_watch.forget()
         self.scale.correct(scale)
         if self._smoother.running:
             state, gravity = self._smoother.state, self._smoother.gravity
@@ -319,11 +316,19 @@ class InertialTracker:
 
     def samples_between(self, from_ns: int, to_ns: int) -> Samples | None:
         """Corrected samples between two camera stamps; None with a gap, and before the last ones have come."""
-        return self._come_between(self.clock.taken_ns(from_ns), self.clock.taken_ns(to_ns))
+        from_ns, to_ns = self.clock.taken_ns(from_ns), self.clock.taken_ns(to_ns)
+        return self._between_frames(from_ns, to_ns) if self._has_come(to_ns) else None
 
-    def _come_between(self, from_ns: int, to_ns: int) -> Samples | None:
-        begin_ns, end_ns = from_ns + self._offset_ns, to_ns + self._offset_ns
-        return None if self._buffer.lacks_some(end_ns) else self._between(begin_ns, end_ns)
+    def has_samples(self, t_ns: int) -> bool:
+        """True if the samples up to a camera stamp have come."""
+        return self._has_come(self.clock.taken_ns(t_ns))
+
+    def _has_come(self, t_ns: int) -> bool:
+        """True if the samples up to a frame's time have come."""
+        return not self._buffer.lacks_some(t_ns + self._offset_ns)
+
+    def _between_frames(self, from_ns: int, to_ns: int) -> Samples | None:
+        return self._between(from_ns + self._offset_ns, to_ns + self._offset_ns)
 
     def _between(self, from_ns: int, to_ns: int) -> Samples | None:
         """Corrected samples; cached, as the prediction and the update of a frame need the same ones."""
@@ -356,22 +361,6 @@ class InertialTracker:
         newest = self._buffer.newest_t_ns
         self._incomplete = (self._interval_end_ns, end_ns) if newest is not None and newest < end_ns else None
         return state
-
-    def _watch_scale(self, t_ns: int, T_m_b: F64, depth_m: float, state: InertialState | None) -> None:
-        """Compare a pose by images, and one some frames before, with the IMU in between."""
-        if not self.scale.running or state is None:
-            self.scale.stop()
-            return
-        if self._scale_from is None:
-            self.scale.resume(state.velocity)
-            self._scale_from = (t_ns, T_m_b)
-        elif (t_ns - self._scale_from[0]) * 1e-9 >= INTERVAL_S:
-            samples = self._come_between(self._scale_from[0], t_ns)
-            if samples is not None and depth_m > 0.0:
-                self.scale.add(self._scale_from[1], T_m_b, samples, state.bias[:3], depth_m)
-            else:
-                self.scale.resume(state.velocity)
-            self._scale_from = (t_ns, T_m_b)
 
     def _complete_interval(self) -> None:
         """Replace the last interval if its final samples came after its frame: IMU stamps ahead of the camera's."""

@@ -42,6 +42,7 @@ class KeyframeStage:
         """Make a keyframe if the policy needs one and CPU time allows it; share it if the link does. Returns events."""
         if not self._maker.lacks_depth(ctx):
             self._depth_t_ns = ctx.t_ns
+        self._share_steps()
         need = self._camera.reference.keyframe_need(ctx, track)
         if need is None:
             return []
@@ -60,6 +61,12 @@ class KeyframeStage:
         """Make a keyframe of a tracked frame, with new landmarks where the image has room."""
         points = self._maker.points_beside(ctx, track)
         self.make(ctx, track, points, self._camera.pose.T_m_c, Extra.KEYFRAME)
+
+    def _share_steps(self) -> None:
+        """Share the inertial steps between keyframes whose samples have come."""
+        for steps in self._camera.motion.take_steps():
+            if self._channel.profile.inertial_steps:
+                self._channel.put(steps)
 
     def _add_unshared(self, ctx: FrameContext, track: Track) -> None:
         """Make a keyframe for the tracker alone."""
@@ -96,9 +103,8 @@ class KeyframeStage:
         keyframe, parent, T_p_k = reference.next_keyframe(submap, T_m_c)
         T_m_p = reference.T_m_k
         T_p_k = self._maker.make(ctx, track, points, T_m_c, keyframe, parent, T_p_k, self._camera.motion.up())
-        steps = self._camera.motion.take_steps(keyframe, ctx.t_ns)
-        if steps is not None and self._channel.profile.inertial_steps:
-            self._channel.put(steps)
+        self._camera.motion.mark_keyframe(keyframe, ctx.t_ns)
+        self._share_steps()
         T_m_k = T_p_k if parent == NO_KEYFRAME else T_m_c if T_m_p is None else se3.orthonormalise(T_m_p @ T_p_k)
         reference.set_new(keyframe, submap, T_m_c, T_m_k, ctx.t_ns, ctx.number)
         self._relocaliser.add_keyframe(keyframe)

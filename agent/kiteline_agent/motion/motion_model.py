@@ -175,7 +175,7 @@ class MotionModel:
             T_m_b = se3.inverse(track.T_c_m) @ self._T_c_b
             state = self.tracker.update(t_ns, T_m_b, points, velocity)
             if self._steps is not None and self.tracker.metric and state is not None:
-                self._steps.see(t_ns, T_m_b, self.tracker)
+                self._steps.see(t_ns, T_m_b)
             if self._metric and self.tracker.self_calibration.contradicts:
                 self._leave_imu(self.tracker)
                 state = None
@@ -190,9 +190,14 @@ class MotionModel:
         self.ignore_imu()
         self._events += [_CONTRADICTS, _NO_VERTICAL] if self.has_false_vertical else [_CONTRADICTS]
 
-    def take_steps(self, keyframe: KeyframeId, t_ns: int) -> InertialSteps | None:
-        """The steps from the keyframe before to a new one of this frame; None if the base cannot use them."""
-        return None if self._steps is None or self.tracker is None else self._steps.take(keyframe, t_ns, self.tracker)
+    def mark_keyframe(self, keyframe: KeyframeId, t_ns: int) -> None:
+        """A keyframe was made of the frame at t_ns."""
+        if self._steps is not None:
+            self._steps.mark(keyframe, t_ns)
+
+    def take_steps(self) -> list[InertialSteps]:
+        """Steps between keyframes for the base, whose samples have come."""
+        return [] if self._steps is None or self.tracker is None else self._steps.take(self.tracker)
 
     def up(self) -> tuple[F64, float] | None:
         """Unit vector (3,) against gravity in the camera, and its deviation about an axis, rad; None if unknown."""

@@ -4,6 +4,8 @@ Only short steps tell it: between keyframes, a second apart, an accelerometer's 
 and IMU would have to differ by.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from kiteline_agent.inertial.inertial_tracker import InertialTracker
@@ -15,37 +17,52 @@ from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry import se3
 from kiteline_core.ids import NO_KEYFRAME, KeyframeId
 
-_LONGEST_S = 2.0  # of a step
+_LONGEST_S = 2.0  # of a step, and for which the samples of one may be late
 _LARGEST = 30.0  # of a step's m, m/s: more is no flight, and has no code
 
 
+@dataclass(frozen=True, slots=True)
+class _Step:
+    """A step between two stamps. moved: (6,) [rotation, translation m] by images, in the body's axes at its begin."""
+
+    begin_ns: int
+    end_ns: int
+    moved: F64
+
+
 class StepRecorder:
-    """Call `see` with each frame placed by images, and `take` with each keyframe."""
+    """Call `see` with each frame placed by images, `mark` with each keyframe, and `take` after both.
+
+    Steps wait until their samples have come.
+    """
 
     def __init__(self, calibration: ImuCalibration, step_s: float) -> None:
         self._calibration = calibration
         self._step_ns = round(step_s * 1e9)
-        self._steps: list[F64] = []  # (13,) each: dt, turn, moved, velocity, position
         self._from: tuple[int, F64] | None = None  # stamp and T_m_b where the present step begins
         self._last: tuple[int, F64] | None = None  # newest frame
-        self._since: tuple[KeyframeId, int] = NO_KEYFRAME, 0  # keyframe before the steps, and its stamp
+        self._marked_ns: int | None = None  # stamp of the last keyframe; None after a break
+        self._waiting: list[_Step | KeyframeId | None] = []  # in order; None: the steps before are lost
+        self._since = NO_KEYFRAME  # the keyframe before the steps that were integrated
+        self._steps: list[F64] | None = None  # (13,) each: dt, turn, moved, velocity, position; None: some are lost
 
-    def see(self, t_ns: int, T_m_b: F64, tracker: InertialTracker) -> None:
+    def see(self, t_ns: int, T_m_b: F64) -> None:
         """Append a frame, T_m_b (4,4) by images alone."""
         self._last = t_ns, T_m_b
         if self._from is None:
             self._from = self._last
         elif t_ns - self._from[0] >= self._step_ns:
-            self._end_step(tracker)
+            self._end_step(self._from, self._last)
 
     def clear(self) -> None:
         """Begin anew after frames without images: the steps up to the next keyframe are lost."""
-        self._steps, self._from, self._last = [], None, None
-        self._since = NO_KEYFRAME, 0
+        self._from = self._last = self._marked_ns = None
+        if not self._waiting or self._waiting[-1] is not None:
+            self._waiting.append(None)
 
     def restart(self, t_ns: int, T_m_b: F64) -> None:
         """Continue at another pose in the map, or in a new one."""
-        if self._since[1] != t_ns:
+        if self._marked_ns != t_ns:
             self.clear()
         self._from = self._last = t_ns, T_m_b.copy()
 
@@ -54,34 +71,60 @@ class StepRecorder:
         self._from = None if self._from is None else (self._from[0], T_new_old @ self._from[1])
         self._last = None if self._last is None else (self._last[0], T_new_old @ self._last[1])
 
-    def take(self, keyframe: KeyframeId, t_ns: int, tracker: InertialTracker) -> InertialSteps | None:
-        """The steps from the keyframe before to this one; None if they are not complete."""
-        seen = self._last is not None and self._last[0] == t_ns
-        if seen and self._from is not None and self._from[0] < t_ns:
-            self._end_step(tracker)
-        steps, since = self._steps, self._since[0]
-        self._steps, self._since = [], (keyframe, t_ns)
-        self._from = self._last if seen else None
-        if not seen or since == NO_KEYFRAME or since >= keyframe or not 0 < len(steps) <= MAX_STEPS:
-            return None
-        columns = np.array(steps)
-        return InertialSteps(
-            keyframe, since, self._calibration.accel_noise, columns[:, 0], columns[:, 1:4], columns[:, 4:7],
-            columns[:, 7:10], columns[:, 10:],
-        )  # fmt: skip
+    def mark(self, keyframe: KeyframeId, t_ns: int) -> None:
+        """A keyframe was made of the frame at t_ns: the steps before it are complete."""
+        if self._last is None or self._last[0] != t_ns:
+            self.clear()
+        elif self._from is not None and self._from[0] < t_ns:
+            self._end_step(self._from, self._last)
+        self._from, self._marked_ns = self._last, t_ns
+        self._waiting.append(keyframe)
 
-    def _end_step(self, tracker: InertialTracker) -> None:
-        assert self._from is not None and self._last is not None
-        (begin_ns, T_m_b0), (end_ns, T_m_b1) = self._from, self._last
-        samples, state = tracker.samples_between(begin_ns, end_ns), tracker.state
-        if samples is not None and state is not None and len(self._steps) < MAX_STEPS:
-            motion = preintegrate(samples, np.concatenate([state.bias[:3], np.zeros(3)]), self._calibration)
-            moved = se3.inverse(T_m_b0) @ T_m_b1
-            step = np.concatenate([[motion.dt_s], se3.so3_log(moved[:3, :3]), moved[:3, 3], motion.vp])
-            if motion.dt_s < _LONGEST_S and bool((np.abs(step) < _LARGEST).all()):
-                self._steps.append(step)
-                self._from = self._last
-                return
-        last = self._last
-        self.clear()
-        self._from = self._last = last
+    def take(self, tracker: InertialTracker) -> list[InertialSteps]:
+        """The steps between keyframes whose samples have come; without those that are not complete."""
+        out: list[InertialSteps] = []
+        while self._waiting:
+            item = self._waiting[0]
+            if item is None:
+                self._steps = None
+            elif not isinstance(item, _Step):
+                out += self._complete(item)
+            elif tracker.has_samples(item.end_ns) or self._is_late(item):
+                self._integrate(item, tracker)
+            else:
+                break
+            del self._waiting[0]
+        return out
+
+    def _end_step(self, begin: tuple[int, F64], end: tuple[int, F64]) -> None:
+        moved = se3.inverse(begin[1]) @ end[1]
+        self._waiting.append(_Step(begin[0], end[0], np.append(se3.so3_log(moved[:3, :3]), moved[:3, 3])))
+        self._from = end
+
+    def _is_late(self, step: _Step) -> bool:
+        """True if a step's samples will not come any more."""
+        return self._last is not None and self._last[0] - step.end_ns > _LONGEST_S * 1e9
+
+    def _integrate(self, step: _Step, tracker: InertialTracker) -> None:
+        samples, state, steps = tracker.samples_between(step.begin_ns, step.end_ns), tracker.state, self._steps
+        self._steps = None
+        if samples is None or state is None or steps is None or len(steps) >= MAX_STEPS:
+            return
+        motion = preintegrate(samples, np.concatenate([state.bias[:3], np.zeros(3)]), self._calibration)
+        found = np.concatenate([[motion.dt_s], step.moved, motion.vp])
+        if motion.dt_s < _LONGEST_S and bool((np.abs(found) < _LARGEST).all()):
+            self._steps = [*steps, found]
+
+    def _complete(self, keyframe: KeyframeId) -> list[InertialSteps]:
+        """The steps up to a keyframe, if they are complete. The next ones begin there."""
+        steps, since = self._steps, self._since
+        self._steps, self._since = [], keyframe
+        if not steps or since >= keyframe:
+            return []
+        columns = np.array(steps)
+        return [
+            InertialSteps(
+                keyframe, since, self._calibration.accel_noise, columns[:, 0], columns[:, 1:4], columns[:, 4:7],
+                columns[:, 7:10], columns[:, 10:],
+            )
+        ]  # fmt: skip
