@@ -155,7 +155,11 @@ class DisparityAlignment:
 
         Not by the small ones of a good calibration: their effect on poses is less than what it is known to.
         """
-        return self.applied or self._rms_px(np.outer(change, change)) >= _LEAST_PX
+        return self.applied or self.voids_turns(change)
+
+    def voids_turns(self, change: F64) -> bool:
+        """True if rotations by images, as they were before a change (5,) px of the offset, tell nothing of an IMU."""
+        return self._rms_px(np.outer(change, change)) >= _LEAST_PX
 
     def take_base(self, offset: F64, sigma_px: float | None) -> bool:
         """Set the map's offset to the base's (5,), unless more is known here. Returns whether it was set.

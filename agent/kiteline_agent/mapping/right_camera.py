@@ -69,6 +69,8 @@ class RightCamera:
             # the odometry frame keeps the error that the map had until now
             covariance.set_disparity_error(disparities.expected_cov + np.outer(change, change), disparities.rig_worn)
             self._camera.correct_disparities(change)
+            if disparities.voids_turns(change):
+                self._camera.motion.forget_turns()
         covariance.set_disparity_error(disparities.expected_cov, disparities.rig_worn)
         self._found_px = self._map.disparity_offset
         self._sigma_px = disparities.sigma_px if disparities.applied else None

@@ -253,6 +253,11 @@ class MotionModel:
             self.tracker.scale_map(growth)
         self.odometer.move_map(T_new_old)
 
+    def forget_turns(self) -> None:
+        """Poses by images were those of a wrongly calibrated camera until now: they tell nothing of the IMU."""
+        if self.tracker is not None:
+            self.tracker.self_calibration.forget_turns()
+
     def begin_unscaled_map(self) -> None:
         """Begin a map of unknown scale."""
         self.odometer.set_metric(metric=False)

@@ -264,8 +264,9 @@ class Camera:
     """In place of CameraState: what the covariance was told, and what it held as the odometry left the map."""
 
     def __init__(self) -> None:
-        self.covariance = self
+        self.covariance = self.motion = self
         self.error = np.zeros((TERMS, TERMS))
+        self.forgotten = 0
         self.left: list[tuple[F64, F64]] = []
 
     def set_disparity_error(self, cov: F64, worn: float) -> None:
@@ -273,6 +274,9 @@ class Camera:
 
     def correct_disparities(self, change: F64) -> None:
         self.left.append((change, self.error))
+
+    def forget_turns(self) -> None:
+        self.forgotten += 1
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -285,7 +289,7 @@ def test_the_odometry_keeps_the_error_that_the_map_had(seed: int) -> None:
     for t_ns, T, rows, seen in flight.frames(80):
         track = SimpleNamespace(T_c_m=T, rows=rows, inlier=np.ones(len(rows), np.bool_), observed=seen)
         right.add(t_ns, cast("Any", track))
-    assert camera.left
+    assert camera.left and camera.forgotten == sum(off_px(change) >= 0.2 for change, _ in camera.left) > 0
     for change, error in camera.left:
         assert change @ np.linalg.solve(error, change) <= 1.0  # it was within a deviation of what was found
     assert np.trace(camera.error) < 0.3 * np.trace(camera.left[0][1])  # the map is better now

@@ -1,9 +1,12 @@
 """Bias, scale and axes of the accelerometer, the vertical and the scale of the images, from positions by images."""
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from kiteline_agent.inertial.calibration.disagreement import Disagreement
 from kiteline_agent.inertial.calibration.lever_search import LeverSearch
+from kiteline_agent.inertial.calibration.pose_chain import SampledMotion
 from kiteline_agent.inertial.calibration.robust_update import AxesFilter, robust_update
 from kiteline_agent.inertial.calibration.window import Window
 from kiteline_core.arrays import F64
@@ -12,6 +15,31 @@ from kiteline_core.geometry import se3
 _AXES, _BIAS, _TILT, _SCALE = slice(0, 9), slice(9, 12), slice(12, 15), 15
 _BIAS_M_S2, _TILT_RAD = 0.1, 0.03  # standard deviations at the start
 _TILT_WALK_RAD = 2e-4  # per sqrt(s): the map bends while it grows
+
+
+@dataclass(frozen=True, slots=True)
+class Move:
+    """A window of motion. density: of the accelerometer's noise. position_m: error of a position by images. unsteady:
+    factor on the variance of poses by images.
+    """
+
+    window: Window
+    link: SampledMotion
+    density: float
+    position_m: float
+    unsteady: float
+
+    def variance_with(self, after: "Move", tilt_m_s2: float) -> float:
+        """Variance in (m/s)^2 of the change of the mean velocity to the window after this one.
+
+        tilt_m_s2: acceleration by an error of the rotation by images.
+        """
+        unsteady, position_m = max(self.unsteady, after.unsteady), max(self.position_m, after.position_m)
+        t0, t1 = self.window.duration_s, after.window.duration_s
+        images = position_m**2 * (1 / t0**2 + (1 / t0 + 1 / t1) ** 2 + 1 / t1**2)
+        imu = (t0 * self.density**2 + t1 * after.density**2) / 3.0
+        tilt = tilt_m_s2**2 * 0.5 * (t0**2 + t1**2)
+        return images + imu + tilt + (unsteady - 1.0) * (images + tilt)
 
 
 class AccelCalibration(AxesFilter):

@@ -4,13 +4,13 @@ Filters beside the smoother, at a few updates a second: these values change slow
 the filters contradict that significantly; then their estimates correct the samples.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from kiteline_agent.inertial.calibration import mounting_search
-from kiteline_agent.inertial.calibration.accel_calibration import AccelCalibration
+from kiteline_agent.inertial.calibration.accel_calibration import AccelCalibration, Move
 from kiteline_agent.inertial.calibration.axes_report import axes_report, correction_event, measured_rotation, turned_rad
 from kiteline_agent.inertial.calibration.disagreement import Disagreement
 from kiteline_agent.inertial.calibration.gyro_calibration import GyroCalibration
@@ -40,7 +40,7 @@ _MOVE_WINDOW_S = 0.6  # s of two windows over which velocities are compared: vib
 _TURN_SIGMA_RAD = 4e-4  # rad; error of a rotation by images over a window
 _POSITION_SIGMA_M = 7e-4  # m; error of a position by images, as it changes over windows, at least
 _SCALE_SIGMA = 0.015  # relative; of lengths by the images
-_SIGNIFICANT_WINDOWS = 2  # of turns, in a row, before axes are applied: people who walk by turn one window
+_SIGNIFICANT_WINDOWS = 2  # of turns, in a row, before axes are applied or dropped: people who walk by turn one window
 _APPLY_S = 0.5  # s; time constant with which applied axes follow
 _OFFSET_SIGNIFICANCE = 3.0  # deviations from the configured offset below which it stays: most rigs have none
 _OFFSET_RATE = 0.05  # s/s; how fast the applied offset follows
@@ -48,19 +48,6 @@ _KEPT_OFFSET_SIGMA_S = 3e-4  # s; of the time offset between two flights: anothe
 _REFUTED = 5.0  # log likelihood of an unknown IMU over that of earlier flights, from which those are dropped
 _EXACTLY_S = 1e-6  # s; deviation of a time offset that is used as configured
 _OFFSET_TRUSTED_S = 3e-3  # s; deviation below which the offset is applied
-
-
-@dataclass(frozen=True, slots=True)
-class _Move:
-    """A window of motion. density: of the accelerometer's noise. position_m: error of a position by images. unsteady:
-    factor on the variance of poses by images.
-    """
-
-    window: Window
-    link: SampledMotion
-    density: float
-    position_m: float
-    unsteady: float
 
 
 class SelfCalibration:
@@ -86,13 +73,14 @@ class SelfCalibration:
         self._lever_m = np.zeros(3)  # origin of the body, as the calibration places it, in the IMU
         self.restarted = False  # True after an `update` that found a calibration: what was integrated before is void
         self.turned = False  # True after one that found a rotation: so is the vertical
-        self._before: _Move | None = None  # last window of moves
+        self._before: Move | None = None  # last window of moves
         self._added = 0.0  # rad^2, of the rotation by images in the last window of turns, beside turn_sigma_rad
         self._unsteady = 1.0  # factor on the variance of poses by images, since the last window of moves
         self._depth_m = 0.0  # that the images saw, largest since the last window of moves
         self.offset_s = config.offset_s  # applied: camera stamp + offset = IMU time
         self._gyro_matrix, self._accel_matrix = np.eye(3), np.eye(3)  # applied to samples
         self._gyro_windows = 0  # in a row after which the gyro's axes differed significantly
+        self._refuting_windows = 0  # in a row that refuted what earlier flights found
         self._corrects_offset = self._corrects_gyro = self._corrects_accel = False
         self.is_proved = False  # both sensors have agreed with the images, over turns
         self.camera_rotation_rad = 0.0  # against the gyro, rms as expected
@@ -115,22 +103,27 @@ class SelfCalibration:
         """Begin with what earlier flights found, as a prior; it is dropped if the flight refutes it: after repairs."""
         config, self._earlier = self._config, known
         if known.gyro and known.offset_s:
-            self._unprimed_gyro = self._unknown_gyro()
-            offset_s, offset_sigma_s = known.offset_s
-            self.gyro.begin_with(
-                np.reshape(known.gyro, (3, 3)), np.hypot(known.gyro_sigma, config.kept_axes_sigma),
-                offset_s, float(np.hypot(offset_sigma_s, _KEPT_OFFSET_SIGMA_S)),
-            )  # fmt: skip
-            self._given_axes, self._given_offset_s = self.gyro.matrix, offset_s
-            self._follow_offset(np.inf)
-            self._gyro_windows = _SIGNIFICANT_WINDOWS  # they were, in flight
-            self._test_gyro()
+            self._begin_gyro()
         if known.accel:
             sigma = np.hypot(known.accel_sigma, config.kept_axes_sigma)
             self.accel.begin_with(np.reshape(known.accel, (3, 3)), sigma)
             self._test_accel()
         self._gyro_matrix = self.gyro.matrix if self._corrects_gyro else np.eye(3)
         self._accel_matrix = self.accel.matrix if self._corrects_accel else np.eye(3)
+
+    def _begin_gyro(self) -> None:
+        """Begin the gyro's filter with what earlier flights found, and one without it beside."""
+        known, config = self._earlier, self._config
+        self.gyro, self._unprimed_gyro = self._unknown_gyro(), self._unknown_gyro()
+        offset_s, offset_sigma_s = known.offset_s
+        self.gyro.begin_with(
+            np.reshape(known.gyro, (3, 3)), np.hypot(known.gyro_sigma, config.kept_axes_sigma),
+            offset_s, float(np.hypot(offset_sigma_s, _KEPT_OFFSET_SIGMA_S)),
+        )  # fmt: skip
+        self._given_axes, self._given_offset_s = self.gyro.matrix, offset_s
+        self._follow_offset(np.inf)
+        self._gyro_windows = _SIGNIFICANT_WINDOWS  # they were, in flight
+        self._test_gyro()
 
     @property
     def applied_offset(self) -> TimeOffset:
@@ -213,6 +206,12 @@ class SelfCalibration:
             windows.clear()
         self._before = None
 
+    def forget_turns(self) -> None:
+        """Begin again with what earlier flights found: rotations by images were wrong until now."""
+        self.clear()
+        if self._unprimed_gyro is not None:
+            self._begin_gyro()
+
     def begin_map(self) -> None:
         """Begin new windows in a new map, whose vertical is unknown."""
         self.clear()
@@ -270,7 +269,11 @@ class SelfCalibration:
     def _drop_refuted_prior(self) -> None:
         """Drop what earlier flights found if rotations are likelier without it. Applied axes follow the new ones."""
         unprimed = self._unprimed_gyro
-        if unprimed is not None and unprimed.log_likelihood - self.gyro.log_likelihood > _REFUTED:
+        if unprimed is None:
+            return
+        refuted = unprimed.log_likelihood - self.gyro.log_likelihood > _REFUTED
+        self._refuting_windows = self._refuting_windows + 1 if refuted else 0
+        if self._refuting_windows >= _SIGNIFICANT_WINDOWS:
             self.gyro, self._unprimed_gyro, self._earlier = unprimed, None, KnownImuConfig()
             self._given_axes, self._given_offset_s = np.eye(3), self._config.offset_s
             accel, self.accel = self.accel, self._unknown_accel()
@@ -371,20 +374,13 @@ class SelfCalibration:
         return change
 
     def _add_move(self, link: SampledMotion) -> None:
-        config = self._config
-        position_m = max(_POSITION_SIGMA_M, config.position_rad * self._depth_m)
-        now = _Move(self._integrate(link, self.gyro), link, float(self._density(link)[1]), position_m, self._unsteady)
+        position_m = max(_POSITION_SIGMA_M, self._config.position_rad * self._depth_m)
+        now = Move(self._integrate(link, self.gyro), link, float(self._density(link)[1]), position_m, self._unsteady)
         before, self._before, self._unsteady, self._depth_m = self._before, now, 1.0, 0.0
-        if before is None:
-            return
-        unsteady, position_m = max(before.unsteady, now.unsteady), max(before.position_m, now.position_m)
-        t0, t1 = before.window.duration_s, now.window.duration_s
-        images = position_m**2 * (1 / t0**2 + (1 / t0 + 1 / t1) ** 2 + 1 / t1**2)
-        imu = (t0 * before.density**2 + t1 * now.density**2) / 3.0
-        tilt = (self._gravity_m_s2 * _TURN_SIGMA_RAD) ** 2 * 0.5 * (t0**2 + t1**2)
-        variance = images + imu + tilt + (unsteady - 1.0) * (images + tilt)
-        poses = before.link.T_m_b0, link.T_m_b0, link.T_m_b1
-        self.accel.add((before.window, now.window), poses, self._p_b_c, variance, self._lever)
+        if before is not None:
+            poses = before.link.T_m_b0, link.T_m_b0, link.T_m_b1
+            variance = before.variance_with(now, self._gravity_m_s2 * _TURN_SIGMA_RAD)
+            self.accel.add((before.window, now.window), poses, self._p_b_c, variance, self._lever)
 
     def _integrate(self, link: SampledMotion, gyro: GyroCalibration) -> Window:
         matrix, bias = gyro.matrix, gyro.bias

@@ -71,10 +71,11 @@ def flight(
 def calibrated(
     f: Flight, config: SelfCalibrationConfig | None = None, turn_map_at: int | None = None,
     known: KnownImuConfig | None = None, *, metric: bool = True, p_b_c: F64 = P_B_C, depth_m: float = 3.0,
+    corrected_at: int | None = None,
 ) -> SelfCalibration:  # fmt: skip
     """A calibration after a flight, in a map that is turned at a frame. known: from earlier flights. p_b_c: told.
 
-    depth_m: of what the images see.
+    depth_m: of what the images see. corrected_at: frame at which the camera turns out to have been wrong until then.
     """
     calibration = SelfCalibration(CALIBRATION, config or SelfCalibrationConfig(), p_b_c, 9.81, metric=metric)
     if known is not None:
@@ -87,6 +88,8 @@ def calibrated(
         if k == turn_map_at:
             moved = se3.from_rt(se3.so3_exp(np.array([0.2, -0.3, 1.0])), np.array([3.0, 1.0, -2.0]))
             calibration.move_map(moved)
+        if k == corrected_at:
+            calibration.forget_turns()
         calibration.add(int(t_ns), moved @ T, depth_m)
         calibration.update(buffer, moved[:3, :3] @ np.array([0.0, 0.0, -9.81]), 0.05)
     return calibration
@@ -290,6 +293,19 @@ def test_an_imu_that_was_replaced_is_found_anew() -> None:
     # the same IMU is not refuted
     again = calibrated(flight(25.0, 1, GYRO, ACCEL, 4_000_000), known=known)
     assert not any("calibrated anew" in event for event in again.take_events())
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_turns_by_a_camera_that_was_wrong_do_not_refute_the_imu(seed: int) -> None:
+    known = calibrated(flight(25.0, 0, GYRO, ACCEL, 4_000_000)).known()
+    again, wrong = flight(12.0, seed, GYRO, ACCEL, 4_000_000), 16
+    first = again.seen[0, :3, :3].copy()
+    for T in again.seen[:wrong]:
+        T[:3, :3] = first @ se3.so3_exp(1.03 * se3.so3_log(first.T @ T[:3, :3]))
+    left_in = calibrated(again, known=known)
+    assert any("calibrated anew" in event or "turned by" in event for event in left_in.take_events())
+    forgotten = calibrated(again, known=known, corrected_at=wrong)
+    assert not any("anew" in event or "turned by" in event for event in forgotten.take_events())
 
 
 def test_a_true_imu_is_left_alone_in_later_flights() -> None:
