@@ -185,7 +185,7 @@ class SmoothingConfig:
     )
 
     max_m_s: float = 0.03  # m/s at which the odometry frame moves in w: 3 mm a frame at 10 Hz; 0: at once
-    onboard_m: float = 0.0028  # m a frame by which live poses follow what the agent itself finds of its map
+    onboard_m: float = 0.0026  # m a frame by which live poses follow what the agent itself finds of its map
     time_s: float = 10.0  # s for all but an e-th of a correction that is larger, or whose lengths accelerations told
     max_rad_s: float = 0.0  # rad/s at which it rotates about the vehicle; 0: at once, which moves nothing
     snap_m: float = 1.0  # m: a correction that moves the vehicle farther at once is a map merge, and not smoothed
