@@ -21,7 +21,7 @@ class _Interval:
 
 
 class ScaleWatch:
-    """Call `see` with each frame placed by images. filter: of the map's scale, after the last interval."""
+    """Call `see` with each frame placed by images. filter: as it is at the end of the last compared interval."""
 
     def __init__(
         self, scale: ScaleFilter, p_b_c: F64, has_come: Callable[[int], bool],
@@ -29,8 +29,8 @@ class ScaleWatch:
     ) -> None:  # fmt: skip
         """p_b_c: (3,) m, camera in the body.
 
-        has_come: whether the samples up to a frame's time have come. samples_between: those between two of these times;
-        None with a gap.
+        has_come: whether the samples up to a frame's time have come, but for one or two. samples_between: those between
+        two of these times; None with a gap.
         """
         self.filter = scale
         self._p_b_c = p_b_c
@@ -44,8 +44,9 @@ class ScaleWatch:
             self.filter.stop()
             return
         if self._waiting is not None and self._has_come(self._waiting.end_ns):
-            self._compare(self._waiting, state)
-            self._waiting = None
+            waiting, self._waiting = self._waiting, None
+            if not self._compare(waiting, state):
+                self.forget()  # the velocity at its end is not known any more
         if self._from is None:
             self.filter.resume(state.velocity)
             self._from = (t_ns, T_m_b)
@@ -54,18 +55,19 @@ class ScaleWatch:
             if self._waiting is not None:  # samples this late are none
                 self.forget()
                 self.filter.resume(state.velocity)
-            elif self._has_come(t_ns):
-                self._compare(interval, state)
-            else:
+            elif not self._has_come(t_ns):
                 self._waiting = interval
+            elif not self._compare(interval, state):
+                self.filter.resume(state.velocity)
             self._from = (t_ns, T_m_b)
 
-    def _compare(self, interval: _Interval, state: InertialState) -> None:
+    def _compare(self, interval: _Interval, state: InertialState) -> bool:
+        """Give the filter an interval; False if that tells nothing."""
         samples = self._samples_between(interval.begin_ns, interval.end_ns)
         if samples is None or interval.depth_m <= 0.0:
-            self.filter.resume(state.velocity)
-        else:
-            self.filter.add(interval.T_m_b0, interval.T_m_b1, samples, state.bias[:3], interval.depth_m)
+            return False
+        self.filter.add(interval.T_m_b0, interval.T_m_b1, samples, state.bias[:3], interval.depth_m)
+        return True
 
     def forget(self) -> None:
         """Begin a new interval at the next frame."""
@@ -73,17 +75,18 @@ class ScaleWatch:
 
     def move_map(self, T_new_old: F64) -> None:
         """The map moved: p_new = T_new_old p_old."""
-        self._transform(lambda T_m_b: T_new_old @ T_m_b)
+        self._transform(lambda T_m_b: T_new_old @ T_m_b, 1.0)
         self.filter.rotate_map(T_new_old[:3, :3])
 
     def scale_map(self, factor: float, centre: F64) -> None:
         """Lengths in the map were multiplied by `factor` about centre (3,)."""
-        self._transform(lambda T_m_b: camera_scaled(T_m_b, factor, self._p_b_c, centre))
+        self._transform(lambda T_m_b: camera_scaled(T_m_b, factor, self._p_b_c, centre), factor)
         self.filter.scale_map(factor)
 
-    def _transform(self, change: Callable[[F64], F64]) -> None:
+    def _transform(self, change: Callable[[F64], F64], factor: float) -> None:
         if self._from is not None:
             self._from = self._from[0], change(self._from[1])
         w = self._waiting
         if w is not None:
-            self._waiting = _Interval(w.begin_ns, change(w.T_m_b0), w.end_ns, change(w.T_m_b1), w.depth_m)
+            begin, end = change(w.T_m_b0), change(w.T_m_b1)
+            self._waiting = _Interval(w.begin_ns, begin, w.end_ns, end, factor * w.depth_m)

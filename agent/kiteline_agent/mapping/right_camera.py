@@ -96,10 +96,13 @@ class RightCamera:
 
     def take_base(self, record: DisparityCalibration) -> list[str]:
         """Take over the base's disparity offset, unless more is known here. Returns events."""
+        before = self._map.disparity_offset
         if self.disparities is None:
             self._map.set_disparity_offset(record.disparity_px)
         elif not self.disparities.take_base(record.disparity_px, record.sigma_px):
             return []
+        elif self.disparities.voids_turns(record.disparity_px - before):
+            self._camera.motion.forget_turns()
         return [f"disparities in the middle are {record.disparity_px[0]:+.3f} px too large"]
 
     def _put(self, rows_px: F64) -> None:

@@ -17,7 +17,8 @@ from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry import se3
 from kiteline_core.ids import NO_KEYFRAME, KeyframeId
 
-_LONGEST_S = 2.0  # of a step, and for which the samples of one may be late
+_LONGEST_S = 2.0  # of a step
+_LATEST_S = 2.0  # after a step, until which its samples may come
 _LARGEST = 30.0  # of a step's m, m/s: more is no flight, and has no code
 
 
@@ -28,6 +29,17 @@ class _Step:
     begin_ns: int
     end_ns: int
     moved: F64
+
+
+@dataclass(frozen=True, slots=True)
+class _Mark:
+    """A keyframe at the end of a step."""
+
+    keyframe: KeyframeId
+
+
+class _Break:
+    """The steps up to the next keyframe are lost."""
 
 
 class StepRecorder:
@@ -42,13 +54,14 @@ class StepRecorder:
         self._from: tuple[int, F64] | None = None  # stamp and T_m_b where the present step begins
         self._last: tuple[int, F64] | None = None  # newest frame
         self._marked_ns: int | None = None  # stamp of the last keyframe; None after a break
-        self._waiting: list[_Step | KeyframeId | None] = []  # in order; None: the steps before are lost
+        self._waiting: list[_Step | _Mark | _Break] = []  # in order
+        self._newest_ns = 0  # newest stamp of a frame or keyframe
         self._since = NO_KEYFRAME  # the keyframe before the steps that were integrated
         self._steps: list[F64] | None = None  # (13,) each: dt, turn, moved, velocity, position; None: some are lost
 
     def see(self, t_ns: int, T_m_b: F64) -> None:
         """Append a frame, T_m_b (4,4) by images alone."""
-        self._last = t_ns, T_m_b
+        self._last, self._newest_ns = (t_ns, T_m_b), t_ns
         if self._from is None:
             self._from = self._last
         elif t_ns - self._from[0] >= self._step_ns:
@@ -57,8 +70,8 @@ class StepRecorder:
     def clear(self) -> None:
         """Begin anew after frames without images: the steps up to the next keyframe are lost."""
         self._from = self._last = self._marked_ns = None
-        if not self._waiting or self._waiting[-1] is not None:
-            self._waiting.append(None)
+        if not self._waiting or not isinstance(self._waiting[-1], _Break):
+            self._waiting.append(_Break())
 
     def restart(self, t_ns: int, T_m_b: F64) -> None:
         """Continue at another pose in the map, or in a new one."""
@@ -73,26 +86,30 @@ class StepRecorder:
 
     def mark(self, keyframe: KeyframeId, t_ns: int) -> None:
         """A keyframe was made of the frame at t_ns: the steps before it are complete."""
+        self._newest_ns = t_ns
         if self._last is None or self._last[0] != t_ns:
-            self.clear()
-        elif self._from is not None and self._from[0] < t_ns:
+            self.clear()  # not placed by images: neither the steps before it nor those after it are complete
+            self._waiting += [_Mark(keyframe), _Break()]
+            return
+        if self._from is not None and self._from[0] < t_ns:
             self._end_step(self._from, self._last)
         self._from, self._marked_ns = self._last, t_ns
-        self._waiting.append(keyframe)
+        self._waiting.append(_Mark(keyframe))
 
     def take(self, tracker: InertialTracker) -> list[InertialSteps]:
         """The steps between keyframes whose samples have come; without those that are not complete."""
         out: list[InertialSteps] = []
         while self._waiting:
             item = self._waiting[0]
-            if item is None:
-                self._steps = None
-            elif not isinstance(item, _Step):
-                out += self._complete(item)
-            elif tracker.has_samples(item.end_ns) or self._is_late(item):
+            if isinstance(item, _Step):
+                late = self._newest_ns - item.end_ns > _LATEST_S * 1e9
+                if not (late or tracker.has_samples(item.end_ns)):
+                    break
                 self._integrate(item, tracker)
+            elif isinstance(item, _Mark):
+                out += self._complete(item.keyframe)
             else:
-                break
+                self._steps = None
             del self._waiting[0]
         return out
 
@@ -100,10 +117,6 @@ class StepRecorder:
         moved = se3.inverse(begin[1]) @ end[1]
         self._waiting.append(_Step(begin[0], end[0], np.append(se3.so3_log(moved[:3, :3]), moved[:3, 3])))
         self._from = end
-
-    def _is_late(self, step: _Step) -> bool:
-        """True if a step's samples will not come any more."""
-        return self._last is not None and self._last[0] - step.end_ns > _LONGEST_S * 1e9
 
     def _integrate(self, step: _Step, tracker: InertialTracker) -> None:
         samples, state, steps = tracker.samples_between(step.begin_ns, step.end_ns), tracker.state, self._steps

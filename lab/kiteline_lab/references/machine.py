@@ -1,6 +1,7 @@
 """What numbers depend on beside the code: library versions, and the CPU kernels that libraries choose."""
 
 import ctypes
+import hashlib
 import importlib
 import platform
 from functools import cache
@@ -19,7 +20,7 @@ def machine() -> str:
     """Processor type, versions, the kernels of OpenBLAS, numpy and OpenCV, and numba's CPU, as one line."""
     versions = [f"{name} {_version(name)}" for name in _LIBRARIES]
     kernels = f"OpenBLAS for {_blas_core()}", f"numpy for {_numpy_features()}", f"OpenCV for {_opencv_features()}"
-    return "; ".join((platform.machine(), *versions, *kernels, f"numba for {binding.get_host_cpu_name()}"))
+    return "; ".join((platform.machine(), *versions, *kernels, f"numba for {_numba_cpu()}"))
 
 
 def _version(name: str) -> str:
@@ -53,3 +54,9 @@ def _opencv_features() -> str:
     """The highest CPU feature that OpenCV dispatches to; those that the CPU lacks end in "?"."""
     found = [word.strip("*") for word in cv2.getCPUFeaturesLine().split() if not word.endswith("?")]
     return found[-1] if found else "baseline"
+
+
+def _numba_cpu() -> str:
+    """The CPU that numba compiles for, and a digest of its features: one name stands for several CPUs."""
+    features = str(binding.get_host_cpu_features().flatten())
+    return f"{binding.get_host_cpu_name()} {hashlib.sha256(features.encode()).hexdigest()[:6]}"

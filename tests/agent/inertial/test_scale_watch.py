@@ -27,8 +27,9 @@ class Filter:
         self.calls: list[str] = []
 
     def add(self, T_m_b0: F64, T_m_b1: F64, samples: Samples, gyro_bias: F64, depth_m: float) -> None:
-        assert samples is SAMPLES and depth_m == 3.0
+        assert samples is SAMPLES
         self.added.append((T_m_b0, T_m_b1))
+        self.depth_m = depth_m
 
     def resume(self, velocity: F64) -> None:
         assert velocity is STATE.velocity
@@ -96,6 +97,7 @@ def test_a_waiting_interval_moves_with_the_map() -> None:
     flight.watch.scale_map(2.0, np.zeros(3))
     flight.fly(1)
     assert positions(flight) == [(200.0, 216.0)] and flight.filter.calls == ["rotate", "scale"]
+    assert flight.filter.depth_m == 6.0
 
 
 def test_samples_that_are_an_interval_late_are_none() -> None:
@@ -109,6 +111,16 @@ def test_over_a_gap_the_filter_goes_on_at_the_velocity() -> None:
     flight.gap = True
     flight.fly(2 * PER_INTERVAL + 1)
     assert positions(flight) == [] and flight.filter.resumed == 3
+
+
+def test_after_a_late_gap_it_begins_at_the_present_frame() -> None:
+    flight = Flight(2 * FRAME_NS)
+    flight.gap = True
+    flight.fly(PER_INTERVAL + 3)  # the gap is known of at frame 10
+    assert flight.filter.resumed == 2
+    flight.gap = False
+    flight.fly(PER_INTERVAL + 2)
+    assert positions(flight) == [(10.0, 18.0)]
 
 
 def test_after_a_loss_it_begins_anew_and_without_a_state_it_stops() -> None:

@@ -165,6 +165,23 @@ def test_steps_wait_until_their_samples_have_come(tracker: Any) -> None:
             assert np.array_equal(found[0].velocity, at_once.velocity)
 
 
+def test_no_steps_begin_at_a_keyframe_that_images_did_not_place(tracker: Any) -> None:
+    steps = recorder(tracker, 6)
+    assert take(steps, K1, 8, tracker) is None
+    for n in (10, 12, 14):
+        steps.see(n * FRAME_NS, pose(n))
+    assert take(steps, K2, 14, tracker) is None
+
+
+def test_nothing_piles_up_while_the_imu_is_dead(tracker: Any) -> None:
+    steps = recorder(tracker, 1)
+    tracker.come_ns, tracker.silent = 0, True
+    steps.see(5 * FRAME_NS, pose(5))
+    for n in range(6, 300):
+        steps.mark(keyframe_id(SUBMAP, n), n * FRAME_NS)
+        assert steps.take(tracker) == [] and len(steps._waiting) < 100
+
+
 def test_steps_do_not_wait_for_ever(tracker: Any) -> None:
     steps = recorder(tracker, 1)
     tracker.come_ns, tracker.silent = 0, True

@@ -12,6 +12,7 @@ import numpy as np
 from kiteline_agent.inertial.preintegration import Samples
 from kiteline_agent.inertial.samples.sample_buffer import SampleBuffer
 from kiteline_core.arrays import F64
+from kiteline_core.frame import ImuCalibration
 
 _RATE_NS = 12_000_000  # to either side of an instant, averaged for the rate there
 _LONGEST = 4.0  # times the window: longer ones have a gap
@@ -30,6 +31,12 @@ class SampledMotion:
     T_m_b1: F64
     rates: F64
     frames: tuple[tuple[int, F64], ...]
+
+    def density(self, calibration: ImuCalibration) -> F64:
+        """(2,) noise density of gyro and accelerometer: the calibrated one, or what was measured if that is larger."""
+        calibrated = np.array([calibration.gyro_noise, calibration.accel_noise])
+        measured = self.samples.density
+        return calibrated if measured is None else np.maximum(calibrated, np.sqrt(np.mean(measured**2, axis=0)))
 
 
 class PoseChain:

@@ -64,7 +64,7 @@ class SelfCalibration:
         self._gravity_m_s2 = gravity_m_s2
         self.gyro, self.accel = self._unknown_gyro(), self._unknown_accel()
         self._unprimed_gyro: GyroCalibration | None = None  # a second estimate, without what earlier flights found
-        self._earlier = KnownImuConfig()  # what earlier flights found
+        self._earlier = self._told = KnownImuConfig()  # what earlier flights found; before this one refuted it
         self._turns = PoseChain(_TURN_WINDOW_S)
         self._moves = PoseChain(_MOVE_WINDOW_S)
         self._mounting, self._lever = MountingSearch(), LeverSearch()
@@ -81,6 +81,7 @@ class SelfCalibration:
         self._gyro_matrix, self._accel_matrix = np.eye(3), np.eye(3)  # applied to samples
         self._gyro_windows = 0  # in a row after which the gyro's axes differed significantly
         self._refuting_windows = 0  # in a row that refuted what earlier flights found
+        self._has_found_mounting = False
         self._corrects_offset = self._corrects_gyro = self._corrects_accel = False
         self.is_proved = False  # both sensors have agreed with the images, over turns
         self.camera_rotation_rad = 0.0  # against the gyro, rms as expected
@@ -101,29 +102,31 @@ class SelfCalibration:
 
     def begin_with(self, known: KnownImuConfig) -> None:
         """Begin with what earlier flights found, as a prior; it is dropped if the flight refutes it: after repairs."""
-        config, self._earlier = self._config, known
+        self._earlier = self._told = known
         if known.gyro and known.offset_s:
             self._begin_gyro()
-        if known.accel:
-            sigma = np.hypot(known.accel_sigma, config.kept_axes_sigma)
-            self.accel.begin_with(np.reshape(known.accel, (3, 3)), sigma)
-            self._test_accel()
+            self._follow_offset(np.inf)
+        self._begin_accel()
         self._gyro_matrix = self.gyro.matrix if self._corrects_gyro else np.eye(3)
         self._accel_matrix = self.accel.matrix if self._corrects_accel else np.eye(3)
 
     def _begin_gyro(self) -> None:
         """Begin the gyro's filter with what earlier flights found, and one without it beside."""
-        known, config = self._earlier, self._config
+        known, (offset_s, offset_sigma_s) = self._earlier, self._earlier.offset_s
         self.gyro, self._unprimed_gyro = self._unknown_gyro(), self._unknown_gyro()
-        offset_s, offset_sigma_s = known.offset_s
-        self.gyro.begin_with(
-            np.reshape(known.gyro, (3, 3)), np.hypot(known.gyro_sigma, config.kept_axes_sigma),
-            offset_s, float(np.hypot(offset_sigma_s, _KEPT_OFFSET_SIGMA_S)),
-        )  # fmt: skip
+        sigma = np.hypot(known.gyro_sigma, self._config.kept_axes_sigma)
+        offset_sigma_s = float(np.hypot(offset_sigma_s, _KEPT_OFFSET_SIGMA_S))
+        self.gyro.begin_with(np.reshape(known.gyro, (3, 3)), sigma, offset_s, offset_sigma_s)
         self._given_axes, self._given_offset_s = self.gyro.matrix, offset_s
-        self._follow_offset(np.inf)
-        self._gyro_windows = _SIGNIFICANT_WINDOWS  # they were, in flight
+        self._gyro_windows, self._refuting_windows = _SIGNIFICANT_WINDOWS, 0  # they were significant, in flight
         self._test_gyro()
+
+    def _begin_accel(self) -> None:
+        known = self._earlier
+        if known.accel:
+            sigma = np.hypot(known.accel_sigma, self._config.kept_axes_sigma)
+            self.accel.begin_with(np.reshape(known.accel, (3, 3)), sigma)
+            self._test_accel()
 
     @property
     def applied_offset(self) -> TimeOffset:
@@ -207,10 +210,17 @@ class SelfCalibration:
         self._before = None
 
     def forget_turns(self) -> None:
-        """Begin again with what earlier flights found: rotations by images were wrong until now."""
+        """Rotations by images were wrong until now: begin again with what was known before the flight."""
         self.clear()
-        if self._unprimed_gyro is not None:
-            self._begin_gyro()
+        if self._has_found_mounting:
+            return  # vertical and velocity rest on it
+        if not (self._told.gyro and self._told.offset_s):
+            self.gyro = self._unknown_gyro()
+            return
+        if self._earlier is not self._told:  # they had refuted it
+            self._earlier = self._told
+            self._begin_accel()
+        self._begin_gyro()
 
     def begin_map(self) -> None:
         """Begin new windows in a new map, whose vertical is unknown."""
@@ -235,7 +245,7 @@ class SelfCalibration:
         self.restarted = self.turned = False
         turn = self._turns.take(buffer, self.gyro.offset_s)
         if isinstance(turn, SampledMotion):
-            offset_s, density = self.gyro.offset_s, float(self._density(turn)[0])
+            offset_s, density = self.gyro.offset_s, float(turn.density(self._calibration)[0])
             added = added_variance(
                 turn, buffer, self.gyro.matrix, self.gyro.bias, _TURN_SIGMA_RAD, density
             )  # fmt: skip
@@ -316,6 +326,7 @@ class SelfCalibration:
 
     def _begin_with_mounting(self, found: Mounting) -> None:
         """Begin the gyro's filter anew; after more than a small change of the time offset all that is inertial, too."""
+        self._has_found_mounting = True
         change_rad = float(np.linalg.norm(se3.so3_log(found.rotation @ self._accel_matrix.T)))
         self.turned = change_rad > mounting_search.LEAST_ROTATION_RAD
         jumps = abs(found.offset_s - self.offset_s) > mounting_search.RESTART_S
@@ -375,7 +386,8 @@ class SelfCalibration:
 
     def _add_move(self, link: SampledMotion) -> None:
         position_m = max(_POSITION_SIGMA_M, self._config.position_rad * self._depth_m)
-        now = Move(self._integrate(link, self.gyro), link, float(self._density(link)[1]), position_m, self._unsteady)
+        density = float(link.density(self._calibration)[1])
+        now = Move(self._integrate(link, self.gyro), link, density, position_m, self._unsteady)
         before, self._before, self._unsteady, self._depth_m = self._before, now, 1.0, 0.0
         if before is not None:
             poses = before.link.T_m_b0, link.T_m_b0, link.T_m_b1
@@ -386,9 +398,3 @@ class SelfCalibration:
         matrix, bias = gyro.matrix, gyro.bias
         rates = link.rates @ matrix.T - bias
         return Window.of(link.samples, matrix, bias, rates[0], rates[1])
-
-    def _density(self, link: SampledMotion) -> F64:
-        """(2,) noise density of gyro and accelerometer in a window."""
-        calibrated = np.array([self._calibration.gyro_noise, self._calibration.accel_noise])
-        measured = link.samples.density
-        return calibrated if measured is None else np.maximum(calibrated, np.sqrt(np.mean(measured**2, axis=0)))

@@ -51,34 +51,42 @@ class SampleClock:
         """The samples with the times at which they were taken; without those that cannot be later than the last."""
         if imu is None or len(imu.t_ns) == 0:
             return imu
-        imu = self._without_copies(imu)
+        imu = self._in_order(imu)
         if len(imu.t_ns) == 0:
             return None
         times_ns = self._taken_ns(imu.t_ns)
-        newest_ns = self._newest_ns
-        before_ns = np.concatenate([[times_ns[0] - 1 if newest_ns is None else newest_ns], times_ns[:-1]])
-        before_ns = np.maximum.accumulate(before_ns)
-        later, self._newest_ns = times_ns > before_ns, max(int(before_ns[-1]), int(times_ns[-1]))
+        newest_ns = int(times_ns[0]) - 1 if self._newest_ns is None else self._newest_ns
+        later = times_ns > np.maximum.accumulate(np.append(newest_ns, times_ns[:-1]))
+        last_ns = int(times_ns[-1])
+        set_back = int(times_ns.max()) - last_ns > 1e9 * _SILENT_S
+        self._newest_ns = last_ns if set_back else max(newest_ns, last_ns)
         if later.all():
             return imu if times_ns is imu.t_ns else ImuBatch(times_ns, imu.gyro, imu.accel)
         return ImuBatch(times_ns[later], imu.gyro[later], imu.accel[later]) if later.any() else None
 
-    def _without_copies(self, imu: ImuBatch) -> ImuBatch:
-        """The samples without those that are the same as the one before, stamp included: some links send twice."""
-        before = imu if self._last is None else joined([self._last, imu])
-        self._last = ImuBatch(imu.t_ns[-1:], imu.gyro[-1:], imu.accel[-1:])
-        assert before is not None
-        same = before.t_ns[1:] == before.t_ns[:-1]
-        if not same.any():
-            return imu
-        same &= (before.gyro[1:] == before.gyro[:-1]).all(axis=1) & (before.accel[1:] == before.accel[:-1]).all(axis=1)
-        first = np.concatenate([[True], ~same])[-len(imu.t_ns) :]
-        return ImuBatch(imu.t_ns[first], imu.gyro[first], imu.accel[first])
+    def _in_order(self, imu: ImuBatch) -> ImuBatch:
+        """The samples without those that a link sends twice or late, and those stamped far ahead of the next one."""
+        silent_ns = round(1e9 * _SILENT_S)
+        whole = imu if self._last is None else joined([self._last, imu])
+        assert whole is not None
+        step_ns = np.diff(whole.t_ns)
+        if not (step_ns > 0).all():
+            keep = np.append(step_ns > -silent_ns, True)
+            newest_ns = np.maximum.accumulate(np.where(keep, whole.t_ns, whole.t_ns.min()))[:-1]
+            late = (whole.t_ns[1:] < newest_ns) | ((whole.t_ns[1:] == newest_ns) & (step_ns != 0))
+            keep[1:] &= ~(late & (newest_ns - whole.t_ns[1:] < silent_ns))
+            copy = (step_ns == 0) & (whole.gyro[1:] == whole.gyro[:-1]).all(axis=1)
+            keep[1:] &= ~(copy & (whole.accel[1:] == whole.accel[:-1]).all(axis=1))
+            new = keep[len(keep) - len(imu.t_ns) :]
+            imu = ImuBatch(imu.t_ns[new], imu.gyro[new], imu.accel[new])
+        if len(imu.t_ns):
+            self._last = ImuBatch(imu.t_ns[-1:], imu.gyro[-1:], imu.accel[-1:])
+        return imu
 
     def _taken_ns(self, stamps_ns: I64) -> I64:
         """Times (n,) of new samples; the stamps (n,) themselves where they are even or tell no rate."""
         old = self._stamps_ns
-        if len(old) and not 0 < int(stamps_ns[0]) - int(old[-1]) < 1e9 * _SILENT_S:
+        if len(old) and not 0 <= int(stamps_ns[0]) - int(old[-1]) < 1e9 * _SILENT_S:
             self._begin_again()
         new = self._number(stamps_ns)
         self._unjudged += len(stamps_ns)

@@ -106,3 +106,29 @@ def test_samples_sent_twice_or_out_of_order_are_left_out() -> None:
     values = np.arange(30.0).reshape(10, 3)
     batch = SampleClock().timed(ImuBatch(swapped, values, values))
     assert batch is not None and batch.t_ns.tolist() == sorted({*swapped.tolist()} - {int(swapped[5])})
+
+
+def test_batches_sent_twice_are_left_out() -> None:
+    clock, stamps, times = SampleClock(), true_ns(600), []
+    for batch in batches(stamps):
+        for _ in range(2):
+            out = clock.timed(batch)
+            times += [] if out is None else out.t_ns.tolist()
+    assert times == stamps.tolist()
+
+
+@pytest.mark.parametrize("ahead_ns", [1_000_000_000_000, 2_000_000_000])
+@pytest.mark.parametrize("at", [500, 504, 509])
+def test_one_stamp_far_ahead_stops_nothing(ahead_ns: int, at: int) -> None:
+    stamps = true_ns(2000)
+    true = stamps.copy()
+    stamps[at] += ahead_ns
+    _, times = timed(SampleClock(), stamps)
+    assert len(set(times.tolist()) & set(true.tolist())) > 1980
+
+
+def test_a_clock_that_is_set_back_goes_on() -> None:
+    stamps = true_ns(2000)
+    stamps[1004:] -= 3_000_000_000
+    _, times = timed(SampleClock(), stamps)
+    assert len(times) > 1980
