@@ -320,11 +320,11 @@ class InertialTracker:
         return self._between_frames(from_ns, to_ns) if self._has_come(to_ns) else None
 
     def has_samples(self, t_ns: int) -> bool:
-        """True if the samples up to a camera stamp have come."""
+        """True if the samples up to a camera stamp have come, but for one or two."""
         return self._has_come(self.clock.taken_ns(t_ns))
 
     def _has_come(self, t_ns: int) -> bool:
-        """True if the samples up to a frame's time have come."""
+        """True if the samples up to a frame's time have come, but for one or two."""
         return not self._buffer.lacks_some(t_ns + self._offset_ns)
 
     def _between_frames(self, from_ns: int, to_ns: int) -> Samples | None:

@@ -39,7 +39,10 @@ class KeyframeStage:
         self._depth_t_ns = 0  # of the last frame whose images measure depth
 
     def add_if_needed(self, ctx: FrameContext, track: Track) -> list[str]:
-        """Make a keyframe if the policy needs one and CPU time allows it; share it if the link does. Returns events."""
+        """Make a keyframe if the policy needs one and CPU time allows it; share it if the link does. Returns events.
+
+        Inertial steps between earlier keyframes are shared first, if their samples have come.
+        """
         if not self._maker.lacks_depth(ctx):
             self._depth_t_ns = ctx.t_ns
         self._share_steps()

@@ -132,7 +132,10 @@ def samples_in_bursts(recording: Recording, every_s: float) -> Recording:
 
 
 def wrong_samples(recording: Recording, share: float, seed: int) -> Recording:
-    """Spoil inertial samples by chance: one axis reads anything, all read zero, or a tenth of a second is repeated."""
+    """Spoil inertial samples, beginning at a share of them: an axis reads anything, all read zero, or one is repeated.
+
+    One in ten is repeated, twenty times, so that about three times the share is wrong.
+    """
     samples = _joined_imu(recording.items)
     if samples is None:
         return recording

@@ -200,7 +200,7 @@ def test_an_offset_that_a_good_calibration_may_have_is_reduced(seed: int, way: F
 @pytest.mark.parametrize("seed", [1, 2, 3])
 @pytest.mark.parametrize("way", [AHEAD, SIDEWAYS])
 def test_a_small_offset_is_found_by_several_keyframes(seed: int, way: F64) -> None:
-    """Forward motion leads to what is far away, where hundredths of a pixel are percents of the depth."""
+    """Where landmarks are far away, as ahead, hundredths of a pixel are percents of the depth."""
     off = np.array([0.05, 0.0, 0.0, 0.0, 0.0])
     flight = Flight(off, seed, way)
     flight.fly(40)
@@ -208,7 +208,7 @@ def test_a_small_offset_is_found_by_several_keyframes(seed: int, way: F64) -> No
         flight.alignment._begin(0)
         flight.alignment._keyframe[0] = -1 - n
         flight.fly(40)
-    assert flight.alignment.is_good_offset and off_px(flight.map.disparity_offset - off) < 0.8 * off_px(off)
+    assert flight.alignment.is_good_offset and off_px(flight.map.disparity_offset - off) < 0.6 * off_px(off)
 
 
 def test_a_good_calibration_s_offset_begins_at_what_the_base_tells() -> None:
