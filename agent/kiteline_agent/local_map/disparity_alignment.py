@@ -69,11 +69,12 @@ class DisparityAlignment:
         self._share = np.ones(slots)
         self._evicted_sure_h, self._evicted_sure_b = np.zeros((TERMS, TERMS)), np.zeros(TERMS)
         self._refuted = False  # earlier flights were of another rig; the map still has their offset
-        self._good = np.eye(TERMS) / GOOD_PX**2
         self._prior = np.diag(np.array([_PRIOR_PX, *[_PRIOR_SLOPE_RAD * camera.fx] * (TERMS - 1)]) ** -2.0)
         self._bent = self._prior / _BENT**2
         x, y = np.meshgrid(np.linspace(0.0, camera.width, 7), np.linspace(0.0, camera.height, 5))
         self._grid = terms(np.stack([(x.ravel() - camera.cx) / camera.fx, (y.ravel() - camera.cy) / camera.fy], 1))
+        # A good calibration is as good at the edges of a wide view.
+        self._good = np.diag((np.maximum(np.abs(self._grid).max(axis=0), 1.0) / GOOD_PX) ** 2)
         self._frames = 0  # since the last one that could make a pair
         self._pair_t_ns: int | None = None  # of that one
         self.pairs = 0  # compared so far
