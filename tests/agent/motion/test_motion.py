@@ -152,3 +152,33 @@ def test_without_a_known_velocity_an_odometer_predicts_else_the_camera_and_the_g
     else:
         np.testing.assert_allclose(predicted[:3, 3], 3.0 * VELOCITY * PERIOD_NS * 1e-9, atol=1e-9)
         np.testing.assert_allclose(se3.so3_log(predicted[:3, :3]), 2.0 * rate * PERIOD_NS * 1e-9, atol=1e-6)
+
+
+def test_wrong_samples_and_those_sent_twice_are_left_out_before_anything_else() -> None:
+    rng = np.random.default_rng(0)
+    model = MotionModel(CAMERA, CALIBRATION, CONFIG, OdometerConfig(), PoseState(), metric=True)
+    stamps = np.arange(0, 1200 * 5_000_000, 5_000_000)
+    gyro, accel = 0.01 * rng.standard_normal((1200, 3)), UP + 0.2 * rng.standard_normal((1200, 3))
+    wrong = np.arange(200, 1190, 30)
+    accel[wrong, 0] += 70.0
+    times: list[int] = []
+    for k in range(0, 1200, 10):
+        for _ in range(2):
+            out = model.timed(ImuBatch(stamps[k : k + 10], gyro[k : k + 10], accel[k : k + 10]))
+            times += [] if out is None else out.t_ns.tolist()
+    assert times == np.delete(stamps, wrong).tolist()
+    assert any("left out" in event for event in model.take_events())
+
+
+@pytest.mark.parametrize("late_ns", [0, 40_000_000])
+def test_samples_up_to_a_frame_have_come_once_they_are_there(late_ns: int) -> None:
+    tracker = InertialTracker(CAMERA, CALIBRATION, CONFIG)
+    for k in range(1, 21):
+        stamps = np.arange((k - 1) * PERIOD_NS, k * PERIOD_NS, 5_000_000) + 5_000_000 - late_ns
+        n = len(stamps)
+        tracker.predict(ImuBatch(stamps, np.zeros((n, 3)), np.tile(UP, (n, 1))), k * PERIOD_NS)
+        tracker._set_last(k * PERIOD_NS, np.eye(4))
+        assert tracker.has_samples(k * PERIOD_NS) == (late_ns == 0)
+        assert tracker.has_samples((k - 1) * PERIOD_NS)
+    assert (tracker.samples_between(15 * PERIOD_NS, 20 * PERIOD_NS) is None) == (late_ns > 0)
+    assert tracker.samples_between(10 * PERIOD_NS, 19 * PERIOD_NS) is not None
