@@ -159,7 +159,7 @@ class DisparityAlignment:
         return self.applied or self.voids_turns(change)
 
     def voids_turns(self, change: F64) -> bool:
-        """True if rotations by images, as they were before a change (5,) px of the offset, tell nothing of an IMU."""
+        """True if rotations by images, as they were before a change (5,) px of the offset, do not refute an IMU."""
         return self._rms_px(np.outer(change, change)) >= _LEAST_PX
 
     def take_base(self, offset: F64, sigma_px: float | None) -> bool:

@@ -254,7 +254,7 @@ class MotionModel:
         self.odometer.move_map(T_new_old)
 
     def forget_turns(self) -> None:
-        """Poses by images were those of a wrongly calibrated camera until now: they tell nothing of the IMU."""
+        """Poses by images were those of a wrongly calibrated camera until now: they do not refute the IMU."""
         if self.tracker is not None:
             self.tracker.self_calibration.forget_turns()
 

@@ -210,13 +210,13 @@ class SelfCalibration:
         self._before = None
 
     def forget_turns(self) -> None:
-        """Rotations by images were wrong until now: begin again with what was known before the flight."""
+        """Rotations by images were wrong until now: begin again with what earlier flights found.
+
+        Without those the filter goes on: it has learned more from these rotations than they were off by.
+        """
         self.clear()
-        if self._has_found_mounting:
-            return  # vertical and velocity rest on it
-        if not (self._told.gyro and self._told.offset_s):
-            self.gyro = self._unknown_gyro()
-            return
+        if self._has_found_mounting or not (self._told.gyro and self._told.offset_s):
+            return  # vertical and velocity rest on a mounting
         if self._earlier is not self._told:  # they had refuted it
             self._earlier = self._told
             self._begin_accel()
