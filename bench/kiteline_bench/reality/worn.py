@@ -5,7 +5,7 @@ each scene. The seeds are held out: options are tuned on others.
 """
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -94,16 +94,21 @@ def _bars(bench: Bench, scene: str) -> list[Bar]:
                 [pair.over_bound("base", _BASE, _BASE_M) for pair in pairs], 1.0, "", 2),
         *spread(f"worn {scene}: largest live jump beside the motion", [_jump_mm(pair.worn) for pair in pairs],
                 _JUMP_MM, "mm", 1),
-        *(bar for name in pairs[0].found
+        *(bar for name in _names(pair.found for pair in pairs)
           for bar in spread(f"worn {scene}: {name}, error that is left over that of the calibration",
                             [pair.found.get(name, 1.0) for pair in pairs], _LEFT, "", 2)),
-        *(bar for name in pairs[0].kept
+        *(bar for name in _names(pair.kept for pair in pairs)
           for bar in spread(f"worn {scene}: {name}, the same after three flights with the rig file",
                             [pair.kept.get(name, 1.0) for pair in pairs], _LEFT, "", 2)),
         *spread(f"true {scene}: ATE live over that without self-calibration",
                 [pair.clean.ate_m("live") / pair.plain.ate_m("live") for pair in pairs], _UNHURT, "", 2),
         *spread(f"worn {scene}: frames without a pose", [float(pair.worn.run.lost) for pair in pairs], 0.0, "", 0),
     ]  # fmt: skip
+
+
+def _names(found: Iterable[dict[str, float]]) -> list[str]:
+    """Parts of a rig that any flight has found; a flight that left its IMU found none."""
+    return list(dict.fromkeys(name for shares in found for name in shares))
 
 
 def _truth(bench: Bench, scene: str, seed: int) -> Any:

@@ -210,11 +210,11 @@ class SelfCalibration:
         self._before = None
 
     def forget_turns(self) -> None:
-        """Rotations by images were wrong until now: begin again with what earlier flights found.
+        """Poses by images were wrong until now: begin again with what earlier flights found.
 
-        Without those the filter goes on: it has learned more from these rotations than they were off by.
-        """
+        Without those the filter goes on: it has learned more than these rotations were off by."""
         self.clear()
+        self._lever.clear()
         if self._has_found_mounting or not (self._told.gyro and self._told.offset_s):
             return  # vertical and velocity rest on a mounting
         if self._earlier is not self._told:  # they had refuted it
