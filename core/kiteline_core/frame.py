@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kiteline_core.arrays import F32, F64, I64, U8
+from kiteline_core.arrays import F32, F64, I64, U8, Bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,6 +82,11 @@ class Trajectory:
 
     t_ns: I64
     T_w_b: F64
+
+
+def chosen(batch: ImuBatch, which: I64 | Bool | slice) -> ImuBatch:
+    """Some samples of a batch, by their numbers or flags."""
+    return ImuBatch(batch.t_ns[which], batch.gyro[which], batch.accel[which])
 
 
 def joined(batches: Sequence[ImuBatch]) -> ImuBatch | None:

@@ -21,7 +21,7 @@ class _Interval:
 
 
 class ScaleWatch:
-    """Call `see` with each frame placed by images. filter: as it is at the end of the last compared interval."""
+    """Call `see` with each frame placed by images. The filter is as at the end of the last compared interval."""
 
     def __init__(
         self, scale: ScaleFilter, p_b_c: F64, has_come: Callable[[int], bool],
@@ -32,7 +32,7 @@ class ScaleWatch:
         has_come: whether the samples up to a frame's time have come, but for one or two. samples_between: those between
         two of these times; None with a gap.
         """
-        self.filter = scale
+        self._filter = scale
         self._p_b_c = p_b_c
         self._has_come, self._samples_between = has_come, samples_between
         self._from: tuple[int, F64] | None = None  # time and pose at which the present interval begins
@@ -40,25 +40,25 @@ class ScaleWatch:
 
     def see(self, t_ns: int, T_m_b: F64, depth_m: float, state: InertialState | None) -> None:
         """Process a frame at T_m_b (4,4) by images, `depth_m` from what they see. state: after it, if it is known."""
-        if not self.filter.running or state is None:
-            self.filter.stop()
+        if not self._filter.running or state is None:
+            self._filter.stop()
             return
         if self._waiting is not None and self._has_come(self._waiting.end_ns):
             waiting, self._waiting = self._waiting, None
             if not self._compare(waiting, state):
                 self.forget()  # the velocity at its end is not known any more
         if self._from is None:
-            self.filter.resume(state.velocity)
+            self._filter.resume(state.velocity)
             self._from = (t_ns, T_m_b)
         elif (t_ns - self._from[0]) * 1e-9 >= INTERVAL_S:
             interval = _Interval(*self._from, t_ns, T_m_b, depth_m)
             if self._waiting is not None:  # samples this late are none
                 self.forget()
-                self.filter.resume(state.velocity)
+                self._filter.resume(state.velocity)
             elif not self._has_come(t_ns):
                 self._waiting = interval
             elif not self._compare(interval, state):
-                self.filter.resume(state.velocity)
+                self._filter.resume(state.velocity)
             self._from = (t_ns, T_m_b)
 
     def _compare(self, interval: _Interval, state: InertialState) -> bool:
@@ -66,7 +66,7 @@ class ScaleWatch:
         samples = self._samples_between(interval.begin_ns, interval.end_ns)
         if samples is None or interval.depth_m <= 0.0:
             return False
-        self.filter.add(interval.T_m_b0, interval.T_m_b1, samples, state.bias[:3], interval.depth_m)
+        self._filter.add(interval.T_m_b0, interval.T_m_b1, samples, state.bias[:3], interval.depth_m)
         return True
 
     def forget(self) -> None:
@@ -76,12 +76,12 @@ class ScaleWatch:
     def move_map(self, T_new_old: F64) -> None:
         """The map moved: p_new = T_new_old p_old."""
         self._transform(lambda T_m_b: T_new_old @ T_m_b, 1.0)
-        self.filter.rotate_map(T_new_old[:3, :3])
+        self._filter.rotate_map(T_new_old[:3, :3])
 
     def scale_map(self, factor: float, centre: F64) -> None:
         """Lengths in the map were multiplied by `factor` about centre (3,)."""
         self._transform(lambda T_m_b: camera_scaled(T_m_b, factor, self._p_b_c, centre), factor)
-        self.filter.scale_map(factor)
+        self._filter.scale_map(factor)
 
     def _transform(self, change: Callable[[F64], F64], factor: float) -> None:
         if self._from is not None:

@@ -160,7 +160,7 @@ class DisparityAlignment:
 
     def voids_turns(self, change: F64) -> bool:
         """True if rotations by images, as they were before a change (5,) px of the offset, do not refute an IMU."""
-        return self._rms_px(np.outer(change, change)) >= _LEAST_PX
+        return self._size_px(change) >= _LEAST_PX
 
     def take_base(self, offset: F64, sigma_px: float | None) -> bool:
         """Set the map's offset to the base's (5,), unless more is known here. Returns whether it was set.
@@ -373,6 +373,10 @@ class DisparityAlignment:
             self.is_good_offset, self._refuted, self._base_sigma_px = True, False, None
         return change
 
+    def _size_px(self, offset: F64) -> float:
+        """Rms over the image of an offset (5,)."""
+        return float(np.sqrt(np.mean((self._grid @ offset) ** 2)))
+
     def _rms_px(self, square: F64) -> float:
         """Root of the mean over the image of an offset's square, told as the mean square (5,5) of its terms."""
         return float(np.sqrt(np.mean(np.einsum("ni,ij,nj->n", self._grid, square, self._grid))))
@@ -380,7 +384,7 @@ class DisparityAlignment:
     def _set(self, offset: F64, least_px: float) -> F64 | None:
         """Set the map's offset (5,); the change, None if it is less than least_px, rms over the image."""
         change = offset - self._map.disparity_offset
-        if float(np.sqrt(np.mean((self._grid @ change) ** 2))) < least_px:
+        if self._size_px(change) < least_px:
             return None
         self._map.set_disparity_offset(offset)
         return np.asarray(change)

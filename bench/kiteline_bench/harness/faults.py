@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from kiteline_bench.harness.recording import Item, Recording
 from kiteline_core.arrays import U8
-from kiteline_core.frame import Frame, ImuBatch, joined
+from kiteline_core.frame import Frame, ImuBatch, chosen, joined
 
 Change = Callable[[Frame], Frame]
 Fault = Callable[[Recording], Recording]
@@ -103,7 +103,7 @@ def without_samples(recording: Recording, every_s: float, length_s: float) -> Re
 
     def kept(imu: ImuBatch) -> ImuBatch | None:
         keep = (imu.t_ns - begin_ns) * 1e-9 % every_s < every_s - length_s
-        return ImuBatch(imu.t_ns[keep], imu.gyro[keep], imu.accel[keep]) if keep.any() else None
+        return chosen(imu, keep) if keep.any() else None
 
     return _each_batch(recording, kept)
 

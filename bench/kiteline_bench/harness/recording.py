@@ -8,7 +8,7 @@ import numpy as np
 
 from kiteline_core import odometry as odometer
 from kiteline_core.arrays import F64
-from kiteline_core.frame import Frame, ImuBatch, ImuCalibration, OdometryBatch, Trajectory, joined
+from kiteline_core.frame import Frame, ImuBatch, ImuCalibration, OdometryBatch, Trajectory, chosen, joined
 from kiteline_core.geometry.cameras import CameraRig
 from kiteline_hw.logs.mcap_log import GROUND_TRUTH, IMU, LogWriter
 from kiteline_hw.ports import FrameSource
@@ -85,7 +85,7 @@ class Recording:
         items, first = [], 0
         for item in self.items:
             last = int(np.searchsorted(samples.t_ns, item.frame.t_ns, side="right"))
-            items.append(replace(item, imu=_rows(samples, first, last) if last > first else None))
+            items.append(replace(item, imu=chosen(samples, slice(first, last)) if last > first else None))
             first = last
         return replace(self, items=tuple(items))
 
@@ -190,10 +190,10 @@ def _reversed(before: ImuBatch | None, batch: ImuBatch | None, end_ns: int) -> I
     """The samples of `batch`, played backward; the last sample of `before` comes last, at `end_ns`."""
     if batch is None or not len(batch.t_ns):
         return None
-    parts = [batch] if before is None or not len(before.t_ns) else [_rows(before, -1, None), _rows(batch, 0, -1)]
+    parts = (
+        [batch]
+        if before is None or not len(before.t_ns)
+        else [chosen(before, slice(-1, None)), chosen(batch, slice(0, -1))]
+    )
     t_ns, gyro, accel = (np.concatenate([getattr(p, name) for p in parts])[::-1] for name in ("t_ns", "gyro", "accel"))
     return ImuBatch(np.asarray(end_ns - (t_ns - int(t_ns[-1]))), -gyro, np.ascontiguousarray(accel))
-
-
-def _rows(batch: ImuBatch, begin: int, end: int | None) -> ImuBatch:
-    return ImuBatch(batch.t_ns[begin:end], batch.gyro[begin:end], batch.accel[begin:end])

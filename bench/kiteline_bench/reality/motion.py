@@ -33,8 +33,7 @@ _PLAIN, _SAMPLES = "as recorded", "0.3 s without IMU in every 5 s"
 _LATE, _EARLY, _SCATTER = "IMU stamps 20 ms late", "IMU stamps 80 ms early", "camera stamps scatter by 2 ms"
 _BURSTS = "IMU samples stamped in bursts of 16 ms"
 _WRONG = "three IMU samples in a hundred wrong"
-_OF_IMU = (_SAMPLES, _LATE, _EARLY, _BURSTS, _WRONG)
-_BY_CHANCE = (_WRONG,)  # of them
+_OF_IMU, _BY_CHANCE = (_SAMPLES, _LATE, _EARLY, _BURSTS), (_WRONG, _SCATTER)  # those that need an IMU
 _FAULTS: dict[str, Callable[[Recording, int], Recording]] = {
     _PLAIN: lambda recording, _: recording,
     "one image in ten blank": lambda recording, seed: some(recording, 0.1, wall, seed),
@@ -116,10 +115,9 @@ def _faulty_sensors(bench: Bench) -> list[Bar]:
     bars = []
     for name, ways, limit in flights:
         for fault, change in _FAULTS.items():
-            if fault in (*_OF_IMU, _SCATTER) and ways[0].imu is None:
+            if fault in (*_OF_IMU, *_BY_CHANCE) and ways[0].imu is None:
                 continue
-            same = fault in (_PLAIN, *_OF_IMU) and fault not in _BY_CHANCE
-            seeds = (0,) if same else bench.chosen(_SEEDS)
+            seeds = (0,) if fault in (_PLAIN, *_OF_IMU) else bench.chosen(_SEEDS)
             found = [flown(bench, f"{name}, {fault}", change(way, seed), base=False) for way in ways for seed in seeds]
             waits = sum(e.initialising for flight in found for e in flight.run.found)
             errors = [flight.ate_m("odometry") for flight in found]

@@ -127,12 +127,18 @@ def _recorded(folder: Path) -> set[str]:
     return set(path.read_text().splitlines()) if path.exists() else set()
 
 
+def compiled_for() -> tuple[str, str]:
+    """Name of the CPU that numba compiles for, and its features: one name stands for several CPUs."""
+    import llvmlite.binding as llvm
+
+    return str(llvm.get_host_cpu_name()), str(llvm.get_host_cpu_features().flatten())
+
+
 def _needed() -> dict[Path, set[str]]:
     """One line per module, with everything its compiled code depends on, by the folder of its compiled kernels."""
-    import llvmlite.binding as llvm
     import numba
 
-    machine = f"{llvm.get_host_cpu_name()} {llvm.get_host_cpu_features().flatten()}"
+    machine = " ".join(compiled_for())
     compiler = hashlib.blake2b(machine.encode(), digest_size=8).hexdigest()
     versions = f"{platform.python_version()} {numba.__version__} {compiler}"
     needed: dict[Path, set[str]] = {}

@@ -10,7 +10,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from llvmlite import binding
+
+from kiteline_hw.system.kernel_cache import compiled_for
 
 _LIBRARIES = ("numpy", "numba", "opencv-python-headless", "gtsam")
 
@@ -57,6 +58,6 @@ def _opencv_features() -> str:
 
 
 def _numba_cpu() -> str:
-    """The CPU that numba compiles for, and a digest of its features: one name stands for several CPUs."""
-    features = str(binding.get_host_cpu_features().flatten())
-    return f"{binding.get_host_cpu_name()} {hashlib.sha256(features.encode()).hexdigest()[:6]}"
+    """The CPU that numba compiles for, and a digest of its features."""
+    name, features = compiled_for()
+    return f"{name} {hashlib.sha256(features.encode()).hexdigest()[:6]}"

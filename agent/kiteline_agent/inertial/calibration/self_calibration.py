@@ -210,9 +210,7 @@ class SelfCalibration:
         self._before = None
 
     def forget_turns(self) -> None:
-        """Poses by images were wrong until now: begin again with what earlier flights found.
-
-        Without those the filter goes on: it has learned more than these rotations were off by."""
+        """Poses by images were wrong until now: begin again with what earlier flights found; without those, go on."""
         self.clear()
         self._lever.clear()
         if self._has_found_mounting or not (self._told.gyro and self._told.offset_s):

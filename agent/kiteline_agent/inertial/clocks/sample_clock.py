@@ -9,7 +9,7 @@ import numpy as np
 
 from kiteline_agent.inertial.clocks.stamp_line import stamp_line
 from kiteline_core.arrays import I64
-from kiteline_core.frame import ImuBatch, joined
+from kiteline_core.frame import ImuBatch, chosen, joined
 from kiteline_core.order_statistics import median
 
 _SAMPLES = 400  # that a line is fitted to: one or two seconds
@@ -66,21 +66,22 @@ class SampleClock:
 
     def _in_order(self, imu: ImuBatch) -> ImuBatch:
         """The samples without those that a link sends twice or late, and those stamped far ahead of the next one."""
-        silent_ns = round(1e9 * _SILENT_S)
-        whole = imu if self._last is None else joined([self._last, imu])
-        assert whole is not None
-        step_ns = np.diff(whole.t_ns)
-        if not (step_ns > 0).all():
+        stamps_ns, last = imu.t_ns, self._last
+        follows = last is None or bool(stamps_ns[0] > last.t_ns[0])
+        if not (follows and (stamps_ns[1:] > stamps_ns[:-1]).all()):
+            silent_ns = round(1e9 * _SILENT_S)
+            whole = imu if last is None else joined([last, imu])
+            assert whole is not None
+            step_ns = np.diff(whole.t_ns)
             keep = np.append(step_ns > -silent_ns, True)
             newest_ns = np.maximum.accumulate(np.where(keep, whole.t_ns, whole.t_ns.min()))[:-1]
             late = (whole.t_ns[1:] < newest_ns) | ((whole.t_ns[1:] == newest_ns) & (step_ns != 0))
             keep[1:] &= ~(late & (newest_ns - whole.t_ns[1:] < silent_ns))
             copy = (step_ns == 0) & (whole.gyro[1:] == whole.gyro[:-1]).all(axis=1)
             keep[1:] &= ~(copy & (whole.accel[1:] == whole.accel[:-1]).all(axis=1))
-            new = keep[len(keep) - len(imu.t_ns) :]
-            imu = ImuBatch(imu.t_ns[new], imu.gyro[new], imu.accel[new])
+            imu = chosen(imu, keep[len(keep) - len(imu.t_ns) :])
         if len(imu.t_ns):
-            self._last = ImuBatch(imu.t_ns[-1:], imu.gyro[-1:], imu.accel[-1:])
+            self._last = chosen(imu, slice(-1, None))
         return imu
 
     def _taken_ns(self, stamps_ns: I64) -> I64:

@@ -7,8 +7,8 @@ may be a peak, it waits for the next one.
 
 import numpy as np
 
-from kiteline_core.arrays import F64, I64, Bool
-from kiteline_core.frame import ImuBatch, joined
+from kiteline_core.arrays import F64, Bool
+from kiteline_core.frame import ImuBatch, chosen, joined
 
 _BEFORE = 3  # samples before a peak that agree with the next one
 _LEAST = np.repeat([0.5, 5.0], 3)  # rad/s, m/s^2; of a peak: smaller ones do little harm
@@ -58,8 +58,8 @@ class SampleCheck:
         keep[at[peak]] = False
         self._note_left_out(int(np.count_nonzero(~keep)))
         if waits:
-            keep[at[-1]], self._waiting = False, _chosen(imu, at[-1:])
-        return imu if keep.all() else _chosen(imu, np.flatnonzero(keep)) if keep.any() else None
+            keep[at[-1]], self._waiting = False, chosen(imu, at[-1:])
+        return imu if keep.all() else chosen(imu, keep) if keep.any() else None
 
     def _measured(self, values: F64) -> Bool:
         """Which of new samples (n,6) a sensor measured: no zeros, nothing that is not finite, no repeats; (n,)."""
@@ -129,7 +129,3 @@ def _is_peak(value: F64, around: F64, least: F64) -> bool:
     """True if a sample (6,) is far from its neighbours (n,6), which agree."""
     off = np.abs(value - np.median(around, axis=0))
     return bool(((off > least) & (off > _APART * (around.max(axis=0) - around.min(axis=0)))).any())
-
-
-def _chosen(imu: ImuBatch, at: I64) -> ImuBatch:
-    return ImuBatch(imu.t_ns[at], imu.gyro[at], imu.accel[at])
