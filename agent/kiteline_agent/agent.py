@@ -18,6 +18,7 @@ from kiteline_agent.initialisation.inertial_start import InertialStart
 from kiteline_agent.initialisation.two_view_start import TwoViewStart
 from kiteline_agent.keyframes.depth_from_motion import DepthFromMotion
 from kiteline_agent.keyframes.keyframe_maker import KeyframeMaker
+from kiteline_agent.keyframes.slant_from_motion import SlantFromMotion
 from kiteline_agent.known_rig import KnownRigConfig
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.mapping.camera_state import CameraState
@@ -98,6 +99,7 @@ class Agent:
         maker = KeyframeMaker(self.map, channel, rows, self.work, has_depth=self._has_depth)
         self._keyframes = KeyframeStage(self._camera, maker, self._relocaliser, self._governor, channel, self.work)
         self._depth = DepthFromMotion(self.map, config, self.work)
+        self._slants = SlantFromMotion(self.map, config.slant, self.work)
         self._two_view_start = None if self._has_depth else TwoViewStart(camera, config, self.work)
         self._inertial_start = inertial_start = (
             None if self._has_depth or imu is None
@@ -209,13 +211,14 @@ class Agent:
             camera.set_measured(track, dt_s, repeated=ctx.repeated)
             self._loss.end()
             events += self._align_gravity(ctx)
-            # 6. Update the depths of landmarks, and search those without a depth.
+            # 6. Update depths and slants of landmarks, and search those without a depth.
             if self._two_view_start is not None:
                 self._two_view_start.note_depths(track.depth_m[track.inlier])
             if self._inertial_start is not None:
                 self._inertial_start.clear()
             # By images: what a fused pose differs by is in all pixels alike, and would move all depths together.
             self._depth.update_landmarks(ctx, by_images)
+            self._slants.update(ctx, by_images)
             self._depth.search_seeds(ctx, track)
             if self.right_camera is not None and self._effort.first == 0:  # half an image hardly tells the offset
                 T_o_m = camera.pose.T_o_m

@@ -124,6 +124,17 @@ class DepthFromMotionConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class SlantConfig:
+    """How slanted the surfaces around landmarks are, which says how their templates are warped."""
+
+    MAY_BE_ZERO: ClassVar = ("points",)
+
+    points: int = 240  # landmarks whose slant is measured in a frame, 1 us each; 0: all surfaces face the camera
+    sigma: float = 1.0  # deviation of a slant before it is measured: a wall seen at 45 degrees, in the middle of a view
+    memory: float = 0.9  # share of the information that is kept from frame to frame: they share the template's errors
+
+
+@dataclass(frozen=True, slots=True)
 class DisparityAlignmentConfig:
     """Estimation of a worn stereo rig's disparity offset on board."""
 
@@ -249,6 +260,7 @@ class AgentConfig:
     governor: GovernorConfig = field(default_factory=GovernorConfig)
     prediction: PredictionConfig = field(default_factory=PredictionConfig)
     depth_from_motion: DepthFromMotionConfig = field(default_factory=DepthFromMotionConfig)
+    slant: SlantConfig = field(default_factory=SlantConfig)
     two_view_start: TwoViewStartConfig = field(default_factory=TwoViewStartConfig)
     inertial_start: InertialStartConfig = field(default_factory=InertialStartConfig)
     relocalisation: RelocalisationConfig = field(default_factory=RelocalisationConfig)

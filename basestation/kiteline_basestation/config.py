@@ -20,7 +20,7 @@ class MeasurementConfig:
 
     sigma_px: float = 0.25  # px at octave 0; of an aligned keypoint
     sigma_disparity_px: float = (
-        0.4  # px at octave 0; of a disparity: observations of a landmark share its template's error
+        0.2  # px at octave 0; of a disparity: with an offset of a good calibration, which is not known
     )
 
 

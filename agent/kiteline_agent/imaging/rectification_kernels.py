@@ -39,29 +39,32 @@ def _differences(a, b, c, part):  # type: ignore[no-untyped-def]
 
 
 @njit
-def _rectify_patch(image, grid, scale, left, top, rows, columns, bits, out):  # type: ignore[no-untyped-def]
+def _rectify_patch(image, grid, scale, left, top, rows, columns, bits, out, stretch=1.0, shear=0.0):  # type: ignore[no-untyped-def]
     """Fill out[:columns, :rows] with the rectified pixels from (left, top) on; False outside of the raw image.
 
     image: raw, of the pyramid's level whose pixels are `scale` px wide; left, top: px of it. bits: of 14, by which grey
-    levels are shortened. Distortion is a parabola in each direction, through three by three pixels.
+    levels are shortened. Distortion is a parabola in each direction, through three by three pixels. stretch: px between
+    two columns. shear: px by which each row begins farther to the right than the one above it, about the middle row.
     """
     h, w = image.shape
     one = np.uint64(1)
     last = columns - 1.0
     inverse = 1.0 / scale
-    half_x = 0.5 * last * scale
+    half_x = 0.5 * last * scale * stretch
     half_y = 0.5 * (rows - 1.0) * scale
-    x0 = left * scale
+    x1 = left * scale
+    x0 = x1 - shear * half_y
+    x2 = x1 + shear * half_y
     y0 = top * scale
     u00, v00 = _raw_at(grid, x0, y0)
     u01, v01 = _raw_at(grid, x0 + half_x, y0)
     u02, v02 = _raw_at(grid, x0 + 2.0 * half_x, y0)
-    u10, v10 = _raw_at(grid, x0, y0 + half_y)
-    u11, v11 = _raw_at(grid, x0 + half_x, y0 + half_y)
-    u12, v12 = _raw_at(grid, x0 + 2.0 * half_x, y0 + half_y)
-    u20, v20 = _raw_at(grid, x0, y0 + 2.0 * half_y)
-    u21, v21 = _raw_at(grid, x0 + half_x, y0 + 2.0 * half_y)
-    u22, v22 = _raw_at(grid, x0 + 2.0 * half_x, y0 + 2.0 * half_y)
+    u10, v10 = _raw_at(grid, x1, y0 + half_y)
+    u11, v11 = _raw_at(grid, x1 + half_x, y0 + half_y)
+    u12, v12 = _raw_at(grid, x1 + 2.0 * half_x, y0 + half_y)
+    u20, v20 = _raw_at(grid, x2, y0 + 2.0 * half_y)
+    u21, v21 = _raw_at(grid, x2 + half_x, y0 + 2.0 * half_y)
+    u22, v22 = _raw_at(grid, x2 + 2.0 * half_x, y0 + 2.0 * half_y)
     if min(u00, u10, u20) * inverse < 0.5 or max(u02, u12, u22) * inverse >= w - 2.0:
         return False
     if min(v00, v01, v02) * inverse < 0.5 or max(v20, v21, v22) * inverse >= h - 2.0:

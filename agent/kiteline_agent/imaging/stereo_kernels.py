@@ -120,6 +120,32 @@ def _sample_columns(image, left, top, columns, out):  # type: ignore[no-untyped-
 
 
 @njit
+def _sample_slanted(image, left, top, stretch, shear, out):  # type: ignore[no-untyped-def]
+    """Fill out[: SIDE + 2, :SIDE] with the image from (left, top) on, as `_rectify_patch` does. False outside of it."""
+    first = left - shear * RADIUS
+    last = left + shear * RADIUS
+    if min(first, last) < 0.0 or max(first, last) + (SIDE + 1) * stretch >= image.shape[1] - 1.0:
+        return False
+    y0 = int(top)
+    fy = np.int32((top - y0) * 128.0 + 0.5)
+    for r in range(SIDE):
+        upper = image[y0 + r]
+        lower = image[y0 + r + 1]
+        to = np.uint64(r)
+        x = first + shear * r
+        for k in range(SIDE + 2):
+            x0 = int(x)
+            fx = np.int32((x - x0) * 128.0 + 0.5)
+            a = np.int32(upper[x0])
+            b = np.int32(lower[x0])
+            above = (a << 7) + fx * (np.int32(upper[x0 + 1]) - a)
+            below = (b << 7) + fx * (np.int32(lower[x0 + 1]) - b)
+            out[np.uint64(k), to] = ((above << 7) + fy * (below - above) + 512) >> 10
+            x += stretch
+    return True
+
+
+@njit
 def _put_template(wide, patches):  # type: ignore[no-untyped-def]
     """Write the template (row 0 of patches) and twice its gradient along the row (1), by wide (SIDE + 2, STRIDE)."""
     grey = wide.reshape(-1)
@@ -181,13 +207,15 @@ def _slide(strip, first, patches, begin, width, iterations, max_step_px):  # typ
 
 @njit
 def refine_rows(  # type: ignore[no-untyped-def]
-    left, left_grid, right, grid, uv, octave, sure, iterations, max_step_px, min_ncc, disparity, found
+    left, left_grid, right, grid, uv, octave, sure, slopes, iterations, max_step_px, min_ncc, disparity, found
 ):
     """Sub-pixel disparity by 1-D Lucas-Kanade, invariant to gain and offset, at level `octave` (and one coarser first).
 
     left_grid, grid: (0,0,2) if `left` or `right` is rectified; else that is the raw image's pyramid, and the grid
     (gh,gw,2) float32 the raw pixel of every GRID_STEP-th rectified one, so that only patches and strips are rectified.
     sure: (n,) bool, the prediction is good to a pixel of its octave: the coarser level is skipped.
+    slopes: (n,2) gradient of the disparity by the left pixel: the left patch is sampled so that the right one, which is
+    straight, shows the same surface.
     disparity: (n,) float64 px at level 0: prediction in (negative: skip), result out. found: (n,) bool out.
     max_step_px: largest distance of the match from the prediction, in px of the level.
     """
@@ -220,11 +248,18 @@ def refine_rows(  # type: ignore[no-untyped-def]
             begin = x - d / s
             if begin < RADIUS or begin >= w - RADIUS - 1:
                 continue
+            stretch = 1.0 / (1.0 - slopes[i, 0])
+            shear = slopes[i, 1] * stretch
+            reach_x = (RADIUS + 1) * stretch
             if raw_left:
-                if not _rectify_patch(left[level], left_grid, s, x - RADIUS - 1, y - RADIUS, SIDE, SIDE + 2, 10, wide):
+                if not _rectify_patch(
+                    left[level], left_grid, s, x - reach_x, y - RADIUS, SIDE, SIDE + 2, 10, wide, stretch, shear
+                ):
                     continue
-            else:
+            elif slopes[i, 0] == 0.0 and slopes[i, 1] == 0.0:
                 _sample_columns(left[level], x - RADIUS - 1, y - RADIUS, SIDE + 2, wide)
+            elif not _sample_slanted(left[level], x - reach_x, y - RADIUS, stretch, shear, wide):
+                continue
             _put_template(wide, patches)
             first = max(int(begin) - RADIUS - reach, 0)
             columns = min(int(begin) + RADIUS + reach + 2, w - 1) - first

@@ -76,6 +76,8 @@ class LocalMap:
         self.uv = np.zeros((k, b, 2))
         self.rho = np.zeros((k, b))
         self.sigma_rho = np.zeros((k, b))
+        self.slant = np.zeros((k, b, 2))  # of the surface around a landmark: see projection_kernels.project
+        self.slant_equations = np.zeros((k, b, 5))  # that determine it: xx, xy, yy, x, y
         self.octave = np.zeros(k * b, np.uint8)
         self.angle = np.zeros(k * b, np.uint8)  # in 1/256 turns
         self.descriptor = np.zeros((k * b, 32), np.uint8)
@@ -136,6 +138,7 @@ class LocalMap:
         self.bearing[slot, :n] = self._bearings(uv[:n])
         self.rho[slot, :n] = np.where(rho[:n] > 0.0, rho[:n], 1.0 / _SEED_DEPTH_M)
         self.sigma_rho[slot, :n] = np.where(rho[:n] > 0.0, new.sigma_rho[:n], 0.0)  # 0: not initialised
+        self.slant[slot] = self.slant_equations[slot] = 0.0
         self.measured[slot] = False
         self.measured[slot, :n] = rho[:n] > 0.0
         self.disparity[slot] = 0.0
@@ -177,8 +180,8 @@ class LocalMap:
         slots = self._searched((self.keyframe >> SEQUENCE_BITS == wanted).nonzero()[0])
         n = kernels.project(
             T_c_m, self.intrinsics, self._size, margin_px, _MAX_SCALE, slots, self.T_m_k, self.order, self.counts,
-            self.seed if seeds else self.usable,
-            self.bearing, self.rho, self.sigma_rho, self._row, self._uv, self._warp, self._xyz, self._ray, self._depth,
+            self.seed if seeds else self.usable, self.bearing, self.rho, self.slant, self.sigma_rho,
+            self._row, self._uv, self._warp, self._xyz, self._ray, self._depth,
         )  # fmt: skip
         return Candidates(self._row[:n], self._uv[:n], self._warp[:n], self._xyz[:n], self._ray[:n], self._depth[:n])
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from kiteline_core.jit import njit
+from kiteline_core.jit import helper, njit
 
 
 @njit
@@ -19,6 +19,7 @@ def project(  # type: ignore[no-untyped-def]
     usable,
     bearing,
     rho,
+    slant,
     sigma_rho,
     out_row,
     out_uv,
@@ -31,7 +32,8 @@ def project(  # type: ignore[no-untyped-def]
 
     T_c_m: (4,4). camera: fx, fy, cx, cy, bf. size: width, height px. slots: (s,) int64. T_m_k: (K,4,4). order: (K,B)
     int64, landmarks of a slot in the order in which they are taken. counts: (K,). usable: (K,B) bool. bearing: (K,B,2)
-    x/z, y/z in the keyframe. rho, sigma_rho: (K,B) inverse depth, its deviation, 1/m.
+    x/z, y/z in the keyframe. rho, sigma_rho: (K,B) inverse depth, its deviation, 1/m. slant: (K,B,2) gradient of the
+    logarithm of inverse depth by the bearing, of the surface around the landmark.
     Out, capacity K*B: out_row slot*B+index, out_uv px, out_warp (2,2) d(px here)/d(px in the keyframe), out_xyz
     m in the submap frame, out_ray m (one deviation of depth as a vector), out_depth m. Returns how many were written.
     """
@@ -67,8 +69,10 @@ def project(  # type: ignore[no-untyped-def]
             v = fy * y / z + cy
             if u < margin_px or v < margin_px or u >= size[0] - margin_px or v >= size[1] - margin_px:
                 continue
-            x1, y1, z1 = x + r[0, 0] * step / fx, y + r[1, 0] * step / fx, z + r[2, 0] * step / fx
-            x2, y2, z2 = x + r[0, 1] * step / fy, y + r[1, 1] * step / fy, z + r[2, 1] * step / fy
+            gx, gy = p * slant[k, i, 0], p * slant[k, i, 1]  # of the inverse depth
+            x1, x2 = x + (r[0, 0] + t[0] * gx) * step / fx, x + (r[0, 1] + t[0] * gy) * step / fy
+            y1, y2 = y + (r[1, 0] + t[1] * gx) * step / fx, y + (r[1, 1] + t[1] * gy) * step / fy
+            z1, z2 = z + (r[2, 0] + t[2] * gx) * step / fx, z + (r[2, 1] + t[2] * gy) * step / fy
             if z1 < 0.05 or z2 < 0.05:
                 continue
             a00 = (fx * x1 / z1 + cx - u) / step
@@ -94,6 +98,68 @@ def project(  # type: ignore[no-untyped-def]
             out_depth[n] = z * depth
             n += 1
     return n
+
+
+@helper
+def _relative(T_c_m, T_m_k, r, t):  # type: ignore[no-untyped-def]
+    """Write rotation r (3,3) and translation t (3,) from a keyframe at T_m_k (4,4) to a camera at T_c_m (4,4)."""
+    for a in range(3):
+        t[a] = T_c_m[a, 3]
+        for m in range(3):
+            t[a] += T_c_m[a, m] * T_m_k[m, 3]
+        for b in range(3):
+            v = 0.0
+            for m in range(3):
+                v += T_c_m[a, m] * T_m_k[m, b]
+            r[a, b] = v
+
+
+@njit
+def views(T_c_m, camera, rows, T_m_k, bearing, rho, slant, warp, parallax):  # type: ignore[no-untyped-def]
+    """How a camera sees the surfaces around landmarks, for the arguments see `project`.
+
+    rows: (n,) slot*B+index. warp: (n,2,2) d(px here)/d(px in the keyframe), out. parallax: (n,2) px here for a change
+    of the inverse depth by its own value, out.
+    """
+    fx, fy = camera[0], camera[1]
+    slot_size = rho.shape[1]
+    r, t = np.empty((3, 3)), np.empty(3)
+    for j in range(rows.shape[0]):
+        k, i = rows[j] // slot_size, rows[j] % slot_size
+        _relative(T_c_m, T_m_k[k], r, t)
+        bx, by, p = bearing[k, i, 0], bearing[k, i, 1], rho[k, i]
+        inv = 1.0 / max(r[2, 0] * bx + r[2, 1] * by + r[2, 2] + t[2] * p, 1e-3)
+        x = (r[0, 0] * bx + r[0, 1] * by + r[0, 2] + t[0] * p) * inv
+        y = (r[1, 0] * bx + r[1, 1] * by + r[1, 2] + t[1] * p) * inv
+        px, py = (t[0] - x * t[2]) * inv * p, (t[1] - y * t[2]) * inv * p
+        parallax[j, 0], parallax[j, 1] = fx * px, fy * py
+        s0, s1 = slant[k, i, 0], slant[k, i, 1]
+        warp[j, 0, 0] = (r[0, 0] - x * r[2, 0]) * inv + px * s0
+        warp[j, 0, 1] = ((r[0, 1] - x * r[2, 1]) * inv + px * s1) * fx / fy
+        warp[j, 1, 0] = ((r[1, 0] - y * r[2, 0]) * inv + py * s0) * fy / fx
+        warp[j, 1, 1] = (r[1, 1] - y * r[2, 1]) * inv + py * s1
+
+
+@njit
+def disparity_slopes(T_c_m, camera, rows, T_m_k, bearing, rho, slant, limit, slopes):  # type: ignore[no-untyped-def]
+    """Gradients (n,2) of the disparity by the pixel around landmarks in a camera, out; at most `limit`.
+
+    For the arguments see `views`. The plane n X = 1 in the keyframe, whose inverse depths are n (x/z, y/z, 1), is
+    n R^T X = 1 + n R^T t in the camera.
+    """
+    slot_size = rho.shape[1]
+    r, t = np.empty((3, 3)), np.empty(3)
+    for j in range(rows.shape[0]):
+        k, i = rows[j] // slot_size, rows[j] % slot_size
+        _relative(T_c_m, T_m_k[k], r, t)
+        p, s0, s1 = rho[k, i], slant[k, i, 0], slant[k, i, 1]
+        n0, n1, n2 = p * s0, p * s1, p * (1.0 - s0 * bearing[k, i, 0] - s1 * bearing[k, i, 1])
+        c0 = r[0, 0] * n0 + r[0, 1] * n1 + r[0, 2] * n2
+        c1 = r[1, 0] * n0 + r[1, 1] * n1 + r[1, 2] * n2
+        c2 = r[2, 0] * n0 + r[2, 1] * n1 + r[2, 2] * n2
+        away = max(1.0 + c0 * t[0] + c1 * t[1] + c2 * t[2], 1e-3)
+        slopes[j, 0] = min(max(camera[4] * c0 / (away * camera[0]), -limit), limit)
+        slopes[j, 1] = min(max(camera[4] * c1 / (away * camera[1]), -limit), limit)
 
 
 @njit

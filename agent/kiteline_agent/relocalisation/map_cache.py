@@ -89,6 +89,7 @@ class MapCache:
         self._bearing = np.zeros((k, p, 2))
         self._rho = np.zeros((k, p))
         self._sigma_rho = np.zeros((k, p))
+        self._slant = np.zeros((k, p, 2))  # unknown: no template is warped by it
         self._octave = np.zeros(k * p, np.uint8)
         self._angle = np.zeros(k * p, np.uint8)
         self._descriptor = np.zeros((k * p, 32), np.uint8)
@@ -190,7 +191,8 @@ class MapCache:
         row, uv, warp, xyz, ray, depth = self._out
         n = projection_kernels.project(
             T_c_m, self._intrinsics, self._size, margin_px, _MAX_SCALE, slots, self._T_m_k, self._order,
-            self._counts, self._usable, self._bearing, self._rho, self._sigma_rho, row, uv, warp, xyz, ray, depth,
+            self._counts, self._usable, self._bearing, self._rho, self._slant, self._sigma_rho, row, uv, warp, xyz, ray,
+            depth,
         )  # fmt: skip
         rows = row[:n].copy()
         nearer = np.log2(1.0 / (self._rho.reshape(-1)[rows] * depth[:n]))

@@ -61,7 +61,7 @@ class RightImage:
         return np.asarray(cv2.pyrDown(self._image), np.uint8) if self._raw is None else self._raw[1]
 
     def refine(
-        self, left: Pyramid, left_grid: F32, uv: F64, octave: U8, sure: Bool, search_px: float,
+        self, left: Pyramid, left_grid: F32, uv: F64, octave: U8, sure: Bool, slopes: F64, search_px: float,
         disparity: F64, found: Bool,
     ) -> None:  # fmt: skip
         """Measure disparities to sub-pixel (stereo_kernels.refine_rows); rectifies only the patches that it reads."""
@@ -70,7 +70,7 @@ class RightImage:
         offset = np.zeros(len(uv)) if self._offset_px is None else self._offset_px(uv)
         disparity[wanted] = np.maximum(disparity[wanted] + offset[wanted], 0.0)
         stereo_kernels.refine_rows(
-            left, left_grid, self.raw(), NO_GRID if grid is None else grid, uv, octave, sure,
+            left, left_grid, self.raw(), NO_GRID if grid is None else grid, uv, octave, sure, slopes,
             _ITERATIONS, search_px, _MIN_NCC, disparity, found,
         )  # fmt: skip
         disparity[wanted] = np.maximum(disparity[wanted] - offset[wanted], 0.0)

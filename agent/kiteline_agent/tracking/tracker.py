@@ -22,6 +22,7 @@ _COARSEST = 2  # template level at which the coarse pass begins
 _MARGIN_PX = 8.0  # nearer to the border a template hangs over the edge
 _AXIS_STEPS = (0.08, 0.16, 0.24, 0.32)  # of the median depth: steps along the axis that are tried
 _COARSE_STEP_PX = 7.0  # px of the coarse level: half a template
+_STEEPEST = 0.5  # gradient of a disparity, at most: as steep a surface is hardly seen by both cameras
 _ROUNDS = 3  # rounds of the pose optimisation: outliers are chosen anew after each
 
 
@@ -154,7 +155,9 @@ class Tracker:
         observed = np.empty((len(kept), 3))
         observed[:, :2], observed[:, 2] = uv.take(kept, 0), -1.0
         if not coarse_only:
-            self._add_disparities(images, candidates.rows[chosen], octave, candidates.depth[chosen], observed, config)
+            self._add_disparities(
+                images, candidates.rows[chosen], octave, candidates.depth[chosen], T_c_m, observed, config
+            )
         if shutter is not None:
             at_frame = shutter.to_frame(observed[:, :2], 1.0 / candidates.depth.take(chosen))
             at_frame[:, 2] = np.where(observed[:, 2] >= 0.0, observed[:, 2] * at_frame[:, 2], observed[:, 2])
@@ -191,13 +194,17 @@ class Tracker:
         )  # fmt: skip
 
     def _add_disparities(
-        self, images: FrameImages, rows: I64, octave: U8, depth: F64, observed: F64, config: AgentConfig
+        self, images: FrameImages, rows: I64, octave: U8, depth: F64, T_c_m: F64, observed: F64, config: AgentConfig
     ) -> None:
-        """Fill observed[:, 2] from the right image or the depth image, where it can be measured."""
-        bf, stereo, uv = self._map.camera.bf, config.stereo, np.ascontiguousarray(observed[:, :2])
+        """Fill observed[:, 2] from the right image or the depth image, where it can be measured.
+
+        T_c_m: (4,4) from which surfaces are seen about so.
+        """
+        m, stereo, uv = self._map, config.stereo, np.ascontiguousarray(observed[:, :2])
+        bf = m.camera.bf
         if images.right is not None and stereo.points:
             disparity = bf / depth
-            sure = self._map.sigma_rho.reshape(-1)[rows] * bf < _SURE_PX * (1 << octave)
+            sure = m.sigma_rho.reshape(-1)[rows] * bf < _SURE_PX * (1 << octave)
             if len(uv) > stereo.points:
                 picked = np.linspace(0, len(uv) - 1, stereo.points).astype(np.int64)
                 skipped = np.ones(len(uv), np.bool_)
@@ -205,7 +212,13 @@ class Tracker:
                 disparity[skipped] = -1.0
             self._work.stereo_points += min(len(uv), stereo.points)
             found = np.zeros(len(uv), np.bool_)
-            images.right.refine(images.sampled, images.grid, uv, octave, sure, stereo.search_px, disparity, found)
+            slopes = np.empty((len(uv), 2))
+            projection_kernels.disparity_slopes(
+                T_c_m, m.intrinsics, rows, m.T_m_k, m.bearing, m.rho, m.slant, _STEEPEST, slopes
+            )
+            images.right.refine(
+                images.sampled, images.grid, uv, octave, sure, slopes, stereo.search_px, disparity, found
+            )
             observed[found, 2] = disparity[found]
         elif images.depth_m is not None:
             depth_m = depth_at(images.depth_m, uv)

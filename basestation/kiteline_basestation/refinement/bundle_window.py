@@ -13,8 +13,8 @@ from kiteline_core.arrays import F64, I32
 from kiteline_core.ids import BOOT_BITS, SEQUENCE_BITS, SUBMAP_BITS, AgentId, KeyframeId, submap_of_keyframe
 from kiteline_core.optimisation.bundle import BundleProblem
 
-_SIGMA_GROWTH = 1.4  # factor per octave; less than 2, as alignment is finer than the octave's pixels
-_SIGMA_CALIBRATED_PX = 0.2  # px at octave 0; of a disparity once the agent's disparity offset is known
+_SIGMA_GROWTH = 2.0  # factor per octave: of aligned keypoints and disparities, tails included
+_SIGMA_CALIBRATED_PX = 0.1  # px at octave 0; of a disparity once the agent's disparity offset is known
 _SIGMA_FUSED_PX = 0.6  # px at octave 0; of a new landmark that was fused: two detections of one corner
 _SIGMA_FUSED_GROWTH = 2.0  # factor per octave; corners are detected to a fraction of the octave's pixels
 _MIN_LANDMARKS = 20  # landmarks of a bundle: fewer do not constrain the poses

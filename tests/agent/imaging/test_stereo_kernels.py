@@ -29,6 +29,7 @@ def pair(seed: int, disparity: float, rows: int = 200, columns: int = 320) -> tu
 
 UV = np.array([[float(x), float(y)] for y in range(30, 180, 20) for x in range(90, 300, 15)])
 SURE = np.zeros(len(UV), np.bool_)
+FLAT = np.zeros((len(UV), 2))
 
 
 def test_search_then_refinement_recover_the_disparity() -> None:
@@ -38,7 +39,9 @@ def test_search_then_refinement_recover_the_disparity() -> None:
         found_px, found = np.empty(len(UV)), np.zeros(len(UV), np.bool_)
         stereo_kernels.search_rows(left, right, UV, octave, 80.0, 1.15, found_px)
         assert (found_px >= 0).mean() > 0.9
-        stereo_kernels.refine_rows(left, RECTIFIED, right, RECTIFIED, UV, octave, SURE, 6, 3.0, 0.85, found_px, found)
+        stereo_kernels.refine_rows(
+            left, RECTIFIED, right, RECTIFIED, UV, octave, SURE, FLAT, 6, 3.0, 0.85, found_px, found
+        )
         assert found.mean() > 0.85
         assert abs(np.median(found_px[found]) - disparity) < 0.04
         assert np.percentile(np.abs(found_px[found] - disparity), 90) < 0.15
@@ -79,7 +82,7 @@ def test_unrelated_rows_are_not_refined() -> None:
     guess, found = np.full(len(UV), 10.0), np.zeros(len(UV), np.bool_)
     stereo_kernels.refine_rows(
         build_pyramid(left, LEVELS), RECTIFIED, build_pyramid(right, LEVELS), RECTIFIED, UV,
-        np.zeros(len(UV), np.uint8), SURE, 6, 3.0, 0.85, guess, found,
+        np.zeros(len(UV), np.uint8), SURE, FLAT, 6, 3.0, 0.85, guess, found,
     )  # fmt: skip
     assert found.mean() < 0.05
 
@@ -98,7 +101,7 @@ def test_strips_of_the_raw_image_say_what_the_rectified_one_says() -> None:
         (build_pyramid(raw_right, LEVELS), rectifier.right_grid),
     ):
         guess, found = np.full(len(UV), 12.0), np.zeros(len(UV), np.bool_)
-        stereo_kernels.refine_rows(left, RECTIFIED, right, grid, UV, octave, SURE, 6, 3.0, 0.8, guess, found)
+        stereo_kernels.refine_rows(left, RECTIFIED, right, grid, UV, octave, SURE, FLAT, 6, 3.0, 0.8, guess, found)
         results.append((guess, found))
     (whole, whole_found), (strips, strips_found) = results
     both = whole_found & strips_found
@@ -117,8 +120,52 @@ def test_a_raw_left_image_says_what_the_rectified_one_says() -> None:
     octave, results = np.zeros(len(UV), np.uint8), []
     for left, grid in ((whole, RECTIFIED), (build_pyramid(raw_left, LEVELS), rectifier.left_grid)):
         guess, found = np.full(len(UV), 12.0), np.zeros(len(UV), np.bool_)
-        stereo_kernels.refine_rows(left, grid, right, RECTIFIED, UV, octave, SURE, 6, 3.0, 0.8, guess, found)
+        stereo_kernels.refine_rows(left, grid, right, RECTIFIED, UV, octave, SURE, FLAT, 6, 3.0, 0.8, guess, found)
         results.append((guess, found))
     both = results[0][1] & results[1][1]
     assert results[0][1].sum() > 0.5 * len(UV) and both.sum() > 0.95 * results[0][1].sum()
     assert np.percentile(np.abs(results[0][0][both] - results[1][0][both]), 90) < 0.03
+
+
+def slanted_pair(slope_x: float, slope_y: float, disparity: float) -> tuple[U8, U8]:
+    """Left and right image of a wall whose disparity changes by these slopes from the middle of the left image on."""
+    right = pair(11, 0.0)[0]
+    y, x = np.mgrid[: right.shape[0], : right.shape[1]].astype(np.float32)
+    at = disparity + slope_x * (x - 0.5 * right.shape[1]) + slope_y * (y - 0.5 * right.shape[0])
+    left = cv2.remap(right, x - at.astype(np.float32), y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+    return left, right
+
+
+def test_slopes_of_the_disparity_take_the_error_of_slanted_surfaces_away() -> None:
+    for slope_x, slope_y in ((0.08, 0.0), (0.0, 0.25), (-0.1, -0.15)):
+        left, right = (build_pyramid(i, LEVELS) for i in slanted_pair(slope_x, slope_y, 30.0))
+        true = 30.0 + (UV - [160.0, 100.0]) @ [slope_x, slope_y]
+        octave, errors = np.zeros(len(UV), np.uint8), []
+        for slopes in (FLAT, np.tile([slope_x, slope_y], (len(UV), 1))):
+            guess, found = true.copy(), np.zeros(len(UV), np.bool_)
+            stereo_kernels.refine_rows(
+                left, RECTIFIED, right, RECTIFIED, UV, octave, SURE, slopes, 6, 3.0, 0.8, guess, found
+            )
+            errors.append(np.abs(guess - true)[found])
+        assert len(errors[1]) > 0.85 * len(UV) and len(errors[1]) >= len(errors[0])
+        assert np.percentile(errors[1], 75) < 0.5 * np.percentile(errors[0], 75)
+        assert np.percentile(errors[1], 75) < 0.05
+
+
+def test_a_raw_left_image_is_sampled_along_the_same_slopes() -> None:
+    model = CameraModel(320, 200, 220.0, 221.0, 158.0, 101.0, Lens.RADTAN, (-0.28, 0.07, 1e-4, 2e-5))
+    rig = CameraRig(model, model, np.eye(4), from_rt(np.eye(3), np.array([0.1, 0, 0])))
+    rectifier = Rectifier(rig)
+    assert rectifier.left_grid is not None
+    raw_left, raw_right = slanted_pair(0.06, 0.2, 25.0)
+    whole, right = (build_pyramid(i, LEVELS) for i in (rectifier.left(raw_left), rectifier.right(raw_right)))
+    slopes, results = np.tile([0.06, 0.2], (len(UV), 1)), []
+    for left, grid in ((whole, RECTIFIED), (build_pyramid(raw_left, LEVELS), rectifier.left_grid)):
+        guess, found = np.full(len(UV), 25.0), np.zeros(len(UV), np.bool_)
+        near = np.abs(0.06 * (UV[:, 0] - 160.0) + 0.2 * (UV[:, 1] - 100.0)) < 5.0
+        octave = np.zeros(len(UV), np.uint8)
+        stereo_kernels.refine_rows(left, grid, right, RECTIFIED, UV, octave, SURE, slopes, 6, 6.0, 0.7, guess, found)
+        results.append((guess, found & near))
+    both = results[0][1] & results[1][1]
+    assert both.sum() > 20 and both.sum() > 0.9 * results[0][1].sum()
+    assert np.percentile(np.abs(results[0][0][both] - results[1][0][both]), 90) < 0.04

@@ -1,0 +1,155 @@
+"""Kernels that measure how the surface around a landmark is slanted, from a patch that was aligned.
+
+The warp of a template assumes a surface. If that is slanted otherwise, the patch is sheared against the template along
+the landmark's parallax: by one vector times a linear function of the place in the patch. Its two coefficients are
+solved for together with shift, gain and offset of brightness, linearised once (S. Baker, I. Matthews, "Lucas-Kanade 20
+years on", 2004). As in `alignment_kernels`, sums over patches are sums of integers.
+"""
+
+import numpy as np
+
+from kiteline_agent.imaging.alignment_kernels import (
+    GREY,
+    LANES,
+    PATCH,
+    PATCH_RADIUS,
+    STRIDE,
+    _raw_slopes,
+    dot,
+    sample_patch,
+    template_gradients,
+    warp_template,
+)
+from kiteline_core.jit import njit
+
+_NUISANCES = 4  # constant, template, shift along x and y: eliminated before the shear
+_SHEAR = 4.0  # pixels of a patch's radius by which shear images are shortened to 16 bits
+_UNIT = 256.0  # steps of a direction's components
+_LEAST_GAIN = 0.2  # of brightness; with less there is nothing to compare
+_LEAST_PIVOT = 1e-3  # share of a sum of squares that the others leave; less is no equation of its own
+
+
+@njit
+def _fill_shears(patches, direction_x, direction_y):  # type: ignore[no-untyped-def]
+    """Write the images by which shears along a direction change the template, times column (6) and row (7).
+
+    patches: (10, LANES) int16; 2, 3: twice the gradients of the template; 8, 9: column and row from the centre.
+    """
+    x = np.int32(direction_x * _UNIT)
+    y = np.int32(direction_y * _UNIT)
+    for k in range(LANES):
+        j = np.uint64(k)
+        along = (np.int32(patches[2, j]) * x + np.int32(patches[3, j]) * y + 128) >> 8
+        patches[6, j] = (along * np.int32(patches[8, j]) + 2) >> 2
+        patches[7, j] = (along * np.int32(patches[9, j]) + 2) >> 2
+
+
+@njit
+def _normal_equations(patches, images, sums):  # type: ignore[no-untyped-def]
+    """Sums of products (7,7), upper triangle, of the images of a patch; False if shift and gain are not determined.
+
+    images: (7,) rows of patches: constant, template, its gradients along x and y, shears, and what was seen. The first
+    four are eliminated.
+    """
+    for p in range(7):
+        for q in range(p, 7):
+            sums[p, q] = dot(patches[images[p]], patches[images[q]])
+    for p in range(_NUISANCES):
+        if not sums[p, p] > 1e-6:
+            return False
+        for q in range(p + 1, 7):
+            share = sums[p, q] / sums[p, p]
+            before = sums[q, q]
+            for t in range(q, 7):
+                sums[q, t] -= share * sums[p, t]
+            if q < _NUISANCES and sums[q, q] < _LEAST_PIVOT * before:
+                return False
+    return True
+
+
+@njit
+def measure_slants(  # type: ignore[no-untyped-def]
+    pyramid, grid, templates, rows, octave, warp, parallax, uv, per_px, least_grey, equations
+):
+    """Equations of the error in the slants of landmarks, from where their templates were aligned.
+
+    pyramid, grid, templates, rows, octave, warp: see `alignment_kernels.align`. parallax: (n,2) px here for a change of
+    the inverse depth by its own value. uv: (n,2) px at level 0, aligned. per_px: a bearing for one px in the template's
+    image. A slant is the gradient of the logarithm of inverse depth by the bearing (x/z, y/z) in that image.
+    least_grey: grey levels; deviation of a pixel, at least.
+    equations: (n,5) out: information (xx, xy, yy) on the error of the slant that the warp assumed, and its product with
+    that error (x, y). Zero where nothing was measured.
+    """
+    levels = len(pyramid)
+    height, width = pyramid[0].shape
+    is_raw = grid.shape[0] > 0
+    reference = np.zeros((PATCH + 2, STRIDE), np.int16)
+    raw = np.zeros(LANES + STRIDE, np.uint8)
+    across = np.zeros(LANES + STRIDE, np.int16)
+    patches = np.zeros((10, LANES), np.int16)
+    for r in range(PATCH):
+        for c in range(PATCH):
+            patches[4, r * STRIDE + c] = 1
+            patches[8, r * STRIDE + c] = c - PATCH_RADIUS
+            patches[9, r * STRIDE + c] = r - PATCH_RADIUS
+    images = np.array((4, 1, 2, 3, 6, 7, 0))
+    sums = np.zeros((7, 7))
+    for i in range(rows.shape[0]):
+        for k in range(5):
+            equations[i, k] = 0.0
+        det = warp[i, 0, 0] * warp[i, 1, 1] - warp[i, 0, 1] * warp[i, 1, 0]
+        if det < 0.06 or det > 16.0:
+            continue
+        # 1. The level, and the map from its pixels to those of the template, as in the alignment.
+        cut = min(int(octave[i]), levels - 1)
+        level = min(max(cut + int(np.floor(0.5 * np.log2(det) + 0.5)), 0), levels - 1)
+        s = float(1 << level)
+        ratio = s / float(1 << cut) / det
+        m00, m01 = warp[i, 1, 1] * ratio, -warp[i, 0, 1] * ratio
+        m10, m11 = -warp[i, 1, 0] * ratio, warp[i, 0, 0] * ratio
+        x, y = uv[i, 0] / s, uv[i, 1] / s
+        e0, e1 = parallax[i, 0] / s, parallax[i, 1] / s
+        if is_raw:
+            reach = PATCH_RADIUS * s
+            if min(uv[i, 0], uv[i, 1]) < reach or uv[i, 0] >= width - reach - s or uv[i, 1] >= height - reach - s:
+                continue
+            u, v, ux, vx, uy, vy, off_u, off_v = _raw_slopes(grid, uv[i, 0], uv[i, 1], reach)
+            x, y = (u + off_u) / s, (v + off_v) / s
+            part = 1.0 / (ux * vy - uy * vx)
+            xu, xv, yu, yv = vy * part, -uy * part, -vx * part, ux * part
+            m00, m01, m10, m11 = m00 * xu + m01 * yu, m00 * xv + m01 * yv, m10 * xu + m11 * yu, m10 * xv + m11 * yv
+            e0, e1 = ux * e0 + uy * e1, vx * e0 + vy * e1
+        h, w = pyramid[level].shape
+        if x < PATCH_RADIUS or y < PATCH_RADIUS or x >= w - PATCH_RADIUS - 1 or y >= h - PATCH_RADIUS - 1:
+            continue
+        length = np.sqrt(e0 * e0 + e1 * e1)
+        if length < 1e-3 or not warp_template(templates[rows[i], 0], m00, m01, m10, m11, reference):
+            continue
+        # 2. What was seen, the template, and what shift and shear would change.
+        sample_patch(pyramid[level], x, y, raw, across, patches[0])
+        for k in range(LANES):
+            patches[0, k] *= patches[4, k]
+        template_gradients(reference, patches)
+        _fill_shears(patches, e0 / length, e1 / length)
+        # 3. Gain, and what is left of the residuals after all unknowns.
+        if not _normal_equations(patches, images, sums):
+            continue
+        gain = sums[1, 6] / sums[1, 1]
+        a00, a01, a11, b0, b1 = sums[4, 4], sums[4, 5], sums[5, 5], sums[4, 6], sums[5, 6]
+        part = a00 * a11 - a01 * a01
+        if gain < _LEAST_GAIN or part < 1e-6 * a00 * a11 or part <= 0.0:
+            continue
+        left = sums[6, 6] - (a11 * b0 * b0 - 2.0 * a01 * b0 * b1 + a00 * b1 * b1) / part
+        variance = max(left / (PATCH * PATCH - 6), (least_grey * GREY) ** 2)
+        # 4. From shears of the patch to the slant in the template's image: shear = (j) slant.
+        unit = float(1 << cut) * per_px
+        j00, j01, j10, j11 = m00 * unit, m10 * unit, m01 * unit, m11 * unit
+        size = -0.5 * _SHEAR * gain * length
+        h00, h01, h11 = a00 * size * size, a01 * size * size, a11 * size * size
+        g0, g1 = b0 * size, b1 * size
+        k00, k01, k10, k11 = h00 * j00 + h01 * j10, h00 * j01 + h01 * j11, h01 * j00 + h11 * j10, h01 * j01 + h11 * j11
+        equations[i, 0] = (j00 * k00 + j10 * k10) / variance
+        equations[i, 1] = (j00 * k01 + j10 * k11) / variance
+        equations[i, 2] = (j01 * k01 + j11 * k11) / variance
+        equations[i, 3] = (j00 * g0 + j10 * g1) / variance
+        equations[i, 4] = (j01 * g0 + j11 * g1) / variance
