@@ -1,6 +1,6 @@
 """The bars of real and worn recordings."""
 
-from kiteline_bench.agent import altitude, bent, rigs
+from kiteline_bench.agent import altitude, bent, rigs, slants
 from kiteline_bench.base import real_places
 from kiteline_bench.reality import (
     base,
@@ -31,6 +31,7 @@ PARTS = {
     "people": ("Reality: people who walk through", people.run),
     "bent": ("Reality: right cameras that were bent", bent.run),
     "rigs": ("Reality: rigs of many kinds", rigs.run),
+    "slants": ("Reality: slanted surfaces", slants.run),
     "altitude": ("Reality: high above ground", altitude.run),
     "difficult": ("Reality: difficult images", difficult.run),
     "places": ("Reality: places on real images", real_places.run),

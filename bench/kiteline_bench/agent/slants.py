@@ -1,0 +1,73 @@
+"""What the slants of surfaces are worth: flights with them beside the same flights without."""
+
+import os
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from kiteline_agent.config import AgentConfig, SlantConfig
+from kiteline_bench.harness.bars import Bar, Bench, at_most, table
+from kiteline_bench.harness.recording import Recording, items_of, load
+from kiteline_bench.harness.simulated import NAMES, simulated
+from kiteline_bench.reality.flown import Flown, flown
+from kiteline_hw.sim.source import open_sim
+
+_STREETS = ((51, 0.11), (52, 0.3), (53, 0.11), (54, 0.3))  # seed, baseline in m
+_STREET_SECONDS, _STREET_HZ, _APART_S = 12.0, 10.0, 5.0
+_ROOM_STARTS_S = (0.0, 8.0)  # of room_flight, 10 s each
+_KITTI_STARTS_S = (0.0, 0.6)
+_FRAME, _FRAME_WORST, _ATE, _CPU = 0.85, 1.05, 0.9, 1.06
+_FACING = SlantConfig(points=0)  # all surfaces face the camera
+
+
+def run(bench: Bench) -> list[Bar]:
+    """Error of a frame, ATE and CPU of the agent alone, over those of surfaces that face the camera."""
+    rows: list[tuple[object, ...]] = []
+    frame, ate, cpu = [], [], []
+    for name, recording in _recordings(bench):
+        facing, slanted = (
+            flown(bench, f"{name}, {what}", recording, base=False, config=replace(AgentConfig(), slant=config))
+            for what, config in (("facing", _FACING), ("slanted", SlantConfig()))
+        )
+        frame.append(slanted.rpe_mm("odometry") / facing.rpe_mm("odometry"))
+        ate.append(slanted.ate_m("odometry") / facing.ate_m("odometry"))
+        cpu.append(_cpu_ms(slanted) / _cpu_ms(facing))
+        rows.append((name, facing.rpe_mm("odometry"), slanted.rpe_mm("odometry"), 1000.0 * facing.ate_m("odometry"),
+                     1000.0 * slanted.ate_m("odometry"), cpu[-1]))  # fmt: skip
+    columns = ("flight", "mm a frame, facing", "slanted", "ATE mm, facing", "slanted", "CPU a frame over facing")
+    table(bench, "The agent alone", columns, rows)
+    n = len(rows)
+    return [
+        at_most(f"slants: error of a frame over that without, median of {n}", float(np.median(frame)), _FRAME, "", 2),
+        at_most("slants: error of a frame over that without, worst", float(np.max(frame)), _FRAME_WORST, "", 2),
+        at_most(f"slants: ATE over that without, median of {n}", float(np.median(ate)), _ATE, "", 2),
+        at_most(f"slants: CPU a frame over that without, median of {n}", float(np.median(cpu)), _CPU, "", 2),
+    ]
+
+
+def _cpu_ms(flight: Flown) -> float:
+    """Median CPU time of a frame."""
+    return float(np.median(flight.run.cpu_ns)) * 1e-6
+
+
+def _recordings(bench: Bench) -> Iterator[tuple[str, Recording]]:
+    kitti, room = load(bench.source("kitti_straight")), load(bench.source("room_flight.mcap"))
+    for start_s in bench.chosen(_KITTI_STARTS_S):
+        yield f"kitti_straight from {start_s:g} s", kitti.seconds(start_s, 1e9)
+    for start_s in bench.chosen(_ROOM_STARTS_S):
+        part = room.seconds(start_s, start_s + 10.0)
+        yield from (
+            (f"room_flight from {start_s:g} s", part),
+            (f"room_flight from {start_s:g} s, no IMU", part.without_imu()),
+        )
+    for name in bench.chosen(NAMES):
+        flight = load(simulated(bench, name).recording)
+        yield from ((name, flight), (f"{name}, no IMU", flight.without_imu()))
+    for seed, baseline in bench.chosen(_STREETS):
+        source = open_sim(
+            "street", os.cpu_count() or 1, seed=seed, baseline=baseline, seconds=_STREET_SECONDS, rate=_STREET_HZ,
+            start=_APART_S * (seed - _STREETS[0][0]),
+        )  # fmt: skip
+        items = tuple(replace(item, imu=None) for item in items_of(source))
+        yield f"street {seed}, {baseline:g} m", Recording(source.rig, None, items)
