@@ -9,8 +9,9 @@ import numpy as np
 from kiteline_agent.config import AgentConfig, SlantConfig
 from kiteline_bench.harness.bars import Bar, Bench, at_most, table
 from kiteline_bench.harness.recording import Recording, items_of, load
+from kiteline_bench.harness.result import AgentRun
+from kiteline_bench.harness.run import fly_alone
 from kiteline_bench.harness.simulated import NAMES, simulated
-from kiteline_bench.reality.flown import Flown, flown
 from kiteline_hw.sim.source import open_sim
 
 _STREETS = ((51, 0.11), (52, 0.3), (53, 0.11), (54, 0.3))  # seed, baseline in m
@@ -24,17 +25,18 @@ _FACING = SlantConfig(points=0)  # all surfaces face the camera
 def run(bench: Bench) -> list[Bar]:
     """Error of a frame, ATE and CPU of the agent alone, over those of surfaces that face the camera."""
     rows: list[tuple[object, ...]] = []
-    frame, ate, cpu = [], [], []
+    frame, ate, cpu = list[float](), list[float](), list[float]()
     for name, recording in _recordings(bench):
-        facing, slanted = (
-            flown(bench, f"{name}, {what}", recording, base=False, config=replace(AgentConfig(), slant=config))
-            for what, config in (("facing", _FACING), ("slanted", SlantConfig()))
+        bench.say(f"flying {name}")
+        facing = fly_alone(recording, replace(AgentConfig(), slant=_FACING))
+        slanted = fly_alone(recording)
+        step_mm, ate_mm, cpu_ms = (
+            [what(run) for run in (facing, slanted)]
+            for what in (_step_mm, lambda run: 1000.0 * run.ate_m("o"), _cpu_ms)
         )
-        frame.append(slanted.rpe_mm("odometry") / facing.rpe_mm("odometry"))
-        ate.append(slanted.ate_m("odometry") / facing.ate_m("odometry"))
-        cpu.append(_cpu_ms(slanted) / _cpu_ms(facing))
-        rows.append((name, facing.rpe_mm("odometry"), slanted.rpe_mm("odometry"), 1000.0 * facing.ate_m("odometry"),
-                     1000.0 * slanted.ate_m("odometry"), cpu[-1]))  # fmt: skip
+        for ratios, (before, after) in zip((frame, ate, cpu), (step_mm, ate_mm, cpu_ms), strict=True):
+            ratios.append(after / before)
+        rows.append((name, *step_mm, *ate_mm, cpu[-1]))
     columns = ("flight", "mm a frame, facing", "slanted", "ATE mm, facing", "slanted", "CPU a frame over facing")
     table(bench, "The agent alone", columns, rows)
     n = len(rows)
@@ -46,9 +48,15 @@ def run(bench: Bench) -> list[Bar]:
     ]
 
 
-def _cpu_ms(flight: Flown) -> float:
+def _step_mm(run: AgentRun) -> float:
+    """Relative error of a frame, rms."""
+    found = run.evaluate(run.tracked, frame="o")
+    return float("inf") if found is None or found.rpe_frame is None else 1000.0 * found.rpe_frame.translation_m.rmse
+
+
+def _cpu_ms(run: AgentRun) -> float:
     """Median CPU time of a frame."""
-    return float(np.median(flight.run.cpu_ns)) * 1e-6
+    return float(np.median(run.cpu_ns)) * 1e-6
 
 
 def _recordings(bench: Bench) -> Iterator[tuple[str, Recording]]:
