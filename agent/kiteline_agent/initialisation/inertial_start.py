@@ -262,7 +262,7 @@ class InertialStart:
         if sigma < _NEARLY * _SCALE_SIGMA:
             self._work.alignments += int(np.count_nonzero(observations.seen))
             aligned = realigned(
-                keyframes, observations, solution.state, found.xyz, found.first, self._camera, self._config
+                keyframes, observations, solution.state, found.xyz, found.first, self._camera, self._config.align
             )
             all_corners = corner_tracks.with_found(all_corners, columns, aligned)
             yield

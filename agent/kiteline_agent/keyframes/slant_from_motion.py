@@ -8,12 +8,17 @@ import numpy as np
 
 from kiteline_agent.config import SlantConfig
 from kiteline_agent.governor.cost_model import Work
-from kiteline_agent.imaging import slants
+from kiteline_agent.imaging.alignment_kernels import PATCH_RADIUS
 from kiteline_agent.imaging.slant_kernels import measure_slants
 from kiteline_agent.local_map import projection_kernels
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_agent.tracking.track import Track
+from kiteline_core.arrays import F64, I64
+
+_LEAST_GREY = 2.0  # grey levels; deviation of a pixel: noise, and what interpolation costs
+_INFLATION = 4.0  # factor on variances: pixels of a patch share errors of the lens, of blur and of interpolation
+_MOST_CHANGE = 0.5  # of the inverse depth, from the middle of a patch to its edge: steeper surfaces are edges
 
 
 class SlantFromMotion:
@@ -40,11 +45,21 @@ class SlantFromMotion:
         )  # fmt: skip
         measure_slants(
             images.sampled, images.grid, m.templates, rows, m.octave.take(rows), warp, parallax,
-            np.ascontiguousarray(uv), 1.0 / m.camera.fx, slants.LEAST_GREY, equations,
+            np.ascontiguousarray(uv), 1.0 / m.camera.fx, _LEAST_GREY, equations,
         )  # fmt: skip
         self._work.slants += len(rows)
-        # Frames share the errors of the template: what earlier ones told counts less.
-        slant, known = m.slant.reshape(-1, 2), m.slant_equations.reshape(-1, 5)
-        told = slants.about_zero(equations, slant.take(rows, 0))
-        known[rows] = total = self._config.memory * known.take(rows, 0) + told
-        slant[rows] = slants.most_probable(total, self._config.sigma, m.octave.take(rows), m.camera.fx)
+        self._fuse(rows, equations / _INFLATION)
+
+    def _fuse(self, rows: I64, equations: F64) -> None:
+        """Take over measurements (n,5) of rows (n,), see `measure_slants`: the most probable slants after them."""
+        slant, known = self._map.slant.reshape(-1, 2), self._map.slant_equations.reshape(-1, 5)
+        xx, xy, yy, bx, by = equations.T
+        sx, sy = slant.take(rows, 0).T
+        about_zero = np.column_stack([xx, xy, yy, bx + xx * sx + xy * sy, by + xy * sx + yy * sy])
+        known[rows] = total = self._config.memory * known.take(rows, 0) + about_zero
+        xx, xy, yy, bx, by = total.T
+        xx, yy = xx + self._config.sigma**-2, yy + self._config.sigma**-2
+        found = np.column_stack([yy * bx - xy * by, xx * by - xy * bx]) / (xx * yy - xy**2)[:, None]
+        patch = PATCH_RADIUS * (1 << self._map.octave.take(rows)) / self._map.camera.fx
+        most = _MOST_CHANGE / patch[:, None]
+        slant[rows] = np.clip(found, -most, most)
