@@ -16,9 +16,11 @@ from kiteline_hw.sim.source import open_sim
 
 _STREETS = ((51, 0.11), (52, 0.3), (53, 0.11), (54, 0.3))  # seed, baseline in m
 _STREET_SECONDS, _STREET_HZ, _APART_S = 12.0, 10.0, 5.0
-_ROOM_STARTS_S = (0.0, 8.0)  # of room_flight, 10 s each
+_SECONDS = 10.0
+_STARTS_S = (0.0, 10.0, 20.0)  # of such parts of simulated flights
+_ROOM_STARTS_S = (0.0, 8.0)  # of room_flight
 _KITTI_STARTS_S = (0.0, 0.6)
-_FRAME, _FRAME_WORST, _ATE, _CPU = 0.85, 1.05, 0.9, 1.06
+_FRAME, _FRAME_WORST, _ATE, _CPU = 0.95, 1.15, 0.95, 1.06
 _FACING = SlantConfig(points=0)  # all surfaces face the camera
 
 
@@ -63,15 +65,12 @@ def _recordings(bench: Bench) -> Iterator[tuple[str, Recording]]:
     kitti, room = load(bench.source("kitti_straight")), load(bench.source("room_flight.mcap"))
     for start_s in bench.chosen(_KITTI_STARTS_S):
         yield f"kitti_straight from {start_s:g} s", kitti.seconds(start_s, 1e9)
-    for start_s in bench.chosen(_ROOM_STARTS_S):
-        part = room.seconds(start_s, start_s + 10.0)
-        yield from (
-            (f"room_flight from {start_s:g} s", part),
-            (f"room_flight from {start_s:g} s, no IMU", part.without_imu()),
-        )
-    for name in bench.chosen(NAMES):
-        flight = load(simulated(bench, name).recording)
-        yield from ((name, flight), (f"{name}, no IMU", flight.without_imu()))
+    flights = [("room_flight", room, bench.chosen(_ROOM_STARTS_S))]
+    flights += [(name, load(simulated(bench, name).recording), bench.chosen(_STARTS_S)) for name in NAMES]
+    for name, flight, starts_s in flights:
+        for start_s in starts_s:
+            part, what = flight.seconds(start_s, start_s + _SECONDS), f"{name} from {start_s:g} s"
+            yield from ((what, part), (f"{what}, no IMU", part.without_imu()))
     for seed, baseline in bench.chosen(_STREETS):
         source = open_sim(
             "street", os.cpu_count() or 1, seed=seed, baseline=baseline, seconds=_STREET_SECONDS, rate=_STREET_HZ,
