@@ -114,7 +114,7 @@ def fly(
         seen = (local[:, 2] > 0.3) & (uv > 8).all(1) & (uv < [744, 472]).all(1) & (rng.random(points) > missed)
         rows = rng.permutation(np.flatnonzero(seen))[:300]
         octave = np.clip(np.rint(size[rows] + np.log2(3.0 / z[rows])), 0, 2).astype(np.uint8)
-        # As aligned keypoints err in rendered flights: twice as much an octave, and along the row of a pair less.
+        # As in rendered flights: errors double with each octave, and disparities err by 0.4 of what pixels do.
         px = 2.0 ** octave[:, None] * rng.normal(0, noise_px, (len(rows), 3)) * [1.0, 1.0, 0.4]
         wild = rng.random(len(rows)) < outliers
         px[wild] += rng.choice([-12.0, 12.0], (int(wild.sum()), 3))

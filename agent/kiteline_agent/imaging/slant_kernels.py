@@ -23,10 +23,10 @@ from kiteline_agent.imaging.alignment_kernels import (
 from kiteline_core.jit import njit
 
 _NUISANCES = 4  # constant, template, shift along x and y: eliminated before the shear
-_SHEAR = 4.0  # pixels of a patch's radius by which shear images are shortened to 16 bits
-_UNIT = 256.0  # steps of a direction's components
+_DIRECTION_BITS = 8  # of a direction's components
+_SHORTER_BITS = 2  # by which shear images are shortened: sums of their squares fit into 31 bits
 _LEAST_GAIN = 0.2  # of brightness; with less there is nothing to compare
-_LEAST_PIVOT = 1e-3  # share of a sum of squares that the others leave; less is no equation of its own
+_LEAST_PIVOT = 1e-3  # share of a contrast that template and gradients leave of one another; less is no equation
 
 
 @njit
@@ -35,13 +35,14 @@ def _fill_shears(patches, direction_x, direction_y):  # type: ignore[no-untyped-
 
     patches: (10, LANES) int16; 2, 3: twice the gradients of the template; 8, 9: column and row from the centre.
     """
-    x = np.int32(direction_x * _UNIT)
-    y = np.int32(direction_y * _UNIT)
+    x = np.int32(direction_x * (1 << _DIRECTION_BITS))
+    y = np.int32(direction_y * (1 << _DIRECTION_BITS))
     for k in range(LANES):
         j = np.uint64(k)
-        along = (np.int32(patches[2, j]) * x + np.int32(patches[3, j]) * y + 128) >> 8
-        patches[6, j] = (along * np.int32(patches[8, j]) + 2) >> 2
-        patches[7, j] = (along * np.int32(patches[9, j]) + 2) >> 2
+        along = np.int32(patches[2, j]) * x + np.int32(patches[3, j]) * y
+        along = (along + (1 << (_DIRECTION_BITS - 1))) >> _DIRECTION_BITS
+        patches[6, j] = (along * np.int32(patches[8, j]) + (1 << (_SHORTER_BITS - 1))) >> _SHORTER_BITS
+        patches[7, j] = (along * np.int32(patches[9, j]) + (1 << (_SHORTER_BITS - 1))) >> _SHORTER_BITS
 
 
 @njit
@@ -62,20 +63,20 @@ def _normal_equations(patches, images, sums):  # type: ignore[no-untyped-def]
             before = sums[q, q]
             for t in range(q, 7):
                 sums[q, t] -= share * sums[p, t]
-            if q < _NUISANCES and sums[q, q] < _LEAST_PIVOT * before:
+            if p > 0 and q < _NUISANCES and sums[q, q] < _LEAST_PIVOT * before:
                 return False
     return True
 
 
 @njit
 def measure_slants(  # type: ignore[no-untyped-def]
-    pyramid, grid, templates, rows, octave, warp, parallax, uv, per_px, least_grey, equations
+    pyramid, grid, templates, rows, octave, warp, parallax, uv, focal_x, focal_y, least_grey, equations
 ):
     """Equations of the error in the slants of landmarks, from where their templates were aligned.
 
-    pyramid, grid, templates, rows, octave, warp: see `alignment_kernels.align`. parallax: (n,2) px here for a change of
-    the inverse depth by its own value. uv: (n,2) px at level 0, aligned. per_px: a bearing for one px in the template's
-    image. A slant is the gradient of the logarithm of inverse depth by the bearing (x/z, y/z) in that image.
+    pyramid, grid, templates, rows, octave, warp: see `alignment_kernels.align`. parallax: (n,2) px, derivative
+    of the pixel here by the logarithm of inverse depth. uv: (n,2) px at level 0, aligned. focal_x, focal_y: px, of the
+    template's image. A slant is the gradient of the logarithm of inverse depth by the bearing (x/z, y/z) in that image.
     least_grey: grey levels; deviation of a pixel, at least.
     equations: (n,5) out: information (xx, xy, yy) on the error of the slant that the warp assumed, and its product with
     that error (x, y). Zero where nothing was measured.
@@ -98,7 +99,7 @@ def measure_slants(  # type: ignore[no-untyped-def]
         for k in range(5):
             equations[i, k] = 0.0
         det = warp[i, 0, 0] * warp[i, 1, 1] - warp[i, 0, 1] * warp[i, 1, 0]
-        if det < 0.06 or det > 16.0:
+        if not (det >= 0.06 and det <= 16.0):  # nor if it is not a number
             continue
         # 1. The level, and the map from its pixels to those of the template, as in the alignment.
         cut = min(int(octave[i]), levels - 1)
@@ -123,7 +124,7 @@ def measure_slants(  # type: ignore[no-untyped-def]
         if x < PATCH_RADIUS or y < PATCH_RADIUS or x >= w - PATCH_RADIUS - 1 or y >= h - PATCH_RADIUS - 1:
             continue
         length = np.sqrt(e0 * e0 + e1 * e1)
-        if length < 1e-3 or not warp_template(templates[rows[i], 0], m00, m01, m10, m11, reference):
+        if not length >= 1e-3 or not warp_template(templates[rows[i], 0], m00, m01, m10, m11, reference):
             continue
         # 2. What was seen, the template, and what shift and shear would change.
         sample_patch(pyramid[level], x, y, raw, across, patches[0])
@@ -142,9 +143,9 @@ def measure_slants(  # type: ignore[no-untyped-def]
         left = sums[6, 6] - (a11 * b0 * b0 - 2.0 * a01 * b0 * b1 + a00 * b1 * b1) / part
         variance = max(left / (PATCH * PATCH - 6), (least_grey * GREY) ** 2)
         # 4. From shears of the patch to the slant in the template's image: shear = (j) slant.
-        unit = float(1 << cut) * per_px
-        j00, j01, j10, j11 = m00 * unit, m10 * unit, m01 * unit, m11 * unit
-        size = -0.5 * _SHEAR * gain * length
+        unit_x, unit_y = float(1 << cut) / focal_x, float(1 << cut) / focal_y
+        j00, j01, j10, j11 = m00 * unit_x, m10 * unit_y, m01 * unit_x, m11 * unit_y
+        size = -0.5 * (1 << _SHORTER_BITS) * gain * length
         h00, h01, h11 = a00 * size * size, a01 * size * size, a11 * size * size
         g0, g1 = b0 * size, b1 * size
         k00, k01, k10, k11 = h00 * j00 + h01 * j10, h00 * j01 + h01 * j11, h01 * j00 + h11 * j10, h01 * j01 + h11 * j11

@@ -121,11 +121,8 @@ def _sample_columns(image, left, top, columns, out):  # type: ignore[no-untyped-
 
 @njit
 def _sample_slanted(image, left, top, stretch, shear, out):  # type: ignore[no-untyped-def]
-    """Fill out[: SIDE + 2, :SIDE] with the image from (left, top) on, as `_rectify_patch` does. False outside of it."""
+    """Fill out[: SIDE + 2, :SIDE] with the image from (left, top) on, as `_rectify_patch` does; all inside of it."""
     first = left - shear * RADIUS
-    last = left + shear * RADIUS
-    if min(first, last) < 0.0 or max(first, last) + (SIDE + 1) * stretch >= image.shape[1] - 1.0:
-        return False
     y0 = int(top)
     fy = np.int32((top - y0) * 128.0 + 0.5)
     for r in range(SIDE):
@@ -142,7 +139,6 @@ def _sample_slanted(image, left, top, stretch, shear, out):  # type: ignore[no-u
             below = (b << 7) + fx * (np.int32(lower[x0 + 1]) - b)
             out[np.uint64(k), to] = ((above << 7) + fy * (below - above) + 512) >> 10
             x += stretch
-    return True
 
 
 @njit
@@ -243,14 +239,15 @@ def refine_rows(  # type: ignore[no-untyped-def]
             x = uv[i, 0] / s
             y = uv[i, 1] / s
             ok = False
-            if x < RADIUS + 1 or y < RADIUS or x >= w - RADIUS - 2 or y >= h - RADIUS - 1:
+            stretch = 1.0 / (1.0 - slopes[i, 0])
+            shear = slopes[i, 1] * stretch
+            reach_x = (RADIUS + 1) * stretch
+            edge = reach_x + RADIUS * abs(shear)
+            if x < edge or y < RADIUS or x >= w - edge - 1 or y >= h - RADIUS - 1:
                 continue
             begin = x - d / s
             if begin < RADIUS or begin >= w - RADIUS - 1:
                 continue
-            stretch = 1.0 / (1.0 - slopes[i, 0])
-            shear = slopes[i, 1] * stretch
-            reach_x = (RADIUS + 1) * stretch
             if raw_left:
                 if not _rectify_patch(
                     left[level], left_grid, s, x - reach_x, y - RADIUS, SIDE, SIDE + 2, 10, wide, stretch, shear
@@ -258,8 +255,8 @@ def refine_rows(  # type: ignore[no-untyped-def]
                     continue
             elif slopes[i, 0] == 0.0 and slopes[i, 1] == 0.0:
                 _sample_columns(left[level], x - RADIUS - 1, y - RADIUS, SIDE + 2, wide)
-            elif not _sample_slanted(left[level], x - reach_x, y - RADIUS, stretch, shear, wide):
-                continue
+            else:
+                _sample_slanted(left[level], x - reach_x, y - RADIUS, stretch, shear, wide)
             _put_template(wide, patches)
             first = max(int(begin) - RADIUS - reach, 0)
             columns = min(int(begin) + RADIUS + reach + 2, w - 1) - first

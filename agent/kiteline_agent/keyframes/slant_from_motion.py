@@ -18,6 +18,7 @@ from kiteline_core.arrays import F64, I64
 
 _LEAST_GREY = 2.0  # grey levels; deviation of a pixel: noise, and what interpolation costs
 _INFLATION = 4.0  # factor on variances: pixels of a patch share errors of the lens, of blur and of interpolation
+_TINY = 1e-12  # of information: nothing
 _MOST_CHANGE = 0.5  # of the inverse depth, from the middle of a patch to its edge: steeper surfaces are edges
 
 
@@ -45,21 +46,28 @@ class SlantFromMotion:
         )  # fmt: skip
         measure_slants(
             images.sampled, images.grid, m.templates, rows, m.octave.take(rows), warp, parallax,
-            np.ascontiguousarray(uv), 1.0 / m.camera.fx, _LEAST_GREY, equations,
+            np.ascontiguousarray(uv), m.camera.fx, m.camera.fy, _LEAST_GREY, equations,
         )  # fmt: skip
         self._work.slants += len(rows)
         self._fuse(rows, equations / _INFLATION)
 
     def _fuse(self, rows: I64, equations: F64) -> None:
         """Take over measurements (n,5) of rows (n,), see `measure_slants`: the most probable slants after them."""
-        slant, known = self._map.slant.reshape(-1, 2), self._map.slant_equations.reshape(-1, 5)
+        m, sigma = self._map, self._config.sigma
+        slant, known = m.slant.reshape(-1, 2), m.slant_equations.reshape(-1, 5)
+        # 1. What is told of the slant itself, not of its error.
         xx, xy, yy, bx, by = equations.T
         sx, sy = slant.take(rows, 0).T
-        about_zero = np.column_stack([xx, xy, yy, bx + xx * sx + xy * sy, by + xy * sx + yy * sy])
-        known[rows] = total = self._config.memory * known.take(rows, 0) + about_zero
+        told = np.column_stack([xx, xy, yy, bx + xx * sx + xy * sy, by + xy * sx + yy * sy])
+        # 2. No more is forgotten than is told: where a vehicle hovers nothing is, and its disparities need the slants.
+        before = known.take(rows, 0)
+        share = (xx + yy) / np.maximum(before[:, 0] + before[:, 2], xx + yy + _TINY)
+        forgotten = np.minimum(max(1.0 - self._config.memory, 0.0), share)
+        known[rows] = total = (1.0 - forgotten)[:, None] * before + told
+        # 3. The most probable slant, no steeper than an edge.
         xx, xy, yy, bx, by = total.T
-        xx, yy = xx + self._config.sigma**-2, yy + self._config.sigma**-2
+        xx, yy = xx + sigma**-2, yy + sigma**-2
         found = np.column_stack([yy * bx - xy * by, xx * by - xy * bx]) / (xx * yy - xy**2)[:, None]
-        patch = PATCH_RADIUS * (1 << self._map.octave.take(rows)) / self._map.camera.fx
-        most = _MOST_CHANGE / patch[:, None]
-        slant[rows] = np.clip(found, -most, most)
+        patch = PATCH_RADIUS * np.ldexp(1.0, m.octave.take(rows).astype(np.int32)) / m.camera.fx
+        steepest = _MOST_CHANGE / patch[:, None]
+        slant[rows] = np.clip(found, -steepest, steepest)

@@ -4,6 +4,22 @@ import numpy as np
 
 from kiteline_core.jit import helper, njit
 
+_IN_FRONT = 0.1  # distance to a plane over that from the keyframe, above which its disparities are told
+
+
+@helper
+def _relative(T_c_m, T_m_k, r, t):  # type: ignore[no-untyped-def]
+    """Write rotation r (3,3) and translation t (3,) from a keyframe at T_m_k (4,4) to a camera at T_c_m (4,4)."""
+    for a in range(3):
+        t[a] = T_c_m[a, 3]
+        for m in range(3):
+            t[a] += T_c_m[a, m] * T_m_k[m, 3]
+        for b in range(3):
+            v = 0.0
+            for m in range(3):
+                v += T_c_m[a, m] * T_m_k[m, b]
+            r[a, b] = v
+
 
 @njit
 def project(  # type: ignore[no-untyped-def]
@@ -41,20 +57,10 @@ def project(  # type: ignore[no-untyped-def]
     slot_size = usable.shape[1]
     n = 0
     step = 4.0
+    r, t = np.empty((3, 3)), np.empty(3)
     for s in range(slots.shape[0]):
         k = slots[s]
-        # rotation and translation keyframe -> camera
-        r = np.empty((3, 3))
-        t = np.empty(3)
-        for a in range(3):
-            t[a] = T_c_m[a, 3]
-            for m in range(3):
-                t[a] += T_c_m[a, m] * T_m_k[k, m, 3]
-            for b in range(3):
-                v = 0.0
-                for m in range(3):
-                    v += T_c_m[a, m] * T_m_k[k, m, b]
-                r[a, b] = v
+        _relative(T_c_m, T_m_k[k], r, t)
         for j in range(counts[k]):
             i = order[k, j]
             if not usable[k, i]:
@@ -80,7 +86,7 @@ def project(  # type: ignore[no-untyped-def]
             a01 = (fx * x2 / z2 + cx - u) / step
             a11 = (fy * y2 / z2 + cy - v) / step
             det = a00 * a11 - a01 * a10
-            if det < 1.0 / (max_scale * max_scale) or det > max_scale * max_scale:
+            if not (det >= 1.0 / (max_scale * max_scale) and det <= max_scale * max_scale):  # nor if it is no number
                 continue
             out_row[n] = k * slot_size + i
             out_uv[n, 0] = u
@@ -100,26 +106,12 @@ def project(  # type: ignore[no-untyped-def]
     return n
 
 
-@helper
-def _relative(T_c_m, T_m_k, r, t):  # type: ignore[no-untyped-def]
-    """Write rotation r (3,3) and translation t (3,) from a keyframe at T_m_k (4,4) to a camera at T_c_m (4,4)."""
-    for a in range(3):
-        t[a] = T_c_m[a, 3]
-        for m in range(3):
-            t[a] += T_c_m[a, m] * T_m_k[m, 3]
-        for b in range(3):
-            v = 0.0
-            for m in range(3):
-                v += T_c_m[a, m] * T_m_k[m, b]
-            r[a, b] = v
-
-
 @njit
 def views(T_c_m, camera, rows, T_m_k, bearing, rho, slant, warp, parallax):  # type: ignore[no-untyped-def]
     """How a camera sees the surfaces around landmarks, for the arguments see `project`.
 
-    rows: (n,) slot*B+index. warp: (n,2,2) d(px here)/d(px in the keyframe), out. parallax: (n,2) px here for a change
-    of the inverse depth by its own value, out.
+    rows: (n,) slot*B+index. warp: (n,2,2) d(px here)/d(px in the keyframe), out. parallax: (n,2) px, derivative of the
+    pixel here by the logarithm of inverse depth, out.
     """
     fx, fy = camera[0], camera[1]
     slot_size = rho.shape[1]
@@ -145,7 +137,7 @@ def disparity_slopes(T_c_m, camera, rows, T_m_k, bearing, rho, slant, limit, slo
     """Gradients (n,2) of the disparity by the pixel around landmarks in a camera, out; at most `limit`.
 
     For the arguments see `views`. The plane n X = 1 in the keyframe, whose inverse depths are n (x/z, y/z, 1), is
-    n R^T X = 1 + n R^T t in the camera.
+    n R^T X = 1 + n R^T t in the camera. Zero where the camera is nearly in such a plane, or behind it.
     """
     slot_size = rho.shape[1]
     r, t = np.empty((3, 3)), np.empty(3)
@@ -157,9 +149,11 @@ def disparity_slopes(T_c_m, camera, rows, T_m_k, bearing, rho, slant, limit, slo
         c0 = r[0, 0] * n0 + r[0, 1] * n1 + r[0, 2] * n2
         c1 = r[1, 0] * n0 + r[1, 1] * n1 + r[1, 2] * n2
         c2 = r[2, 0] * n0 + r[2, 1] * n1 + r[2, 2] * n2
-        away = max(1.0 + c0 * t[0] + c1 * t[1] + c2 * t[2], 1e-3)
-        slopes[j, 0] = min(max(camera[4] * c0 / (away * camera[0]), -limit), limit)
-        slopes[j, 1] = min(max(camera[4] * c1 / (away * camera[1]), -limit), limit)
+        away = 1.0 + c0 * t[0] + c1 * t[1] + c2 * t[2]
+        slopes[j, 0] = slopes[j, 1] = 0.0
+        if away > _IN_FRONT:
+            slopes[j, 0] = min(max(camera[4] * c0 / (away * camera[0]), -limit), limit)
+            slopes[j, 1] = min(max(camera[4] * c1 / (away * camera[1]), -limit), limit)
 
 
 @njit

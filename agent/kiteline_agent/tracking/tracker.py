@@ -198,7 +198,7 @@ class Tracker:
     ) -> None:
         """Fill observed[:, 2] from the right image or the depth image, where it can be measured.
 
-        T_c_m: (4,4) from which surfaces are seen about so.
+        T_c_m: (4,4) predicted pose of the frame: how disparities change over slanted surfaces.
         """
         m, stereo, uv = self._map, config.stereo, np.ascontiguousarray(observed[:, :2])
         bf = m.camera.bf
@@ -212,10 +212,11 @@ class Tracker:
                 disparity[skipped] = -1.0
             self._work.stereo_points += min(len(uv), stereo.points)
             found = np.zeros(len(uv), np.bool_)
-            slopes = np.empty((len(uv), 2))
-            projection_kernels.disparity_slopes(
-                T_c_m, m.intrinsics, rows, m.T_m_k, m.bearing, m.rho, m.slant, _STEEPEST, slopes
-            )
+            slopes = np.zeros((len(uv), 2))
+            if config.slant.points:
+                projection_kernels.disparity_slopes(
+                    T_c_m, m.intrinsics, rows, m.T_m_k, m.bearing, m.rho, m.slant, _STEEPEST, slopes
+                )
             images.right.refine(
                 images.sampled, images.grid, uv, octave, sure, slopes, stereo.search_px, disparity, found
             )

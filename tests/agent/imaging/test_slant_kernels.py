@@ -75,7 +75,7 @@ class Views:
         warp, parallax = self.seen_with(slant)
         out = np.empty((self.n, 5))
         slant_kernels.measure_slants(
-            self.second, RECTIFIED, self.templates, np.arange(self.n), self.octave, warp, parallax, uv, 1.0 / F, 1.0,
+            self.second, RECTIFIED, self.templates, np.arange(self.n), self.octave, warp, parallax, uv, F, F, 1.0,
             out,
         )  # fmt: skip
         return out
@@ -155,7 +155,7 @@ def test_nothing_is_measured_without_parallax_or_texture_or_at_the_border() -> N
     views.templates[2] = 90
     out = np.empty((views.n, 5))
     slant_kernels.measure_slants(
-        views.second, RECTIFIED, views.templates, np.arange(views.n), views.octave, warp, parallax, uv, 1.0 / F, 1.0,
+        views.second, RECTIFIED, views.templates, np.arange(views.n), views.octave, warp, parallax, uv, F, F, 1.0,
         out,
     )  # fmt: skip
     assert (out[:3] == 0.0).all() and (out[3:, 0] > 0.0).mean() > 0.9
@@ -178,7 +178,7 @@ def test_a_raw_image_says_what_the_rectified_one_says() -> None:
     rectified = views.equations(zero, uv)
     out = np.empty((views.n, 5))
     slant_kernels.measure_slants(
-        raw, rectifier.left_grid, views.templates, np.arange(views.n), views.octave, warp, parallax, uv, 1.0 / F, 1.0,
+        raw, rectifier.left_grid, views.templates, np.arange(views.n), views.octave, warp, parallax, uv, F, F, 1.0,
         out,
     )  # fmt: skip
     both = found & (rectified[:, 0] > 4.0) & (out[:, 0] > 4.0)

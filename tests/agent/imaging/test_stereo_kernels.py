@@ -169,3 +169,15 @@ def test_a_raw_left_image_is_sampled_along_the_same_slopes() -> None:
     both = results[0][1] & results[1][1]
     assert both.sum() > 20 and both.sum() > 0.9 * results[0][1].sum()
     assert np.percentile(np.abs(results[0][0][both] - results[1][0][both]), 90) < 0.04
+
+
+def test_slanted_patches_that_reach_over_the_border_are_not_measured() -> None:
+    model = CameraModel(320, 200, 220.0, 221.0, 158.0, 101.0, Lens.RADTAN, (-0.28, 0.07, 1e-4, 2e-5))
+    rectifier = Rectifier(CameraRig(model, model, np.eye(4), from_rt(np.eye(3), np.array([0.1, 0, 0]))))
+    image = build_pyramid(pair(12, 0.0)[0], LEVELS)
+    uv = np.array([[x, 100.0] for x in (6.0, 8.0, 314.0, 312.0, 160.0)])
+    steep, sure, octave = np.tile([0.5, 0.2], (5, 1)), np.ones(5, np.bool_), np.zeros(5, np.uint8)
+    for grid in (RECTIFIED, rectifier.left_grid):
+        guess, found = np.full(5, 0.5), np.zeros(5, np.bool_)
+        stereo_kernels.refine_rows(image, grid, image, RECTIFIED, uv, octave, sure, steep, 6, 3.0, -1.0, guess, found)
+        assert not found[:4].any()

@@ -1,0 +1,91 @@
+"""What the map knows of slants: they converge, last while nothing is told, are bounded, and go with their keyframe."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from kiteline_agent.config import LocalMapConfig, SlantConfig
+from kiteline_agent.governor.cost_model import Work
+from kiteline_agent.imaging.alignment_kernels import TEMPLATE, TEMPLATE_LEVELS
+from kiteline_agent.keyframes.slant_from_motion import SlantFromMotion
+from kiteline_agent.local_map.keyframe_landmarks import KeyframeLandmarks
+from kiteline_agent.local_map.local_map import LocalMap
+from kiteline_codec.schema import KeyframeHeader
+from kiteline_core.arrays import F64
+from kiteline_core.geometry.cameras import RectifiedCamera
+from kiteline_core.ids import NO_KEYFRAME, keyframe_id, submap_id
+
+CAMERA = RectifiedCamera(752, 480, 420.0, 420.0, 376.0, 240.0, 0.11, True, np.eye(4))
+LANDMARKS, ROWS = 6, np.arange(6)
+TRUE = np.array([1.5, -0.5])
+
+
+def add_keyframe(local_map: LocalMap, sequence: int) -> None:
+    octave = np.array([0, 0, 0, 1, 1, 2], np.uint8)
+    keyframe = keyframe_id(submap_id(0, 1, 0), sequence)
+    landmarks = KeyframeLandmarks(
+        np.full((LANDMARKS, 2), 200.0), np.full(LANDMARKS, 0.2), np.full(LANDMARKS, 0.01), octave,
+        np.zeros(LANDMARKS, np.uint8), np.zeros((LANDMARKS, 32), np.uint8),
+        np.zeros((LANDMARKS, TEMPLATE_LEVELS, TEMPLATE, TEMPLATE), np.uint8),
+    )  # fmt: skip
+    local_map.add(KeyframeHeader(keyframe, sequence, NO_KEYFRAME, np.eye(4), 0), np.eye(4), landmarks, sequence)
+
+
+class Told:
+    """A map with one keyframe, and frames that tell equations of its slants' errors."""
+
+    def __init__(self, config: SlantConfig) -> None:
+        self.map = LocalMap(CAMERA, replace(LocalMapConfig(), keyframes=1, landmarks=LANDMARKS))
+        add_keyframe(self.map, 0)
+        self._slants = SlantFromMotion(self.map, config, Work())
+
+    def frames(self, count: int, information: float, true: F64 = TRUE) -> F64:
+        """Slants (6,2) after so many frames, each with this information along both axes."""
+        for _ in range(count):
+            error = true - self.map.slant[0]
+            level = np.full(LANDMARKS, information)
+            self._slants._fuse(ROWS, np.column_stack([level, 0.0 * level, level, information * error]))
+        return self.map.slant[0].copy()
+
+
+def test_slants_converge_to_what_frames_tell() -> None:
+    told = Told(SlantConfig())
+    first = told.frames(1, 4.0)
+    np.testing.assert_allclose(first, np.tile(0.8 * TRUE, (LANDMARKS, 1)))  # 4 of 5 parts, with a prior of 1
+    np.testing.assert_allclose(told.frames(40, 4.0), np.tile(TRUE, (LANDMARKS, 1)), rtol=0.03)
+
+
+def test_frames_count_as_many_as_memory_says() -> None:
+    told = Told(SlantConfig(memory=0.9))
+    told.frames(200, 4.0)
+    np.testing.assert_allclose(told.map.slant_equations[0, :, 0], 40.0, rtol=1e-3)
+    other = -TRUE
+    after = told.frames(7, 4.0, other)  # 0.9 to the seventh is a half
+    assert (np.abs(after) < 0.2 * np.abs(TRUE)).all()
+
+
+def test_nothing_is_forgotten_where_nothing_is_told() -> None:
+    told = Told(SlantConfig())
+    before = told.frames(30, 4.0)
+    np.testing.assert_array_equal(told.frames(500, 0.0), before)
+    np.testing.assert_allclose(told.frames(500, 0.01), before, rtol=0.02)
+
+
+def test_a_memory_beyond_one_keeps_everything_and_no_more() -> None:
+    told = Told(SlantConfig(memory=1.2))
+    assert np.isfinite(told.frames(3000, 4.0)).all()
+    np.testing.assert_allclose(told.map.slant_equations[0, :, 0], 12000.0)
+
+
+def test_slants_are_no_steeper_than_edges() -> None:
+    steep = Told(SlantConfig(sigma=1e3)).frames(5, 1e3, np.array([1e3, -1e3]))
+    patch = 4.0 * 2.0 ** np.array([0, 0, 0, 1, 1, 2]) / CAMERA.fx
+    np.testing.assert_allclose(steep[:, 0] * patch, 0.5)
+    np.testing.assert_allclose(steep[:, 1] * patch, -0.5)
+
+
+def test_a_keyframe_in_an_old_slot_begins_without_slants() -> None:
+    told = Told(SlantConfig())
+    told.frames(3, 4.0)
+    add_keyframe(told.map, 1)
+    assert not told.map.slant.any() and not told.map.slant_equations.any()
