@@ -51,7 +51,7 @@ PRICES_NS: dict[str, float] = {
     "alignments": 800,  # a template aligned at one level
     "stereo_points": 1_750,  # a searched row
     "posed_points": 1_300,  # a landmark in the motion-only optimisation
-    "slants": 1_000,  # a patch compared with its template
+    "slants": 800,  # a patch compared with its template
     "inertial_samples": 1_000,  # preintegration
     "fused": 340_000,  # a frame in the smoother
     "pairs": 300_000,  # a frame compared with a keyframe for the disparity offset

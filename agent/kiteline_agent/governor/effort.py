@@ -42,7 +42,8 @@ ALONE = (
 def governed(config: AgentConfig, effort: Effort) -> AgentConfig:
     """The configuration at an effort: with fewer points, cells are larger and fewer inliers are required.
 
-    Below full effort there are no scans.
+    Below full effort there are no scans, no slants are measured, and disparities are those of surfaces that face the
+    camera.
     """
     align, keyframe = config.align, config.keyframe
     points = max(round(align.points * effort.points), 2 * config.pose.min_inliers)
@@ -69,5 +70,6 @@ def governed(config: AgentConfig, effort: Effort) -> AgentConfig:
             rotation_rad=keyframe.rotation_rad * min(effort.keyframes, 1.4),
         ),
         local_map=replace(config.local_map, searched=max(round(config.local_map.searched * effort.slots), 8)),
+        slant=replace(config.slant, points=config.slant.points if effort == FULL else 0),
         scan=replace(config.scan, on=config.scan.on and effort == FULL),
     )

@@ -17,7 +17,8 @@ from kiteline_agent.tracking.track import Track
 from kiteline_core.arrays import F64, I64
 
 _LEAST_GREY = 2.0  # grey levels; deviation of a pixel: noise, and what interpolation costs
-_INFLATION = 4.0  # factor on variances: pixels of a patch share errors of the lens, of blur and of interpolation
+_LONGEST_S = 0.15  # s between frames; of slower cameras a landmark is seen too few times, too differently
+_INFLATION = 16.0  # factor on variances: pixels of a patch share errors of the lens and of blur, all those of the pose
 _TINY = 1e-12  # of information: nothing
 _MOST_CHANGE = 0.5  # of the inverse depth, from the middle of a patch to its edge: steeper surfaces are edges
 
@@ -31,9 +32,14 @@ class SlantFromMotion:
         self._work = work
 
     def update(self, ctx: FrameContext, track: Track) -> None:
-        """Update the slants of the landmarks that a frame tracked on levels that it has."""
+        """Update the slants of the landmarks that a frame tracked on levels that it has.
+
+        Not if the frame before is long past: what few and distant views tell makes templates worse.
+        """
+        if ctx.dt_s > _LONGEST_S:
+            return
         m, images = self._map, ctx.images
-        chosen = np.flatnonzero(track.inlier & (m.octave.take(track.rows) >= images.first))[: self._config.points]
+        chosen = np.flatnonzero(track.inlier & (m.octave.take(track.rows) >= images.first))[: ctx.config.slant.points]
         if not len(chosen):
             return
         rows, uv = track.rows.take(chosen), track.observed.take(chosen, 0)[:, :2]

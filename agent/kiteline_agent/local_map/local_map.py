@@ -93,6 +93,7 @@ class LocalMap:
         self.holds_landmarks = camera.stereo
         self.active = SubmapId(0)  # the submap that is tracked
         capacity = k * b
+        self._facing = np.zeros((k, b, 2))  # slants
         self._row = np.zeros(capacity, np.int64)
         self._uv = np.zeros((capacity, 2))
         self._warp = np.zeros((capacity, 2, 2))
@@ -170,18 +171,18 @@ class LocalMap:
         return np.asarray(rows % self.slot_size < self.shared[rows // self.slot_size])
 
     def candidates(
-        self, T_c_m: F64, margin_px: float, *, seeds: bool = False, submap: SubmapId | None = None
+        self, T_c_m: F64, margin_px: float, *, seeds: bool = False, facing: bool = False, submap: SubmapId | None = None
     ) -> Candidates:
         """The usable landmarks (or seeds) that should be in view of a camera at T_c_m (4,4).
 
-        submap: None for the active one. Views into buffers: use them at once.
+        facing: as if surfaces faced their keyframes. submap: None for the active one. Views into buffers: use at once.
         """
         wanted = self.active if submap is None else submap
         slots = self._searched((self.keyframe >> SEQUENCE_BITS == wanted).nonzero()[0])
         n = kernels.project(
             T_c_m, self.intrinsics, self._size, margin_px, _MAX_SCALE, slots, self.T_m_k, self.order, self.counts,
-            self.seed if seeds else self.usable, self.bearing, self.rho, self.slant, self.sigma_rho,
-            self._row, self._uv, self._warp, self._xyz, self._ray, self._depth,
+            self.seed if seeds else self.usable, self.bearing, self.rho, self._facing if facing else self.slant,
+            self.sigma_rho, self._row, self._uv, self._warp, self._xyz, self._ray, self._depth,
         )  # fmt: skip
         return Candidates(self._row[:n], self._uv[:n], self._warp[:n], self._xyz[:n], self._ray[:n], self._depth[:n])
 

@@ -37,8 +37,9 @@ class Tracker:
         """Measure the pose of a frame from a prediction (4,4) that is good to some 28 px."""
         align, least = ctx.config.align, 2 * ctx.config.pose.min_inliers
         T_c_m = predicted_T_c_m.copy()
-        # Coarse pass: few landmarks and large steps on small images correct the prediction.
-        coarse = self._map.candidates(T_c_m, _MARGIN_PX)
+        # Coarse pass: few landmarks and large steps on small images correct the prediction. Its patches are wider than
+        # those of which slants were measured.
+        coarse = self._map.candidates(T_c_m, _MARGIN_PX, facing=True)
         chosen = self._choose(coarse, ctx.number, max(align.points // _COARSE, least), 1, 2 * align.cell_px)
         rough = self._measure(ctx, coarse, chosen, T_c_m, _COARSEST, coarse_only=True)
         if rough.inliers >= ctx.config.pose.min_inliers // 2:
