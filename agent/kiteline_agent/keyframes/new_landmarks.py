@@ -67,16 +67,9 @@ def new_points(images: FrameImages, taken: F64, camera: RectifiedCamera, config:
         )
         found = np.zeros(len(disparity), np.bool_)
         images.right.refine(
-            images.aligned,
-            NO_GRID,
-            corners.uv,
-            corners.octave,
-            found.copy(),
-            np.zeros((len(found), 2)),
-            _SEARCH_PX,
-            disparity,
-            found,
-        )
+            images.aligned, NO_GRID, corners.uv, corners.octave, found.copy(), np.zeros((len(found), 2)), _SEARCH_PX,
+            disparity, found,
+        )  # fmt: skip
         disparity[~found] = -1.0
         disparity[disparity < camera.fx / config.local_map.max_far_ratio] = -1.0
     elif images.depth_m is not None:
