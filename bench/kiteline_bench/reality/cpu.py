@@ -32,14 +32,18 @@ _MEDIAN = f"median of {RUNS} runs"
 _TIMEOUT_S = 300.0
 
 
-def yardstick_ms(source: str) -> list[float]:
-    """CPU in ms of cv2.ORB_create(1000).detectAndCompute on every fourth left image, on one thread."""
+def yardstick_ms(source: str, *, rest_s: float = 0.0) -> list[float]:
+    """CPU in ms of cv2.ORB_create(1000).detectAndCompute on every fourth left image, on one thread.
+
+    rest_s: before each, as between the frames of a flight; some machines make memory slow that rests.
+    """
     cv2.setNumThreads(1)
     orb, spent, number = cv2.ORB_create(_CORNERS), [], 0  # type: ignore[attr-defined]
     for item in open_source(source):
         if not isinstance(item, Frame):
             continue
         if number % _EVERY == 0:
+            time.sleep(rest_s)
             begin_ns = time.thread_time_ns()
             orb.detectAndCompute(item.left, None)
             spent.append((time.thread_time_ns() - begin_ns) / 1e6)

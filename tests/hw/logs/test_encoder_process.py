@@ -3,6 +3,7 @@
 import os
 import signal
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -76,26 +77,39 @@ def test_a_log_is_whole_whenever_the_process_ends(tmp_path: Path, kill_at: int |
 
 @pytest.mark.alone
 def test_a_pair_costs_this_process_little(tmp_path: Path) -> None:
-    """Less than a tenth of encoding it here, more than a pair that came encoded."""
+    """Beside a copy of it, less than a tenth of encoding it here, more than a pair that came encoded.
+
+    All at one pace: some machines make memory slow that rests for some tens of ms.
+    """
     random = np.random.default_rng(0)
     frames = [random.integers(0, 16, (2, 480, 752), np.uint8) for _ in range(4)]
-    begin_ns = time.process_time_ns()
     encoded = [tuple(encode_image(image) for image in pair) for pair in frames]
-    encoding_ms = (time.process_time_ns() - begin_ns) / 4e6
+    source, copy = random.integers(0, 16, (4, 2, 480, 752), np.uint8), np.zeros((2, 480, 752), np.uint8)
 
-    def cost_ms(raw: bool) -> float:
+    def cost_ms(take: Callable[[int], object]) -> float:
+        """Of the cheaper ones: what else runs on the machine only adds."""
+        spent = []
+        for k in range(25):
+            begin_ns = time.process_time_ns()
+            take(k)
+            spent.append(time.process_time_ns() - begin_ns)
+            time.sleep(0.08)  # the other process encodes meanwhile
+        return float(np.percentile(spent[5:], 25)) / 1e6
+
+    def logged_ms(raw: bool) -> float:
         encoder = ImageEncoder(EncodingPolicy())
         encoder.stores = encoder.apart = True
-        spent = []
         with LogWriter(tmp_path / "log.mcap", {}, encoder=encoder) as log:
-            for k in range(25):
+
+            def write(k: int) -> None:
                 pair = frames[k % 4]
-                begin_ns = time.process_time_ns()
                 log.frame(Frame(k, pair[0], pair[1], None, () if raw else encoded[k % 4]))
                 log.blob("/packets", k, b"")
-                spent.append(time.process_time_ns() - begin_ns)
-                time.sleep(0.12 if raw else 0.02)  # the other process encodes meanwhile
-            assert not raw or (encoder._process is not None and encoder._process.alive and not encoder.stored)
-        return float(np.median(spent[5:])) / 1e6
 
-    assert cost_ms(raw=True) - cost_ms(raw=False) < 0.1 * encoding_ms
+            spent_ms = cost_ms(write)
+            assert not raw or (encoder._process is not None and encoder._process.alive and not encoder.stored)
+        return spent_ms
+
+    encoding_ms = cost_ms(lambda k: [encode_image(image) for image in frames[k % 4]])
+    copy_ms = cost_ms(lambda k: np.copyto(copy, source[k % 4]))
+    assert logged_ms(raw=True) - logged_ms(raw=False) < 0.1 * encoding_ms + copy_ms

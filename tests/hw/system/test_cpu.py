@@ -93,11 +93,14 @@ def test_a_small_limit_holds_over_one_second() -> None:
         quota = CpuQuota(1.5)
     except QuotaError as error:
         pytest.skip(str(error))
-    with quota:
-        code = f"import sys; sys.stdin.readline()\n{SPIN.format(0.02)}"
-        process = subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE)
-        time.sleep(0.3)  # it has started
+    code = f"import sys; print(flush=True); sys.stdin.readline()\n{SPIN.format(0.02)}\nprint(flush=True)"
+    process = subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    with process, quota:  # the limit is off before Python tears itself down, which may cost a hundred times the spin
+        assert process.stdin is not None and process.stdout is not None
+        assert process.stdout.readline() == b"\n"  # it has started
         quota.add(process.pid)
         began = time.monotonic()
-        process.communicate(b"\n")
+        process.stdin.write(b"\n")
+        process.stdin.flush()
+        assert process.stdout.readline() == b"\n"
         assert time.monotonic() - began > 0.7  # 20 ms of CPU at 1.5 percent take 1.3 s less a period or two
