@@ -69,5 +69,5 @@ class InertialConfig:
     max_gap_s: float = 0.2  # a longer gap in the samples makes an interval unknown: a bus was blocked
     rest_gyro_rad_s: float = 0.02  # standard deviation of the gyro below which the vehicle stands still
     rest_accel_m_s2: float = 0.15  # the same of the accelerometer: motors may idle
-    motion_frames: int = 7  # least frames of that window: with five, noise could pass for acceleration
+    motion_frames: int = 7  # least frames that tell gravity in motion: with five, noise could pass for acceleration
     max_dead_reckoning_s: float = 20.0  # longest dead reckoning: a small IMU is useless after it

@@ -228,7 +228,11 @@ def _add_controller(p: argparse._ArgumentGroup) -> None:
         help="fly on the flight controller's IMU in place of the source's; where the camera sits is said by T_f_c in "
         "[agent.controller_imu] of --config, or by a source that knows its body, with --axes",
     )  # fmt: skip
-    p.add_argument("--axes", metavar="XYZ", default="", help="where the body's axes point: flu (default), rdf, urf, …")
+    p.add_argument(
+        "--axes", metavar="XYZ", default="",
+        help="where the body's axes point: flu, rdf, urf, … (default: flu; rdf if the source knows no body but the "
+        "camera; frd with T_f_c)",
+    )  # fmt: skip
     p.add_argument(
         "--offset", metavar="X,Y,Z", default="", help="where the flight controller sits: metres along the body's axes"
     )

@@ -14,6 +14,9 @@ _SHOWN = (
     "governor: level",
     "odometer",
     "imu",
+    "images",
+    "camera stamps scatter",
+    "camera stamps are right",
 )  # beginnings of the events that are shown
 
 

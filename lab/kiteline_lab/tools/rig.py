@@ -236,9 +236,9 @@ def _euroc(model: CameraModel, T_b_c: F64) -> str:
 
 def main(argv: Sequence[str]) -> int:
     """Run `kiteline rig`; the exit status. Raises KitelineError."""
-    parser = argparse.ArgumentParser(prog="kiteline rig", description="What flights found of cameras.")
+    parser = argparse.ArgumentParser(prog="kiteline rig", description="What flights found of cameras and IMU.")
     verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
-    show = verbs.add_parser("show", help="cameras and what was found of them")
+    show = verbs.add_parser("show", help="cameras, IMU and what was found of them")
     show.add_argument("--json", action="store_true", help="print JSON")
     export = verbs.add_parser("export", help="write the rectified pair as it was found; kiteline: a rig file")
     export.add_argument("--format", choices=FORMATS, required=True)

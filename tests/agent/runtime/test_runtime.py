@@ -97,6 +97,12 @@ def test_changes_are_told_once_and_a_summary_now_and_then() -> None:
     assert summary(tally).startswith("400 frames: 386 tracked, 14 lost")
 
 
+@pytest.mark.parametrize("event", ["images: too few corners to begin a map", "camera stamps scatter by 2.1 ms"])
+def test_what_is_wrong_with_the_cameras_is_shown(event: str) -> None:
+    (line,) = StatusMessages().lines(output(False, event, "keyframe: heartbeat"), FrameCounts(), 0)
+    assert line == f"     0.0 s  {event}"
+
+
 def test_what_is_found_of_the_flight_controller_is_shown() -> None:
     (line,) = StatusMessages().lines(output(False), FrameCounts(), 2_000_000_000, ["flight controller: found: PX4"])
     assert line == "     2.0 s  flight controller: found: PX4"

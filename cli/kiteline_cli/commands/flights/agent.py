@@ -4,7 +4,7 @@ SUMMARY = "run the onboard half live: images in, poses out, map updates to the b
 EXAMPLES = (
     "kiteline agent flight.mcap --link zenoh:tcp/10.0.0.1:7447 --log logs",
     "kiteline agent flight.mcap --mavlink udp:10.0.0.2:14550 --cpu 30",
-    "kiteline agent flight.mcap --mavlink serial:/dev/ttyS0:921600 --imu controller --config rig.toml",
+    "kiteline agent flight.mcap --mavlink serial:/dev/ttyS0:921600 --imu controller --config agent.toml",
     "kiteline agent flight.mcap --agent 3 --key agent3.key --link serial:/dev/ttyUSB0:57600 --up-bytes 1000",
 )
 

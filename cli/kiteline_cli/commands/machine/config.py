@@ -4,7 +4,7 @@ SUMMARY = "print, explain and check the options of agent and base"
 EXAMPLES = (
     "kiteline config > kiteline.toml",
     "kiteline config --explain keyframe.min_share",
-    "kiteline config --check rig.toml",
+    "kiteline config --check agent.toml",
 )
 
 

@@ -1,6 +1,6 @@
 """`kiteline rig`."""
 
-SUMMARY = "show and export what flights found of cameras"
+SUMMARY = "show and export what flights found of cameras and IMU"
 EXAMPLES = (
     "kiteline rig show maps",
     "kiteline rig show rig.toml",

@@ -7,8 +7,8 @@ from kiteline_hw.mavlink.watch.findings import Finding, FindingLevel
 from kiteline_hw.mavlink.watch.messages import ARDUPILOT, PX4
 
 TOPIC, FORWARD_TOPIC = "parameters", "forwarding"
-_NO_FORWARD = 1024  # bit of SERIALx_OPTIONS
-_NO_FORWARD_4_7 = 2  # bit of MAVn_OPTIONS
+_NO_FORWARD = 1024  # in SERIALx_OPTIONS
+_NO_FORWARD_4_7 = 2  # in MAVn_OPTIONS; n counts MAVLink ports, it is not x
 _MAVLINK_1, _MAVLINK_2 = 1, 2  # SERIALx_PROTOCOL
 _LEAST_BAUD = 115  # SERIALx_BAUD in thousands; 30 poses a second take 7.5 kB/s
 _SERIAL_PORTS = range(1, 7)
@@ -147,9 +147,9 @@ def _ardupilot_ports(values: Mapping[str, float]) -> list[Finding]:
         )
     else:
         new = any(f"MAV{n}_OPTIONS" in values for n in _CHANNELS)
-        bit = f"bit {_NO_FORWARD_4_7} of MAVn_OPTIONS" if new else f"bit {_NO_FORWARD} of SERIALx_OPTIONS"
+        bit = f"{_NO_FORWARD_4_7} in MAVn_OPTIONS" if new else f"{_NO_FORWARD} in SERIALx_OPTIONS"
         text = f"MAVLink on {listed}; each forwards, so ODOMETRY also goes out on the telemetry radio"
-        remedy = f"set {bit} of the port here (unless a mavlink: link goes through it: the bit ends that)"
+        remedy = f"set {bit} of the port here (unless a mavlink: link goes through it: that ends it)"
         out.append(Finding(FORWARD_TOPIC, FindingLevel.WARNING, text, "", remedy))
     if slow and len(slow) == len(carrying):
         text = f"each MAVLink port is slower than {_LEAST_BAUD}200 baud: 30 poses a second take 7.5 kB/s"

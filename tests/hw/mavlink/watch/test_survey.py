@@ -94,11 +94,11 @@ def test_forwarding_to_the_radio() -> None:
     (said,) = topic(old, "forwarding")
     assert (
         said.level is FindingLevel.WARNING
-        and "1024 of SERIALx_OPTIONS" in said.remedy
+        and "1024 in SERIALx_OPTIONS" in said.remedy
         and "mavlink: link" in said.remedy
     )
     new = survey(ModelledAutopilot("ardupilot", parameters={"SERIAL2_OPTIONS": 0, "MAV1_OPTIONS": 0}))
-    assert "bit 2 of MAVn_OPTIONS" in topic(new, "forwarding")[0].remedy
+    assert "2 in MAVn_OPTIONS" in topic(new, "forwarding")[0].remedy
     quiet = survey(ModelledAutopilot("ardupilot", parameters={"SERIAL2_OPTIONS": 0, "MAV2_OPTIONS": 2}))
     assert topic(quiet, "forwarding")[0].level is FindingLevel.INFO
     px4 = survey(ModelledAutopilot("px4", parameters={"MAV_1_FORWARD": 1}))
