@@ -243,6 +243,25 @@ def _raw_slopes(grid, x, y, reach):  # type: ignore[no-untyped-def]
     return u, v, (u1 - u0) * s, (v1 - v0) * s, (u3 - u2) * s, (v3 - v2) * s, off_u, off_v
 
 
+@helper
+def level_here(det, cut, levels):  # type: ignore[no-untyped-def]
+    """Level on which a template cut at level `cut` is compared: det is that of its warp at level 0."""
+    return min(max(cut + int(np.floor(np.log2(np.sqrt(det)) + 0.5)), 0), levels - 1)
+
+
+@helper
+def to_template(warp, det, cut, level):  # type: ignore[no-untyped-def]
+    """Map (by rows) from pixels of a level here to those of the template, cut at level `cut`. warp: (2,2), its det."""
+    ratio = float(1 << level) / float(1 << cut) / det
+    return warp[1, 1] * ratio, -warp[0, 1] * ratio, -warp[1, 0] * ratio, warp[0, 0] * ratio
+
+
+@helper
+def through_lens(m00, m01, m10, m11, xu, xv, yu, yv):  # type: ignore[no-untyped-def]
+    """A map (by rows) of rectified pixels as one of raw ones. xu … yv: derivatives of rectified pixels by these."""
+    return m00 * xu + m01 * yu, m00 * xv + m01 * yv, m10 * xu + m11 * yu, m10 * xv + m11 * yv
+
+
 @njit
 def align(  # type: ignore[no-untyped-def]
     pyramid, grid, templates, rows, octave, warp, uv, first, last, iterations, max_step_px, min_ncc, found, ncc
@@ -272,20 +291,14 @@ def align(  # type: ignore[no-untyped-def]
         det = warp[i, 0, 0] * warp[i, 1, 1] - warp[i, 0, 1] * warp[i, 1, 0]
         if det < 0.06 or det > 16.0:
             continue
-        scale = np.sqrt(det)
-        shift = int(np.floor(np.log2(scale) + 0.5))
         x = uv[i, 0]
         y = uv[i, 1]
         ok = False
         score = 0.0
         for j in range(first, last - 1, -1):
             cut = min(octave[i] + j, levels - 1)
-            level = min(max(cut + shift, 0), levels - 1)
-            ratio = float(1 << level) / float(1 << cut) / det
-            m00 = warp[i, 1, 1] * ratio
-            m01 = -warp[i, 0, 1] * ratio
-            m10 = -warp[i, 1, 0] * ratio
-            m11 = warp[i, 0, 0] * ratio
+            level = level_here(det, cut, levels)
+            m00, m01, m10, m11 = to_template(warp[i], det, cut, level)
             s = float(1 << level)
             begin_x = x / s
             begin_y = y / s
@@ -300,7 +313,7 @@ def align(  # type: ignore[no-untyped-def]
                 begin_y = (v + off_v) / s
                 part = 1.0 / (ux * vy - uy * vx)
                 xu, xv, yu, yv = vy * part, -uy * part, -vx * part, ux * part
-                m00, m01, m10, m11 = m00 * xu + m01 * yu, m00 * xv + m01 * yv, m10 * xu + m11 * yu, m10 * xv + m11 * yv
+                m00, m01, m10, m11 = through_lens(m00, m01, m10, m11, xu, xv, yu, yv)
             if not warp_template(templates[rows[i], j], m00, m01, m10, m11, reference):
                 continue
             template_gradients(reference, patches)

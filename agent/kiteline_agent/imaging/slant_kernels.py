@@ -16,8 +16,11 @@ from kiteline_agent.imaging.alignment_kernels import (
     STRIDE,
     _raw_slopes,
     dot,
+    level_here,
     sample_patch,
     template_gradients,
+    through_lens,
+    to_template,
     warp_template,
 )
 from kiteline_core.jit import njit
@@ -103,11 +106,9 @@ def measure_slants(  # type: ignore[no-untyped-def]
             continue
         # 1. The level, and the map from its pixels to those of the template, as in the alignment.
         cut = min(int(octave[i]), levels - 1)
-        level = min(max(cut + int(np.floor(0.5 * np.log2(det) + 0.5)), 0), levels - 1)
+        level = level_here(det, cut, levels)
         s = float(1 << level)
-        ratio = s / float(1 << cut) / det
-        m00, m01 = warp[i, 1, 1] * ratio, -warp[i, 0, 1] * ratio
-        m10, m11 = -warp[i, 1, 0] * ratio, warp[i, 0, 0] * ratio
+        m00, m01, m10, m11 = to_template(warp[i], det, cut, level)
         x, y = uv[i, 0] / s, uv[i, 1] / s
         e0, e1 = parallax[i, 0] / s, parallax[i, 1] / s
         if is_raw:
@@ -118,7 +119,7 @@ def measure_slants(  # type: ignore[no-untyped-def]
             x, y = (u + off_u) / s, (v + off_v) / s
             part = 1.0 / (ux * vy - uy * vx)
             xu, xv, yu, yv = vy * part, -uy * part, -vx * part, ux * part
-            m00, m01, m10, m11 = m00 * xu + m01 * yu, m00 * xv + m01 * yv, m10 * xu + m11 * yu, m10 * xv + m11 * yv
+            m00, m01, m10, m11 = through_lens(m00, m01, m10, m11, xu, xv, yu, yv)
             e0, e1 = ux * e0 + uy * e1, vx * e0 + vy * e1
         h, w = pyramid[level].shape
         if x < PATCH_RADIUS or y < PATCH_RADIUS or x >= w - PATCH_RADIUS - 1 or y >= h - PATCH_RADIUS - 1:
