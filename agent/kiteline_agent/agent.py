@@ -99,7 +99,7 @@ class Agent:
         maker = KeyframeMaker(self.map, channel, rows, self.work, has_depth=self._has_depth)
         self._keyframes = KeyframeStage(self._camera, maker, self._relocaliser, self._governor, channel, self.work)
         self._depth = DepthFromMotion(self.map, config, self.work)
-        self._slants = SlantFromMotion(self.map, config.slant, self.work)
+        self._slants = SlantFromMotion(self.map, self.work)
         self._two_view_start = None if self._has_depth else TwoViewStart(camera, config, self.work)
         self._inertial_start = inertial_start = (
             None if self._has_depth or imu is None

@@ -26,9 +26,8 @@ _MOST_CHANGE = 0.5  # of the inverse depth, from the middle of a patch to its ed
 class SlantFromMotion:
     """Updates slants of a local map from each tracked frame."""
 
-    def __init__(self, local_map: LocalMap, config: SlantConfig, work: Work) -> None:
+    def __init__(self, local_map: LocalMap, work: Work) -> None:
         self._map = local_map
-        self._config = config
         self._work = work
 
     def update(self, ctx: FrameContext, track: Track) -> None:
@@ -38,8 +37,8 @@ class SlantFromMotion:
         """
         if ctx.dt_s > _LONGEST_S:
             return
-        m, images = self._map, ctx.images
-        chosen = np.flatnonzero(track.inlier & (m.octave.take(track.rows) >= images.first))[: ctx.config.slant.points]
+        m, images, config = self._map, ctx.images, ctx.config.slant
+        chosen = np.flatnonzero(track.inlier & (m.octave.take(track.rows) >= images.first))[: config.points]
         if not len(chosen):
             return
         rows, uv = track.rows.take(chosen), track.observed.take(chosen, 0)[:, :2]
@@ -55,11 +54,11 @@ class SlantFromMotion:
             np.ascontiguousarray(uv), m.camera.fx, m.camera.fy, _LEAST_GREY, equations,
         )  # fmt: skip
         self._work.slants += len(rows)
-        self._fuse(rows, equations / _INFLATION)
+        self._fuse(rows, equations / _INFLATION, config)
 
-    def _fuse(self, rows: I64, equations: F64) -> None:
+    def _fuse(self, rows: I64, equations: F64, config: SlantConfig) -> None:
         """Take over measurements (n,5) of rows (n,), see `measure_slants`: the most probable slants after them."""
-        m, sigma = self._map, self._config.sigma
+        m, sigma = self._map, config.sigma
         slant, known = m.slant.reshape(-1, 2), m.slant_equations.reshape(-1, 5)
         # 1. What is told of the slant itself, not of its error.
         xx, xy, yy, bx, by = equations.T
@@ -68,7 +67,7 @@ class SlantFromMotion:
         # 2. No more is forgotten than is told: where a vehicle hovers nothing is, and its disparities need the slants.
         before = known.take(rows, 0)
         share = (xx + yy) / np.maximum(before[:, 0] + before[:, 2], xx + yy + _TINY)
-        forgotten = np.minimum(max(1.0 - self._config.memory, 0.0), share)
+        forgotten = np.minimum(max(1.0 - config.memory, 0.0), share)
         known[rows] = total = (1.0 - forgotten)[:, None] * before + told
         # 3. The most probable slant, no steeper than an edge.
         xx, xy, yy, bx, by = total.T

@@ -1,12 +1,16 @@
 """What the map knows of slants: they converge, last while nothing is told, are bounded, and go with their keyframe."""
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
+import pytest
 
-from kiteline_agent.config import LocalMapConfig, SlantConfig
+from kiteline_agent.config import AgentConfig, LocalMapConfig, SlantConfig
 from kiteline_agent.governor.cost_model import Work
 from kiteline_agent.imaging.alignment_kernels import TEMPLATE, TEMPLATE_LEVELS
+from kiteline_agent.keyframes import slant_from_motion
 from kiteline_agent.keyframes.slant_from_motion import SlantFromMotion
 from kiteline_agent.local_map.keyframe_landmarks import KeyframeLandmarks
 from kiteline_agent.local_map.local_map import LocalMap
@@ -37,14 +41,14 @@ class Told:
     def __init__(self, config: SlantConfig) -> None:
         self.map = LocalMap(CAMERA, replace(LocalMapConfig(), keyframes=1, landmarks=LANDMARKS))
         add_keyframe(self.map, 0)
-        self._slants = SlantFromMotion(self.map, config, Work())
+        self._slants, self._config = SlantFromMotion(self.map, Work()), config
 
     def frames(self, count: int, information: float, true: F64 = TRUE) -> F64:
         """Slants (6,2) after so many frames, each with this information along both axes."""
         for _ in range(count):
             error = true - self.map.slant[0]
             level = np.full(LANDMARKS, information)
-            self._slants._fuse(ROWS, np.column_stack([level, 0.0 * level, level, information * error]))
+            self._slants._fuse(ROWS, np.column_stack([level, 0.0 * level, level, information * error]), self._config)
         return self.map.slant[0].copy()
 
 
@@ -89,3 +93,43 @@ def test_a_keyframe_in_an_old_slot_begins_without_slants() -> None:
     told.frames(3, 4.0)
     add_keyframe(told.map, 1)
     assert not told.map.slant.any() and not told.map.slant_equations.any()
+
+
+@pytest.mark.parametrize(
+    ("dt_s", "first", "points", "measured"),
+    [
+        (0.05, 0, 240, [0, 1, 2, 4, 5]),  # all inliers
+        (0.05, 1, 240, [4, 5]),  # a frame of halved images: those of finer levels were aligned elsewhere
+        (0.05, 0, 2, [0, 1]),
+        (0.05, 0, 0, []),  # below full effort
+        (0.2, 0, 240, []),  # a slow camera
+    ],
+)
+def test_what_a_frame_measures(
+    monkeypatch: pytest.MonkeyPatch, dt_s: float, first: int, points: int, measured: list[int]
+) -> None:
+    def measure(*arguments: Any) -> None:
+        arguments[-1][:] = (1.0, 0.0, 1.0, 0.5, 0.0)
+
+    monkeypatch.setattr(slant_from_motion, "measure_slants", measure)
+    told, work = Told(SlantConfig()), Work()
+    images: Any = SimpleNamespace(first=first, sampled=(), grid=None)
+    config = replace(AgentConfig(), slant=SlantConfig(points=points))
+    ctx: Any = SimpleNamespace(dt_s=dt_s, images=images, config=config, shutter=None)
+    track: Any = SimpleNamespace(
+        T_c_m=np.eye(4), rows=ROWS, observed=np.full((LANDMARKS, 3), 200.0), inlier=np.arange(LANDMARKS) != 3
+    )
+    SlantFromMotion(told.map, work).update(ctx, track)
+    assert np.flatnonzero(told.map.slant_equations[0, :, 0]).tolist() == measured
+    assert np.flatnonzero(told.map.slant[0, :, 0] > 0.0).tolist() == measured
+    assert work.slants == len(measured)
+
+
+def test_only_candidates_that_face_their_keyframes_are_warped_without_slants() -> None:
+    flat, told = Told(SlantConfig()).map, Told(SlantConfig()).map
+    told.slant[0] = TRUE
+    T_c_m = np.eye(4)
+    T_c_m[2, 3] = -1.0
+    expected = flat.candidates(T_c_m, 0.0).warp.copy()
+    np.testing.assert_array_equal(told.candidates(T_c_m, 0.0, facing=True).warp, expected)
+    assert (np.abs(told.candidates(T_c_m, 0.0).warp - expected).max((1, 2)) > 0.01).all()
