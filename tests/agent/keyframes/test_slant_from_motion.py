@@ -128,8 +128,10 @@ def test_what_a_frame_measures(
 def test_only_candidates_that_face_their_keyframes_are_warped_without_slants() -> None:
     flat, told = Told(SlantConfig()).map, Told(SlantConfig()).map
     told.slant[0] = TRUE
+    flat.active = told.active = submap_id(0, 1, 0)
     T_c_m = np.eye(4)
     T_c_m[2, 3] = -1.0
     expected = flat.candidates(T_c_m, 0.0).warp.copy()
+    assert len(expected) == LANDMARKS
     np.testing.assert_array_equal(told.candidates(T_c_m, 0.0, facing=True).warp, expected)
     assert (np.abs(told.candidates(T_c_m, 0.0).warp - expected).max((1, 2)) > 0.01).all()
