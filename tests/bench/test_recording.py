@@ -21,7 +21,9 @@ from kiteline_bench.harness.faults import (
     rearranged,
     samples_in_bursts,
     scattered_stamps,
+    smeared,
     some,
+    torn,
     wall,
     without_samples,
 )
@@ -173,6 +175,21 @@ def test_light_that_flickers_and_images_that_show_nothing_are_drawn_by_chance(fl
     ratios = [a.frame.left.mean() / b.frame.left.mean() for a, b in zip(lit.items, flight.items)]
     assert 0.1 < np.std(np.log(ratios)) < 0.4
     assert all(a.frame.right is not None and a.frame.t_ns == b.frame.t_ns for a, b in zip(lit.items, flight.items))
+
+
+def test_images_are_torn_and_smeared(flight: Recording) -> None:
+    for frame in (item.frame for item in flight.items):
+        assert frame.right is not None
+        bad = torn(frame)
+        assert bad.right is not None and (bad.left is frame.left) != (bad.right is frame.right)
+        before, after = (frame.left, bad.left) if bad.right is frame.right else (frame.right, bad.right)
+        rows = np.flatnonzero((before != after).any(axis=1))
+        assert 0.2 * len(before) - 1 <= rows[0] <= 0.6 * len(before) and rows[-1] == len(before) - 1
+        assert np.array_equal(np.sort(before, axis=1), np.sort(after, axis=1))
+    assert torn(replace(frame, right=None)).right is None
+    row, blurred = frame.left[100].astype(np.float64), smeared(frame).left[100]
+    means = [row[x - 12 : x + 13].mean() for x in range(12, len(row) - 12)]
+    assert np.abs(blurred[12:-12] - means).max() <= 1.0
 
 
 def test_samples_of_the_imu_are_left_out_or_stamped_late(flight: Recording) -> None:

@@ -21,6 +21,7 @@ from kiteline_core.ids import NO_KEYFRAME, KeyframeId
 _WAIT_DEPTH_S = 0.26  # s that a keyframe waits for a lost right or depth image; slow depth cameras have 5 a second
 _DEAD_RECKONING_RAD = 0.02  # rad: standard deviation up to which dead reckoning extends the map, a degree
 _THIN_TRACK = 3.0  # times the fewest inliers of a pose; with fewer a keyframe does not wait for CPU time
+_SHOWS_LESS = 0.7  # of the share of landmarks that the frame before showed; motion alone leaves 0.72 and more
 
 
 class KeyframeStage:
@@ -37,6 +38,7 @@ class KeyframeStage:
         self._channel = channel
         self._work = work
         self._depth_t_ns = 0  # of the last frame whose images measure depth
+        self._found = 0.0  # share of the landmarks searched for that the last tracked frame showed
 
     def add_if_needed(self, ctx: FrameContext, track: Track) -> list[str]:
         """Make a keyframe if the policy needs one and CPU time allows it; share it if the link does. Returns events.
@@ -46,6 +48,7 @@ class KeyframeStage:
         if not self._maker.lacks_depth(ctx):
             self._depth_t_ns = ctx.t_ns
         self._share_steps()
+        shows_less = self._shows_less(track)
         need = self._camera.reference.keyframe_need(ctx, track)
         if need is None:
             return []
@@ -54,11 +57,18 @@ class KeyframeStage:
             return ["governor: keyframe postponed"]
         if not urgent and 0.0 < (ctx.t_ns - self._depth_t_ns) * 1e-9 < _WAIT_DEPTH_S:
             return []  # its new landmarks would have no depth
+        if not urgent and shows_less:
+            return []  # its new landmarks would be what is wrong with it; if it was not the image, the next frame does
         if not need.pressing and self._camera.reference.age_ns(ctx.t_ns) < self._channel.keyframe_gap_ns():
             self._add_unshared(ctx, track)
             return [f"keyframe, not shared: {need.rule}"]
         self.add(ctx, track)
         return [f"keyframe: {need.rule}"]
+
+    def _shows_less(self, track: Track) -> bool:
+        """True for a frame that shows much less of the map than the one before: covered, blurred or torn."""
+        before, self._found = self._found, track.inliers / max(track.tried, 1)
+        return self._found < _SHOWS_LESS * before
 
     def add(self, ctx: FrameContext, track: Track) -> None:
         """Make a keyframe of a tracked frame, with new landmarks where the image has room."""

@@ -15,6 +15,7 @@ Fault = Callable[[Recording], Recording]
 
 _WALL_GREY, _BLACK_GREY = 120.0, 6.0
 _NOISE_GREY = 1.3  # deviation of a camera's noise
+_SMEAR_PX = 25
 _GYRO, _STUCK = 3, 20  # axes of a gyro; samples that a stuck bus repeats
 _MOST_RAD_S, _MOST_M_S2 = 15.0, 100.0  # that a bus with bit errors reads
 _FIRST_KEPT = 3  # first frames of a flight that no chance changes
@@ -50,6 +51,27 @@ def gain(factor: float, offset: float = 0.0) -> Change:
 
 
 wall, black = blank(_WALL_GREY), blank(_BLACK_GREY)
+
+
+def torn(frame: Frame) -> Frame:
+    """One of the images is shifted sideways below a row, by chance: a transfer lost some bytes."""
+    rng = np.random.default_rng([frame.t_ns, 6])
+    of_right, shift = frame.right is not None and rng.random() < 0.5, int(rng.choice((-1, 1)) * rng.integers(15, 60))
+    image = frame.right if of_right and frame.right is not None else frame.left
+    row = int(rng.uniform(0.2, 0.6) * len(image))
+    broken = np.concatenate([image[:row], np.roll(image[row:], shift, axis=1)])
+    return replace(frame, right=broken, encoded=()) if of_right else replace(frame, left=broken, encoded=())
+
+
+def smeared(frame: Frame) -> Frame:
+    """The camera was hit while it exposed: a line of 25 px along the rows instead of each point."""
+    ends = (_SMEAR_PX - 1) // 2
+
+    def change(image: U8) -> NDArray[np.floating]:
+        sums = np.cumsum(np.pad(image.astype(np.float64), ((0, 0), (ends + 1, ends)), "edge"), axis=1)
+        return (sums[:, _SMEAR_PX:] - sums[:, :-_SMEAR_PX]) / _SMEAR_PX
+
+    return images(change)(frame)
 
 
 def no_right(frame: Frame) -> Frame:

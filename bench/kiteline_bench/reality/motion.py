@@ -1,4 +1,4 @@
-"""Flights that begin in motion, cameras that take few images a second, blank images, flickering light, faulty IMUs."""
+"""Flights that begin in motion, cameras that take few images a second, bad images, flickering light, faulty IMUs."""
 
 from collections.abc import Callable
 
@@ -11,7 +11,9 @@ from kiteline_bench.harness.faults import (
     late_samples,
     samples_in_bursts,
     scattered_stamps,
+    smeared,
     some,
+    torn,
     wall,
     without_samples,
     wrong_samples,
@@ -37,6 +39,8 @@ _OF_IMU, _BY_CHANCE = (_SAMPLES, _LATE, _EARLY, _BURSTS), (_WRONG, _SCATTER)  # 
 _FAULTS: dict[str, Callable[[Recording, int], Recording]] = {
     _PLAIN: lambda recording, _: recording,
     "one image in ten blank": lambda recording, seed: some(recording, 0.1, wall, seed),
+    "one image in twenty torn": lambda recording, seed: some(recording, 0.05, torn, seed),
+    "one image in twenty smeared": lambda recording, seed: some(recording, 0.05, smeared, seed),
     "every image another exposure": lambda recording, seed: flickering(recording, 0.25, seed),
     _SAMPLES: lambda recording, _: without_samples(recording, 5.0, 0.3),
     _LATE: lambda recording, _: late_samples(recording, 0.02),
@@ -99,7 +103,7 @@ def _slow_cameras(bench: Bench) -> list[Bar]:
 
 
 def _faulty_sensors(bench: Bench) -> list[Bar]:
-    """Odometry of the tracker alone where images show nothing, light flickers, samples are missing, wrong or late.
+    """Odometry of the tracker alone where images are bad, light flickers, samples are missing, wrong or late.
 
     The flight of one camera has no error at all if its scale is never known: infinite.
     """

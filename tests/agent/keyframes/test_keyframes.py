@@ -72,6 +72,28 @@ def test_a_view_of_which_two_thirds_are_black_does_not_make_a_keyframe_of_every_
     assert agent.run.lost == 0 and len(bare) < 4
 
 
+def test_an_image_that_shows_much_less_than_the_one_before_makes_no_keyframe(recording: Path) -> None:
+    wall, bad = load(str(recording)), range(4, 30, 5)
+    agent = FlyingAgent(wall.rig, None, vocabulary=False)
+    for k, item in enumerate(wall.items):
+        left = np.concatenate([item.frame.left[:90], np.roll(item.frame.left[90:], 40, axis=1)])
+        agent.step(replace(item, frame=replace(item.frame, left=left, encoded=())) if k in bad else item)
+    made = [k for k, events in enumerate(agent.run.events) if any(e.startswith("keyframe") for e in events)]
+    assert made and not set(made) & set(bad)
+    assert agent.run.lost == 0
+
+
+def test_an_image_that_goes_on_showing_less_makes_a_keyframe(recording: Path) -> None:
+    wall = load(str(recording))
+    agent = FlyingAgent(wall.rig, None, vocabulary=False)
+    for k, item in enumerate(wall.items):
+        left = item.frame.left.copy()
+        left[90 if k > 10 else 240 :] = 90
+        agent.step(replace(item, frame=replace(item.frame, left=left, encoded=())))
+    made = [k for k, events in enumerate(agent.run.events) if "keyframe: few points left" in events]
+    assert 11 not in made and 12 in made
+
+
 @pytest.mark.parametrize("size", [(320, 240), (424, 240), (640, 480)])
 def test_a_small_image_has_as_many_cells(size: tuple[int, int]) -> None:
     config = with_cells_for(AgentConfig(), *size)
