@@ -27,16 +27,17 @@ class Flow:
 
 
 class BlankImages:
-    """Tells which images to leave out: those that show hardly any of the corners before, but not for ever."""
+    """Tells which images to leave out: torn ones and those that show hardly any of the corners before, not for ever."""
 
     def __init__(self, most: int = 4) -> None:
         """most: in a row that are left out; flow hardly reaches over more than four frames."""
         self._most = most
         self._in_a_row = 0
 
-    def leaves_out(self, found: Bool) -> bool:
+    def leaves_out(self, found: Bool, *, torn: bool = False) -> bool:
         """True if an image in which these of the corners (n,) were found is to be left out."""
-        leaves = self._in_a_row < self._most and int(np.count_nonzero(found)) < _LEAST_FOLLOWED * len(found)
+        bad = torn or int(np.count_nonzero(found)) < _LEAST_FOLLOWED * len(found)
+        leaves = bad and self._in_a_row < self._most
         self._in_a_row = self._in_a_row + 1 if leaves else 0
         return leaves
 
