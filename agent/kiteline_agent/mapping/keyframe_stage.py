@@ -21,7 +21,7 @@ from kiteline_core.ids import NO_KEYFRAME, KeyframeId
 _WAIT_DEPTH_S = 0.26  # s that a keyframe waits for a lost right or depth image; slow depth cameras have 5 a second
 _DEAD_RECKONING_RAD = 0.02  # rad: standard deviation up to which dead reckoning extends the map, a degree
 _THIN_TRACK = 3.0  # times the fewest inliers of a pose; with fewer a keyframe does not wait for CPU time
-_SHOWS_LESS = 0.7  # of the share of landmarks that the frame before showed; motion alone leaves 0.72 and more
+_SHOWS_LESS = 0.7  # of the share of landmarks that the frame before showed; motion alone hardly leaves less
 
 
 class KeyframeStage:
