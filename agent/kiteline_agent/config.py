@@ -131,9 +131,7 @@ class SlantConfig:
 
     points: int = 240  # landmarks whose slant is measured in a frame, 1 us each; 0: all surfaces face the camera
     sigma: float = 1.0  # deviation of a slant before it is measured: a wall seen at 45 degrees, in the middle of a view
-    memory: float = (
-        0.9  # share of what is known that a frame leaves if it tells as much: they share a template's errors
-    )
+    memory: float = 0.9  # share of what is known that a frame leaves if it tells as much: frames share errors
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,7 +26,7 @@ class Flow:
     return_px: float = np.inf
 
 
-class BlankImages:
+class BadImages:
     """Tells which images to leave out: torn ones and those that show hardly any of the corners before, not for ever."""
 
     def __init__(self, most: int = 4) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 
 from kiteline_agent.imaging import features
 from kiteline_agent.imaging.features import DetectorConfig, Pyramid
-from kiteline_agent.imaging.optical_flow import BlankImages, Flow, follow
+from kiteline_agent.imaging.optical_flow import BadImages, Flow, follow
 from kiteline_agent.inertial_start_config import CornerTracksConfig
 from kiteline_core.arrays import F64, I64, U8, Bool
 from kiteline_core.geometry.cameras import RectifiedCamera
@@ -72,7 +72,7 @@ class CornerTracks:
         self._last: U8 | None = None  # frame into which they were followed, and where they are there
         self._last_uv = np.zeros((0, 2))
         self._last_step = np.zeros((0, 2))  # px by which they moved into that frame; NaN: unknown
-        self._blank, self._blank_keyframes = BlankImages(), BlankImages(1)
+        self._bad, self._bad_keyframes = BadImages(), BadImages(1)
 
     def is_due(self, t_ns: int) -> bool:
         """True if a frame is to become a keyframe."""
@@ -86,7 +86,7 @@ class CornerTracks:
         if self._last is not None and len(self._last_uv):
             uv, good = follow(self._last, left[0], self._last_uv, _FLOW, _LEVELS)
             step = uv - self._last_uv
-            if self._blank.leaves_out(good, torn=is_torn(uv[good], step[good] - self._last_step[good])):
+            if self._bad.leaves_out(good, torn=is_torn(uv[good], step[good] - self._last_step[good])):
                 self._last_step[:] = np.nan
                 return False
             self._last_uv, self._last_step = uv[good], step[good]
@@ -109,7 +109,7 @@ class CornerTracks:
             else:
                 guess = None if turn is None else self._turned(turn)
                 uv, good = follow(before, left[0], self._uv, _FLOW, _LEVELS, guess)
-                if self._blank_keyframes.leaves_out(good):
+                if self._bad_keyframes.leaves_out(good):
                     return False
             self._uv, self._ids = uv[good], self._ids[good]
             step = self._last_step[good] if near else step

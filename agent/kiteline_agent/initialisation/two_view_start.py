@@ -11,7 +11,7 @@ from kiteline_agent.config import AgentConfig
 from kiteline_agent.governor.cost_model import Work
 from kiteline_agent.imaging import alignment_kernels, features
 from kiteline_agent.imaging.alignment_kernels import ALIGN_ITERATIONS, FINE_STEP_PX, MIN_NCC
-from kiteline_agent.imaging.optical_flow import BlankImages, Flow, follow
+from kiteline_agent.imaging.optical_flow import BadImages, Flow, follow
 from kiteline_agent.initialisation.two_view import MIN_POINTS, two_view
 from kiteline_agent.keyframes.depth_from_motion import triangulated_sigma
 from kiteline_agent.keyframes.new_landmarks import NewPoints
@@ -70,7 +70,7 @@ class TwoViewStart:
         self._first_t_ns = 0
         self._frames = 0
         self._last: U8 = np.zeros((0, 0), np.uint8)
-        self._blank = BlankImages()
+        self._bad = BadImages()
         self._uv0 = np.zeros((0, 2))
         self._octave = np.zeros(0, np.uint8)
         self._templates = np.zeros((0, 3, alignment_kernels.TEMPLATE, alignment_kernels.TEMPLATE), np.uint8)
@@ -128,7 +128,7 @@ class TwoViewStart:
         """Follow the corners from the last frame that showed them. False if this one does not."""
         if len(self._uv):
             after, keep = follow(self._last, images.left[0], self._uv, _FLOW)
-            if self._blank.leaves_out(keep):
+            if self._bad.leaves_out(keep):
                 return False
             self._uv, self._uv0 = after[keep], self._uv0[keep]
             self._octave, self._index = self._octave[keep], self._index[keep]

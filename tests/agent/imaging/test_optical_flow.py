@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from kiteline_agent.imaging.optical_flow import BlankImages, Flow, as_bright_as, follow
+from kiteline_agent.imaging.optical_flow import BadImages, Flow, as_bright_as, follow
 from kiteline_core.arrays import U8
 
 FLOW = Flow(window_px=15, return_px=0.5)
@@ -53,7 +53,7 @@ def test_an_image_in_the_same_light_is_left_as_it_is() -> None:
 
 
 def test_blank_images_are_left_out_a_few_in_a_row() -> None:
-    blank, shown, none = BlankImages(3), np.arange(10) < 1, np.zeros(10, np.bool_)
+    blank, shown, none = BadImages(3), np.arange(10) < 1, np.zeros(10, np.bool_)
     assert [blank.leaves_out(found) for found in (shown, none, none, shown, none)] == [False, True, True, False, True]
     assert [blank.leaves_out(none) for _ in range(5)] == [True, True, False, True, True]
     assert not blank.leaves_out(np.zeros(0, np.bool_))
