@@ -10,6 +10,7 @@ Usage: python -m kiteline_bench.reality.cpu SOURCE    prints the yardstick of a 
 import json
 import sys
 import time
+from itertools import islice
 from statistics import median
 from typing import Any
 
@@ -32,22 +33,20 @@ _MEDIAN = f"median of {RUNS} runs"
 _TIMEOUT_S = 300.0
 
 
-def yardstick_ms(source: str, *, rest_s: float = 0.0) -> list[float]:
+def yardstick_ms(source: str, *, rest_s: float = 0.0, images: int | None = None) -> list[float]:
     """CPU in ms of cv2.ORB_create(1000).detectAndCompute on every fourth left image, on one thread.
 
     rest_s: before each, as between the frames of a flight; some machines make memory slow that rests.
+    images: the first ones alone; None for all.
     """
     cv2.setNumThreads(1)
-    orb, spent, number = cv2.ORB_create(_CORNERS), [], 0  # type: ignore[attr-defined]
-    for item in open_source(source):
-        if not isinstance(item, Frame):
-            continue
-        if number % _EVERY == 0:
-            time.sleep(rest_s)
-            begin_ns = time.thread_time_ns()
-            orb.detectAndCompute(item.left, None)
-            spent.append((time.thread_time_ns() - begin_ns) / 1e6)
-        number += 1
+    orb, spent = cv2.ORB_create(_CORNERS), []  # type: ignore[attr-defined]
+    frames = (item for item in open_source(source) if isinstance(item, Frame))
+    for frame in islice(frames, 0, None if images is None else images * _EVERY, _EVERY):
+        time.sleep(rest_s)
+        begin_ns = time.thread_time_ns()
+        orb.detectAndCompute(frame.left, None)
+        spent.append((time.thread_time_ns() - begin_ns) / 1e6)
     return spent[1:]  # the first one allocates
 
 
