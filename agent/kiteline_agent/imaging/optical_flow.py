@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 
 from kiteline_core.arrays import F64, U8, Bool
 
-_LEAST_FOLLOWED = 0.08  # share of the corners that an image must show: fewer, and it is black, covered or damaged
 _SAME_LIGHT = 1.1  # ratio of the contrasts or means of two images below which flow is as good as in equal light
 _LIGHT_STEP = 4  # px between the pixels whose contrast and mean are compared
 
@@ -24,22 +23,6 @@ class Flow:
     window_px: int
     border_px: float = 8.0  # a window of 15 px lies inside
     return_px: float = np.inf
-
-
-class BadImages:
-    """Tells which images to leave out: torn ones and those that show hardly any of the corners before, not for ever."""
-
-    def __init__(self, most: int = 4) -> None:
-        """most: in a row that are left out; flow hardly reaches over more than four frames."""
-        self._most = most
-        self._in_a_row = 0
-
-    def leaves_out(self, found: Bool, *, torn: bool = False) -> bool:
-        """True if an image in which these of the corners (n,) were found is to be left out."""
-        bad = torn or int(np.count_nonzero(found)) < _LEAST_FOLLOWED * len(found)
-        leaves = bad and self._in_a_row < self._most
-        self._in_a_row = self._in_a_row + 1 if leaves else 0
-        return leaves
 
 
 def follow(before: U8, after: U8, uv: F64, flow: Flow, levels: int = 3, guess: F64 | None = None) -> tuple[F64, Bool]:

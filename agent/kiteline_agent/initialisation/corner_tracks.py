@@ -6,19 +6,16 @@ import numpy as np
 
 from kiteline_agent.imaging import features
 from kiteline_agent.imaging.features import DetectorConfig, Pyramid
-from kiteline_agent.imaging.optical_flow import BadImages, Flow, follow
+from kiteline_agent.imaging.optical_flow import Flow, follow
 from kiteline_agent.inertial_start_config import CornerTracksConfig
-from kiteline_core.arrays import F64, I64, U8, Bool
+from kiteline_agent.initialisation.frame_flow import BadImages, FrameFlow
+from kiteline_core.arrays import F64, I64, Bool
 from kiteline_core.geometry.cameras import RectifiedCamera
 
 _LEVELS, _NEAR_LEVELS = 3, 1  # of the flow above the finest one; where a corner is known to be near
 _REPLENISH = 0.85  # share of the corners below which a keyframe adds new ones
 _FLOW = Flow(window_px=15, return_px=0.5)  # the smallest window that keeps hold of corners
 _DRIFT_PX = 2.0  # px between flow over frames and flow from the last keyframe
-_JUMP_PX = 8.0  # px by which the motion of a corner changes from image to image: parallax of no vehicle does
-_TORN = 0.2  # share of the corners that jump in a torn image, at least
-_FITS = 5  # of a linear motion, each with the weights of the one before
-_LEAST_KNOWN = 20  # corners whose motion into the image before is known, to tell jumps
 KEYFRAME_S = 0.24  # s between two keyframes: short enough for flow, long enough for parallax
 _THINNED_S = 0.6  # s; longest time between two keyframes after one was left out
 CORNERS = 200  # followed at once; a bundle of 100 long tracks is as accurate as one of 300
@@ -69,10 +66,8 @@ class CornerTracks:
         self._next_id = 0
         self._ids: I64 = np.zeros(0, np.int64)
         self._uv = np.zeros((0, 2))  # in the last keyframe
-        self._last: U8 | None = None  # frame into which they were followed, and where they are there
-        self._last_uv = np.zeros((0, 2))
-        self._last_step = np.zeros((0, 2))  # px by which they moved into that frame; NaN: unknown
-        self._bad, self._bad_keyframes = BadImages(), BadImages(1)
+        self._frames = FrameFlow(_FLOW)  # where they are in the last frame
+        self._bad_keyframes = BadImages(1)
 
     def is_due(self, t_ns: int) -> bool:
         """True if a frame is to become a keyframe."""
@@ -83,15 +78,10 @@ class CornerTracks:
 
         False if the image is left out.
         """
-        if self._last is not None and len(self._last_uv):
-            uv, good = follow(self._last, left[0], self._last_uv, _FLOW, _LEVELS)
-            step = uv - self._last_uv
-            if self._bad.leaves_out(good, torn=is_torn(uv[good], step[good] - self._last_step[good])):
-                self._last_step[:] = np.nan
-                return False
-            self._last_uv, self._last_step = uv[good], step[good]
-            self._uv, self._ids = self._uv[good], self._ids[good]
-        self._last = left[0]
+        good = self._frames.follow(left[0])
+        if good is None:
+            return False
+        self._uv, self._ids = self._uv[good], self._ids[good]
         return True
 
     def add(self, t_ns: int, left: Pyramid, turn: F64 | None = None) -> bool:
@@ -100,22 +90,24 @@ class CornerTracks:
         turn: (3,3) rotation of this camera in that of the last keyframe; None: unknown. It counts if the corners were
         not followed into this frame.
         """
-        step = np.zeros((0, 2))
+        near = self._frames.image is left[0]
+        good = np.zeros(len(self._uv), np.bool_)
         if self.keyframes and len(self._uv):
-            before, near = self.keyframes[-1].left[0], self._last is left[0]
+            before = self.keyframes[-1].left[0]
             if near:
-                uv, good = follow(before, left[0], self._uv, _FLOW, _NEAR_LEVELS, self._last_uv)
-                good &= np.linalg.norm(uv - self._last_uv, axis=1) < _DRIFT_PX
+                uv, good = follow(before, left[0], self._uv, _FLOW, _NEAR_LEVELS, self._frames.uv)
+                good &= np.linalg.norm(uv - self._frames.uv, axis=1) < _DRIFT_PX
             else:
                 guess = None if turn is None else self._turned(turn)
                 uv, good = follow(before, left[0], self._uv, _FLOW, _LEVELS, guess)
                 if self._bad_keyframes.leaves_out(good):
                     return False
             self._uv, self._ids = uv[good], self._ids[good]
-            step = self._last_step[good] if near else step
         self._replenish(left)
-        self._last_uv, self._last_step = self._uv, np.full((len(self._uv), 2), np.nan)
-        self._last_step[: len(step)] = step
+        if near:
+            self._frames.replace(good, self._uv)
+        else:
+            self._frames.begin(left[0], self._uv)
         self.keyframes.append(TrackedKeyframe(t_ns, left, self._ids.copy(), self._uv.copy()))
         return True
 
@@ -164,25 +156,6 @@ class CornerTracks:
         self._uv = np.concatenate([self._uv, found])
         self._ids = np.concatenate([self._ids, self._next_id + np.arange(len(found))])
         self._next_id += len(found)
-
-
-def is_torn(uv: F64, change: F64) -> bool:
-    """True if a part of an image jumped: it is torn. uv: (n,2) px of corners. change: (n,2) px of their motions from
-    image to image; NaN where unknown.
-
-    Turns, rolls and steps of the camera change motions by a linear function of the place, which is fitted robustly.
-    What it leaves are jumps.
-    """
-    known = np.isfinite(change).all(axis=1)
-    if np.count_nonzero(known) < _LEAST_KNOWN:
-        return False
-    change, A = change[known], np.column_stack([np.ones(np.count_nonzero(known)), uv[known] - uv[known].mean(axis=0)])
-    off_px = np.linalg.norm(change - np.median(change, axis=0), axis=1)
-    for _ in range(_FITS):
-        weight = 1.0 / (1.0 + (2.0 * off_px / _JUMP_PX) ** 2)
-        fit = np.linalg.lstsq(A * weight[:, None], change * weight[:, None], rcond=None)[0]
-        off_px = np.linalg.norm(change - A @ fit, axis=1)
-    return bool(np.mean(off_px > _JUMP_PX) > _TORN)
 
 
 def covering(corners: CornerObservations, longest: int, each: int) -> I64:

@@ -11,14 +11,15 @@ from kiteline_agent.config import AgentConfig
 from kiteline_agent.governor.cost_model import Work
 from kiteline_agent.imaging import alignment_kernels, features
 from kiteline_agent.imaging.alignment_kernels import ALIGN_ITERATIONS, FINE_STEP_PX, MIN_NCC
-from kiteline_agent.imaging.optical_flow import BadImages, Flow, follow
+from kiteline_agent.imaging.optical_flow import Flow
+from kiteline_agent.initialisation.frame_flow import FrameFlow
 from kiteline_agent.initialisation.two_view import MIN_POINTS, two_view
 from kiteline_agent.keyframes.depth_from_motion import triangulated_sigma
 from kiteline_agent.keyframes.new_landmarks import NewPoints
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_agent.tracking.frame_images import NO_GRID, FrameImages
-from kiteline_core.arrays import F64, U8
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import KeyframeId
@@ -69,13 +70,11 @@ class TwoViewStart:
         self._first: FrameImages | None = None
         self._first_t_ns = 0
         self._frames = 0
-        self._last: U8 = np.zeros((0, 0), np.uint8)
-        self._bad = BadImages()
+        self._corners = FrameFlow(_FLOW)  # that are still followed
         self._uv0 = np.zeros((0, 2))
         self._octave = np.zeros(0, np.uint8)
         self._templates = np.zeros((0, 3, alignment_kernels.TEMPLATE, alignment_kernels.TEMPLATE), np.uint8)
-        self._uv = np.zeros((0, 2))
-        self._index = np.zeros(0, np.int64)  # template of each corner that is still followed
+        self._index = np.zeros(0, np.int64)  # template of each of them
 
     @property
     def at_first_view(self) -> bool:
@@ -102,11 +101,11 @@ class TwoViewStart:
         self._frames += 1
         if not self._follow(ctx.images):
             return None
-        flow = np.linalg.norm(self._uv - self._uv0, axis=1)
+        flow = np.linalg.norm(self._corners.uv - self._uv0, axis=1)
         start = None
-        if len(flow) >= MIN_POINTS and np.median(flow) > config.min_flow * self._camera.fx:
+        if self._corners.smooth and len(flow) >= MIN_POINTS and np.median(flow) > config.min_flow * self._camera.fx:
             start = self._reconstruct(self._first, ctx.images)
-        few = len(self._uv) < max(MIN_POINTS, _MIN_SHARE * len(self._templates))
+        few = len(self._corners.uv) < max(MIN_POINTS, _MIN_SHARE * len(self._templates))
         if start is not None:
             self._first = None
         elif few or (ctx.t_ns - self._first_t_ns) * 1e-9 >= _MAX_S:
@@ -118,32 +117,30 @@ class TwoViewStart:
         images = ctx.images
         corners = features.detect(images.left, np.zeros((0, 2)), self._detector)
         self._first, self._first_t_ns, self._frames = replace(images, right=None), ctx.t_ns, 0
-        self._last = images.left[0]
-        self._uv0, self._uv, self._octave = corners.uv, corners.uv.copy(), corners.octave
+        self._corners.begin(images.left[0], corners.uv)
+        self._uv0, self._octave = corners.uv, corners.octave
         self._templates = np.empty((len(corners.uv), *self._templates.shape[1:]), np.uint8)
         self._index = np.arange(len(corners.uv))
         alignment_kernels.cut_templates(images.aligned, corners.uv, corners.octave, self._templates)
 
     def _follow(self, images: FrameImages) -> bool:
         """Follow the corners from the last frame that showed them. False if this one does not."""
-        if len(self._uv):
-            after, keep = follow(self._last, images.left[0], self._uv, _FLOW)
-            if self._bad.leaves_out(keep):
-                return False
-            self._uv, self._uv0 = after[keep], self._uv0[keep]
-            self._octave, self._index = self._octave[keep], self._index[keep]
-        self._last = images.left[0]
+        good = self._corners.follow(images.left[0])
+        if good is None:
+            return False
+        self._uv0, self._octave, self._index = self._uv0[good], self._octave[good], self._index[good]
         return True
 
     def _reconstruct(self, first: FrameImages, images: FrameImages) -> TwoViewMap | None:
         """Align the corners with their templates, and solve for motion and depth."""
-        uv, found, ncc = self._uv.copy(), np.zeros(len(self._uv), np.bool_), np.zeros(len(self._uv))
-        warp = np.tile(self._mean_warp(), (len(uv), 1, 1))
+        n, uv = len(self._corners.uv), self._corners.uv.copy()
+        found, ncc = np.zeros(n, np.bool_), np.zeros(n)
+        warp = np.tile(self._mean_warp(), (n, 1, 1))
         alignment_kernels.align(
             images.aligned, NO_GRID, self._templates, self._index, self._octave, warp, uv, 0, 0,
             ALIGN_ITERATIONS, FINE_STEP_PX, MIN_NCC, found, ncc,
         )  # fmt: skip
-        uv[~found] = self._uv[~found]
+        uv[~found] = self._corners.uv[~found]
         seen = two_view(self._uv0, uv, self._intrinsics, self._frames)
         if seen is None:
             return None
@@ -160,4 +157,4 @@ class TwoViewStart:
     def _mean_warp(self) -> F64:
         """Linear part (2,2) of the affine map that fits the corners of the first frame to those of the last."""
         a = np.column_stack([self._uv0, np.ones(len(self._uv0))])
-        return np.ascontiguousarray(np.linalg.lstsq(a, self._uv, rcond=None)[0][:2].T)
+        return np.ascontiguousarray(np.linalg.lstsq(a, self._corners.uv, rcond=None)[0][:2].T)

@@ -4,7 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from kiteline_agent.imaging.optical_flow import BadImages, Flow, as_bright_as, follow
+from kiteline_agent.imaging.optical_flow import Flow, as_bright_as, follow
+from kiteline_agent.initialisation.frame_flow import BadImages
 from kiteline_core.arrays import U8
 
 FLOW = Flow(window_px=15, return_px=0.5)
