@@ -46,7 +46,7 @@ class InertialTracker:
         self._initialiser = ImuInitialiser(
             config, calibration, self._p_b_c, self._buffer, self.self_calibration.correct
         )
-        self._reported_s = config.calibration.offset_s
+        self._reported_s = self._followed_s = config.calibration.offset_s  # offset last told; applied then or later
         self.scale = ScaleFilter(calibration, config.gravity_m_s2, self._p_b_c)  # of a monocular map
         self._scale_watch = ScaleWatch(self.scale, self._p_b_c, self._has_come, self._between_frames)
         # the interval that was asked for last
@@ -106,18 +106,24 @@ class InertialTracker:
         return {name: round(1e3 * value, 2) for name, value in values.items()}
 
     def take_calibration_events(self) -> list[str]:
-        """Lines for the log: the applied offset has changed by a millisecond, a correction of axes began."""
+        """Lines for the log: the applied offset follows one that was not told yet, a correction of axes began."""
         events = self.self_calibration.take_events() + self.clock.take_events()
-        if abs(self.self_calibration.offset_s - self._reported_s) >= 1e-3:
-            self._reported_s = self.self_calibration.offset_s
-            found, sigma = (1e3 * value for value in self.time_offset_s)
-            events.append(f"camera stamps + {found:.1f} ms are the IMU's time (deviation {sigma:.1f} ms)")
+        if (
+            abs(self.self_calibration.offset_s - self._followed_s) >= 1e-3
+        ):  # it follows in steps, each of which is no news
+            self._followed_s = self.self_calibration.offset_s
+            found_s, sigma_s = self.time_offset_s
+            if abs(found_s - self._reported_s) >= 1e-3:
+                self._reported_s = found_s
+                events.append(
+                    f"camera stamps + {1e3 * found_s:.1f} ms are the IMU's time (deviation {1e3 * sigma_s:.1f} ms)"
+                )
         return events
 
     def begin_with(self, known: KnownImuConfig) -> None:
         """Begin with what earlier flights found of the IMU."""
         self.self_calibration.begin_with(known)
-        self._reported_s = self.self_calibration.offset_s
+        self._reported_s = self._followed_s = self.self_calibration.offset_s
 
     # per frame
 
