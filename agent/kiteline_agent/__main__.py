@@ -31,6 +31,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     a.key, a.told = sealing.key, sealing.lines
     kept = process.kept_folder(f"agent{a.agent}")
     options = options_of(a, Path(a.log) / kept.name if a.log else kept)
+    process.outlive_terminal()
     fly_live(options, None, process.StopSignal(), numbers_in(kept))
     process.exit_now(0)
 

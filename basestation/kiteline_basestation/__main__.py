@@ -41,6 +41,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     start = numbers_in(process.kept_folder("base")).next(max(1, least))
     if start.kept:
         process.print_lines([f"the number of this session cannot be kept: {start.kept}"])
+    process.outlive_terminal()
     stored = fly_live(options_of(a, start.order), None, process.StopSignal())
     process.exit_now(0 if stored else 1)
 

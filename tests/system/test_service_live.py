@@ -82,6 +82,7 @@ def test_an_agent_stops_within_a_second_and_closes_its_log(serve: Serve, raw_fli
     program, told = serve("agent", raw_flight, "--log", tmp_path / "logs")
     until(told, "READY=1")
     until(told, "WATCHDOG=1")
+    program.send_signal(signal.SIGHUP)  # its terminal closed: no reason to stop
     time.sleep(1.5)
     assert stop_in_s(program) < STOP_S
     assert program.returncode == 0
@@ -143,6 +144,9 @@ def test_a_base_is_ready_before_it_imports_and_can_be_stopped_meanwhile(
     lines = until(told, "STATUS=reading the map")
     assert "READY=1" in lines
     assert lines[-2:] == ["STATUS=reading the map", "WATCHDOG_USEC=3600000000"]
+    program.send_signal(signal.SIGHUP)  # its terminal closed: no reason to stop
+    time.sleep(0.2)
+    assert program.poll() is None
     assert stop_in_s(program) < STOP_S
     assert program.returncode == 0
 

@@ -20,7 +20,7 @@ from kiteline_hw.links.ends import LinkOptions
 from kiteline_hw.links.queued_link import INBOX_BYTES, MOST_PACKET_BYTES, LinkCounters, QueuedLink
 from kiteline_hw.links.zenoh_access import Instances, access_of_base
 from kiteline_hw.links.zenoh_session import (
-    check_port,
+    check_endpoint,
     close_session,
     direct,
     no_stop_at_exit,
@@ -331,11 +331,11 @@ class ZenohHub(Closing):
 
 def open_agent_end(address: str, options: LinkOptions) -> ZenohLink:
     """Connect to the base at an endpoint, in the background. Raises LinkError for one without a port."""
-    check_port(address)
+    check_endpoint(address)
     return ZenohLink(address, options.agent, group=options.group, logins=options.logins)
 
 
 def open_base_end(address: str, options: LinkOptions) -> ZenohHub:
     """Listen on an endpoint. Raises LinkError."""
-    check_port(address)
+    check_endpoint(address)
     return ZenohHub(address, group=options.group, logins=options.logins)

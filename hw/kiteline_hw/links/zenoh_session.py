@@ -30,6 +30,8 @@ _ROUTER = "router/"  # before a locator: a Zenoh router listens there, and both 
 _SOURCE_LINE = re.compile(r"\.? at /\S+\.rs:\d+\.?")
 _WITHOUT_PORT = re.compile(r"(?P<host>(router/)?(tcp|udp|tls|quic|ws)/(\[[^]]*\]|[^:?#]*)):?(?P<options>([?#].*)?)")
 
+_PROTOCOLS = ("tcp", "udp", "tls", "quic", "ws", "unixsock-stream", "unixpipe", "serial", "vsock")
+
 Role = Literal["client", "base"]
 
 
@@ -38,8 +40,13 @@ def reason_of(error: zenoh.ZError) -> str:
     return _SOURCE_LINE.sub("", str(error))
 
 
-def check_port(endpoint: str) -> None:
-    """Raise LinkError for an endpoint of an IP protocol without a port, which Zenoh tries in vain without a word."""
+def check_endpoint(endpoint: str) -> None:
+    """Raise LinkError for an endpoint without protocol or port, at which Zenoh tries in vain without a word."""
+    protocol, slash, address = endpoint.removeprefix(_ROUTER).partition("/")
+    if not slash or protocol not in _PROTOCOLS:
+        host = address.strip("/") if slash else protocol
+        whole = host if host.rpartition(":")[2].isdecimal() else f"{host or 'HOST'}:7447"
+        raise LinkError(f"{endpoint!r} is no Zenoh endpoint: write tcp/{whole}")
     found = _WITHOUT_PORT.fullmatch(endpoint)
     if found is not None:
         who = "router" if endpoint.startswith(_ROUTER) else "base"

@@ -20,6 +20,7 @@ from kiteline_hw.mavlink.transport.signing import Signing, StampFile, read_key
 from kiteline_hw.mavlink.transport.url import parse_mavlink_url
 from kiteline_hw.mavlink.tunnel.tunnel_end import AGENT_END, TunnelConfig
 from kiteline_hw.ports import Clock, LinkError, SourceReport
+from kiteline_hw.system import process
 
 HEADINGS = ("start", "controller")  # of the frame of the poses
 POSE_MESSAGES = ("odometry", "vision")
@@ -98,6 +99,8 @@ def _sink_options(options: ControllerOptions, T_b_f: F64, clock: Clock) -> SinkO
     if options.key:
         stamps = StampFile(Path(options.folder or Path(options.key).parent) / "mavlink_stamp")
         signing = Signing(read_key(Path(options.key)), stamps)
+        if stamps.fault:  # the vehicle flies all the same
+            process.print_lines([f"{stamps.fault}: after a start without a clock, signed messages may be refused"])
     return SinkOptions(signing, start, memory, shared_tunnel(options.url, options.link), computer=True)
 
 

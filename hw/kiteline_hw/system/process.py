@@ -83,6 +83,11 @@ def exit_on_sigterm() -> None:
     signal.signal(signal.SIGTERM, on_signal)
 
 
+def outlive_terminal() -> None:
+    """Go on when the terminal closes, as at the end of an SSH session over bad Wi-Fi: a flight does not end with it."""
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+
+
 def exit_now(status: int) -> NoReturn:
     """End the process now, after logs and sessions were closed.
 

@@ -1,5 +1,6 @@
 """Zenoh links: reconnect with either side, never block the caller, never keep a process from ending."""
 
+import re
 import signal
 import time
 from typing import Any
@@ -8,9 +9,10 @@ import pytest
 import zenoh
 
 from kiteline_hw.links import zenoh_session
+from kiteline_hw.links.open import open_link
 from kiteline_hw.links.queued_link import INBOX_PACKETS, OUTBOX_PACKETS, QueuedLink
 from kiteline_hw.links.zenoh_link import ZenohHub, ZenohLink
-from kiteline_hw.links.zenoh_session import check_port, open_session
+from kiteline_hw.links.zenoh_session import check_endpoint, open_session
 from kiteline_hw.ports import LinkError
 from tests.hw.processes import free_endpoint, start, wait_for
 
@@ -256,7 +258,17 @@ def test_an_endpoint_that_is_taken_is_told_without_lines_of_zenohs_sources() -> 
                  "unixsock-stream//tmp/kiteline", "serial//dev/ttyS0#baudrate=9600", "vsock/-1:1234"],
 )  # fmt: skip
 def test_endpoints_with_a_port_and_those_that_have_none_are_taken(endpoint: str) -> None:
-    check_port(endpoint)
+    check_endpoint(endpoint)
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "right"),
+    [("192.168.1.5:7447", "tcp/192.168.1.5:7447"), ("192.168.1.5", "tcp/192.168.1.5:7447"),
+     ("tcp://10.0.0.1:7448", "tcp/10.0.0.1:7448"), ("tpc/10.0.0.1:7448", "tcp/10.0.0.1:7448"), ("", "tcp/HOST:7447")],
+)  # fmt: skip
+def test_an_endpoint_that_zenoh_would_try_in_vain_is_refused(endpoint: str, right: str) -> None:
+    with pytest.raises(LinkError, match=f"write {re.escape(right)}$"):
+        open_link(f"zenoh:{endpoint}" if endpoint else "zenoh:router/", "agent")
 
 
 def test_bad_numbers_and_names() -> None:

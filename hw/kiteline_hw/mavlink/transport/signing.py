@@ -2,6 +2,7 @@
 
 import contextlib
 import hashlib
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -15,6 +16,7 @@ from kiteline_hw.ports import LinkError
 _EPOCH_S = 1420070400  # s: 1 January 2015, at which stamps begin
 _TICKS = 100_000  # stamps count 10 us
 _AHEAD = 60 * _TICKS  # by which the stored stamp is ahead of those in use
+_AGAIN = 5 * _TICKS  # from one attempt to store it to the next
 _RADIO_STATUS = 109  # telemetry radios cannot sign
 
 
@@ -32,27 +34,48 @@ def read_key(path: Path) -> bytes:
     return hashlib.sha256(text.encode()).digest()
 
 
-class StampFile:
-    """Keeps on disk a stamp later than all that were used, so that stamps increase even over a loss of power."""
+def _in_thread(work: Callable[[], None]) -> None:
+    threading.Thread(target=work, name="kiteline-stamp", daemon=True).start()
 
-    def __init__(self, path: Path, wall_s: Callable[[], float] = time.time) -> None:
-        self._path = path
+
+class StampFile:
+    """Keeps on disk a stamp later than all that were used, so that stamps increase even over a loss of power.
+
+    first: the stamp to begin with. fault: why it cannot be kept, "" if it is. In flight the disk is written beside the
+    messages: a card that stalls must not hold up the poses.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        wall_s: Callable[[], float] = time.time,
+        beside: Callable[[Callable[[], None]], None] = _in_thread,
+    ) -> None:
+        """beside: does a piece of work without waiting for it."""
+        self._path, self._beside = path, beside
         stored = 0
         with contextlib.suppress(OSError, ValueError):
             stored = int(path.read_text(encoding="ascii"))
         self.first = max(stored, round((wall_s() - _EPOCH_S) * _TICKS), 1)
-        self._reserved = 0
-        self.reserve(self.first)
+        self._reserved = self._asked = self.first  # on disk; when it was written last, or tried
+        self.fault = ""
+        self._store(self.first)
 
     def reserve(self, stamp: int) -> None:
-        """Store a stamp ahead of `stamp`, unless the stored one is ahead of it already. Raises LinkError."""
-        if stamp < self._reserved - _AHEAD // 2:
+        """Have a stamp ahead of `stamp` stored, unless the stored one is ahead of it already or was just tried."""
+        if stamp < self._reserved - _AHEAD // 2 or stamp < self._asked + _AGAIN:
             return
+        self._asked = stamp
+        self._beside(lambda: self._store(stamp))
+
+    def _store(self, stamp: int) -> None:
+        """Store a stamp ahead of this one."""
         try:
             write_atomically(self._path, str(stamp + _AHEAD).encode())
         except OSError as error:
-            raise LinkError(f"{self._path}: cannot keep the stamp of MAVLink's signatures ({error})") from error
-        self._reserved = stamp + _AHEAD
+            self.fault = f"{self._path}: cannot keep the stamp of MAVLink's signatures ({error.strerror or error})"
+        else:
+            self.fault, self._reserved = "", stamp + _AHEAD
 
 
 class SigningMavlink(common.MAVLink):  # type: ignore[misc]  # pymavlink's classes are untyped
@@ -80,5 +103,4 @@ class Signing:
     def before_signing(self, mav: Any) -> None:
         """Move the stamp on with the clock before a message is signed."""
         mav.signing.timestamp = max(mav.signing.timestamp, round((self._wall_s() - _EPOCH_S) * _TICKS))
-        with contextlib.suppress(LinkError):  # a full disk must not stop the poses
-            self._stamps.reserve(mav.signing.timestamp)
+        self._stamps.reserve(mav.signing.timestamp)

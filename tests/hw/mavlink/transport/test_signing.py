@@ -1,12 +1,16 @@
 """Signed messages: who is believed, and stamps that never go back."""
 
+import errno
 import struct
+import threading
+import time
 from pathlib import Path
 
 import pytest
 
 from kiteline_hw.mavlink.codec import MavlinkCodec
 from kiteline_hw.mavlink.messages import Heartbeat, RadioStatus, TimeSync
+from kiteline_hw.mavlink.transport import signing
 from kiteline_hw.mavlink.transport.signing import Signing, StampFile, read_key
 from kiteline_hw.ports import LinkError
 
@@ -58,12 +62,44 @@ def test_a_computer_without_a_clock_goes_on_with_later_stamps(tmp_path: Path) ->
 
 def test_a_long_flight_keeps_the_stored_stamp_ahead(tmp_path: Path) -> None:
     now_s = WALL_S
-    stamps = StampFile(tmp_path / "stamp", lambda: now_s)
+    stamps = StampFile(tmp_path / "stamp", lambda: now_s, beside=lambda work: work())
     codec = MavlinkCodec(1, 1, Signing(KEY, stamps, lambda: now_s))
     for _ in range(100):
         now_s += 7.0
         stamp = stamp_of(codec.encode(TimeSync(0, 1)))
         assert int((tmp_path / "stamp").read_text(encoding="ascii")) > stamp
+
+
+def test_messages_never_wait_for_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A card that stalls, and one that is full: no message waits, and the disk is asked every few seconds."""
+    now_s, asked, free = WALL_S, [], threading.Event()
+
+    def stalls(path: Path, content: bytes) -> None:
+        asked.append(now_s - WALL_S)
+        if not free.wait(20.0):
+            raise AssertionError("the message waited for the disk")
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    stamps = StampFile(tmp_path / "stamp", lambda: now_s)
+    codec = MavlinkCodec(1, 1, Signing(KEY, stamps, lambda: now_s))
+    monkeypatch.setattr(signing, "write_atomically", stalls)
+    for _ in range(600):
+        now_s += 0.1
+        codec.encode(TimeSync(0, 1))
+    assert not free.is_set() and not stamps.fault
+    free.set()
+    deadline = time.monotonic() + 10.0
+    while not stamps.fault and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert "No space left" in stamps.fault
+    assert 4 <= len(asked) <= 7 and asked[0] > 29.0  # the stored stamp is ahead by a minute
+
+
+def test_a_disk_that_cannot_be_written_stops_no_start(tmp_path: Path) -> None:
+    (tmp_path / "file").write_bytes(b"")
+    stamps = StampFile(tmp_path / "file" / "stamp", lambda: WALL_S)
+    assert "cannot keep the stamp" in stamps.fault
+    assert stamp_of(MavlinkCodec(1, 1, Signing(KEY, stamps, lambda: WALL_S)).encode(TimeSync(0, 1))) >= stamps.first
 
 
 def test_keys(tmp_path: Path) -> None:
@@ -77,5 +113,3 @@ def test_keys(tmp_path: Path) -> None:
         read_key(path)
     with pytest.raises(LinkError, match="cannot read the key"):
         read_key(tmp_path / "none")
-    with pytest.raises(LinkError, match="cannot keep the stamp"):
-        StampFile(path / "under_a_file", lambda: WALL_S)
