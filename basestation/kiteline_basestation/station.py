@@ -1,7 +1,8 @@
 """The station: the mapper with one channel to each agent. Packets enter, packets leave."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.exchange.correction_batches import CorrectionBatches
@@ -12,9 +13,9 @@ from kiteline_basestation.jobs import Job, JobDone
 from kiteline_basestation.management import Answer, Command
 from kiteline_basestation.mapper import Mapper, MapperInput
 from kiteline_codec.channel import CodedChannel, RecordChannel
-from kiteline_codec.schema import PASSING_KINDS, Key, LivePose, Record, WireError, messages
+from kiteline_codec.schema import PASSING_KINDS, Key, KeyframeHeader, LivePose, Record, WireError, messages
 from kiteline_codec.schema.owners import KEYFRAME_BYTES, submap_of
-from kiteline_core.ids import AgentId
+from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId
 from kiteline_core.places.place_index import Vocabulary
 
 
@@ -61,9 +62,23 @@ class Station:
             self.channels[agent] = channel = self._open_channel(agent)
             if isinstance(channel, CodedChannel):
                 channel.endpoint.earlier.is_gone = lambda key: submap_of(key) in self.mapper.deleted
+                channel.endpoint.claims.is_of_use = self._is_of_use
             self._batches[agent] = CorrectionBatches(agent, self._publish)
             self._deleted_values[agent] = DeletedValues()
         return self.channels[agent]
+
+    def _is_of_use(self, key: Key, code: bytes, also: Collection[Key]) -> bool:
+        """True for a header whose parent has a pose, and for what belongs to a keyframe that is known.
+
+        also: keys of values that will be in the map, too.
+        """
+        header_of = partial(Key, KeyframeHeader.KIND)
+        if key.kind != KeyframeHeader.KIND:
+            return KeyframeId(key.id) in self.mapper.map or header_of(key.id) in also
+        record = messages.decode(key, code)
+        assert isinstance(record, KeyframeHeader)
+        parent = record.parent
+        return parent == NO_KEYFRAME or header_of(parent) in also or self.mapper.map.pose(parent) is not None
 
     def track_changes(self) -> None:
         """From now on collect in `changed` which values change: (agent, True if the base wrote it, key).

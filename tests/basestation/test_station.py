@@ -107,3 +107,21 @@ def test_keyframes_that_are_made_up_earn_nothing(make_flight: Callable[..., Any]
     fly(station, CodedChannel(SyncConfig(), 1), flight)
     assert station.mapper.counts.keyframes == 12
     assert base_end.endpoint.claims.earned <= KEYFRAME_BYTES
+
+
+def test_a_base_that_meets_an_agent_late_takes_all_it_has(make_flight: Callable[..., Any]) -> None:
+    """The newest keyframes come first, and claim all memory that a stranger may; none is of use without the first."""
+    flight = make_flight(keyframes=40, turns=1.0)
+    agent_end, base_end = CodedChannel(SyncConfig(), 1), coded_channel(1, peer=flight.agent)
+    claimed = sum(record.keypoints for records in flight.records for record in records[:1]) * 120
+    config = replace(base_end.endpoint.config, unused_inbox_bytes=claimed // 2)
+    object.__setattr__(base_end.endpoint, "config", config)
+    for records in flight.records:
+        for record in records:
+            agent_end.put(record)
+    late = replace(flight, records=[[] for _ in range(120)])
+    station = Station(BaseConfig(), lambda agent: base_end)
+    fly(station, agent_end, late)
+    assert len(station.mapper.map) == 40
+    assert all(station.mapper.map.is_complete(k) for k in flight.keyframes)
+    assert station.mapper.counts.keyframes >= 40 and agent_end.endpoint.quiet

@@ -111,6 +111,11 @@ class Endpoint:
         held = self._in.held(key)
         return None if held is None else held[1]
 
+    @property
+    def _room_bytes(self) -> int:
+        """Memory for all that the peer claims."""
+        return self.claims.allowed_bytes(self.config) - self.earlier.bytes - self._in.held_bytes
+
     def earlier_values(self) -> dict[Key, bytes]:
         """What earlier sessions of the peer wrote and its present one has not replaced, by key; a copy."""
         return dict(self.earlier.codes)
@@ -135,7 +140,7 @@ class Endpoint:
 
     @property
     def digests(self) -> tuple[bytes, bytes]:
-        """Digests of what this side wrote and of what the peer wrote."""
+        """Digests of what this side and the peer wrote."""
         return self._out.digest.bytes(), self._in.digest.bytes()
 
     @property
@@ -191,14 +196,13 @@ class Endpoint:
                 items = self._own_items(self._expanded(items))
             except WireError as e:
                 return self._refuse(str(e))
-            allowed = self.claims.allowed_bytes(self.config) - self.earlier.bytes
-            if not self._in.room_for(items, allowed - self.claims.bytes, self.config.max_assembly_bytes):
+            room = self._room_bytes + self._in.held_bytes - self.claims.bytes
+            if not self._in.room_for(items, room, self.config.max_assembly_bytes):
                 self._refuse("no memory left for it")
                 return updates
             self._in.packets.mark(number)
             self._owe_answer(now_ns)
             self._in.raise_watermark(watermark)
-            limit = allowed - self._in.held_bytes
             for item in items:
                 known = self._in.held(item.key) is not None
                 update = self._in.apply(item)
@@ -208,12 +212,11 @@ class Endpoint:
                     if update.key.kind == resumption.SUMMARY_KIND:
                         self._take_summary(update.code or b"")
                         continue
-                    known = known or update.key in self.earlier.codes
+                    known = (known or update.key in self.earlier.codes) and not self.claims.waits(update.key)
                     self.earlier.drop(update.key)
-                    if update.code is not None and not known and not self.claims.fit(update.key, update.code, limit):
-                        self._refuse("no memory left for what it claims")
-                        continue
-                    updates.append(update)
+                    if update.code is None or known or self.claims.fit(update.key, update.code, self._room_bytes):
+                        updates.append(update)
+        updates += self.claims.due(lambda k: self.peer_value(k) or self.earlier.codes.get(k), self._room_bytes, now_ns)
         self._compare(header, now_ns)
         return updates
 

@@ -5,7 +5,7 @@ packed.
 """
 
 import heapq
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 
 from kiteline_codec.schema import KEYFRAME_KINDS, Key
@@ -18,6 +18,9 @@ from kiteline_codec.transport.packet import MASK_BITS, Item
 from kiteline_codec.transport.sequence_window import SequenceWindow
 
 VALUE_BYTES = 350  # memory of a value beside its code, roughly; of a removal or of a value that came in part, too
+_AT_ONCE = 0.5  # share of the memory that values claim as they come
+_IN_TIME = 0.75  # the same with those that waited; the rest is for values that claim nothing, or are not used yet
+_TRIED_NS = 200_000_000  # between two looks at those that wait
 _MOST_PIECES = 256  # gaps in a value that comes in part: a link has 64 packets in flight
 
 
@@ -36,22 +39,34 @@ class _Assembly:
     received: ranges.Ranges
 
 
+IsOfUse = Callable[[Key, bytes, Collection[Key]], bool]
+
+
 class Claims:
     """Memory that values of the peer claim where they are used until that is deleted: removing a value frees nothing.
 
-    earned: bytes that the peer may claim because what it sent was of use.
+    earned: bytes that the peer may claim because what it sent was of use. What does not fit waits, and is used oldest
+    first: after a long flight out of reach the newest keyframes come first, and hang on all before them.
+    is_of_use: whether what the value under a key hangs on is in use, or among these keys.
     """
 
     def __init__(self, claimed_bytes: Callable[[Key, bytes], int]) -> None:
         """claimed_bytes: of a code under a key."""
         self._claimed_bytes = claimed_bytes
+        self.is_of_use: IsOfUse = lambda key, code, also: True
         self.bytes = self.earned = 0
+        self._waiting: set[Key] = set()
+        self._tried_ns = 0  # when those that wait were tried
 
     def allowed_bytes(self, config: SyncConfig) -> int:
         """Memory for all that the peer wrote and claims."""
         if config.unused_inbox_bytes is None:
             return config.max_inbox_bytes
         return min(config.max_inbox_bytes, config.unused_inbox_bytes + self.earned)
+
+    def waits(self, key: Key) -> bool:
+        """True if the value under a key does not fit yet."""
+        return key in self._waiting
 
     def resume(self, key: Key, code: bytes) -> None:
         """Count a value that was here before the start."""
@@ -60,15 +75,40 @@ class Claims:
         self.earned += claimed + len(code) + VALUE_BYTES
 
     def fit(self, key: Key, code: bytes, limit: int) -> bool:
-        """Count a value unless all claims would then be above the limit; returns whether it was counted."""
+        """Count a value unless all claims would then be above their share of the limit: then it waits."""
         claimed = self._claimed_bytes(key, code)
-        if claimed and self.bytes + claimed > limit:
+        if claimed and self.bytes + claimed > _AT_ONCE * limit:
+            self._waiting.add(key)
             return False
+        self._waiting.discard(key)
         self.bytes += claimed
         return True
 
+    def due(self, code_of: Callable[[Key], bytes | None], limit: int, now_ns: int) -> list[Update]:
+        """Those that waited, are of use and fit now: they are counted. code_of: of a key; None: it was removed."""
+        if not self._waiting or now_ns - self._tried_ns < _TRIED_NS:
+            return []
+        self._tried_ns = now_ns
+        due: dict[Key, Update] = {}
+        for key in sorted(self._waiting, key=lambda key: (key.id, key)):
+            code = code_of(key)
+            if code is None:
+                self._waiting.discard(key)
+                continue
+            claimed = self._claimed_bytes(key, code)
+            if self.bytes + claimed > _IN_TIME * limit:
+                break
+            if self.is_of_use(key, code, due):
+                self.bytes += claimed
+                due[key] = Update(key, code)
+        self._waiting.difference_update(due)
+        return list(due.values())
+
     def release(self, key: Key, code: bytes) -> None:
         """Count a value no more: where it was used, it is deleted. What it had earned goes with it."""
+        if key in self._waiting:
+            self._waiting.discard(key)
+            return
         claimed = self._claimed_bytes(key, code)
         self.bytes = max(0, self.bytes - claimed)
         self.earned = max(0, self.earned - claimed - len(code) - VALUE_BYTES)

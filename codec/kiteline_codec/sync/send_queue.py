@@ -72,10 +72,10 @@ def item_of(
         return Item(key, version, None, 0, b"") if head <= room else None
     alone = head + varint_bytes(zigzag(key.id)) - varint_bytes(zigzag(key.id - last_id))  # in a packet of its own
     start, stop = entry.unsent[0]
-    fits_alone = alone + varint_bytes(len(code)) + len(code) <= empty
+    whole = entry.unsent == ((0, entry.size),)
+    fits_alone = whole and alone + varint_bytes(len(code)) + len(code) <= empty  # the rest of a split one goes in parts
     if fits_alone and len(code) > _MAX_COMPRESSION * room:
         return None
-    whole = entry.unsent == ((0, entry.size),)
     if residual is not None and not entry.send_plain and whole:
         data = residual()
         if data is not None and head + varint_bytes(len(data)) + len(data) <= room:

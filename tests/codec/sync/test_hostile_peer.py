@@ -170,7 +170,33 @@ def test_headers_claim_the_map_that_they_name() -> None:
         keypoints += sum(r.keypoints for r in received if isinstance(r, KeyframeHeader))
         channel.receive([sender.packet([sender.item(messages.key(header), None, 0, b"")])], 0)
     assert 0 < keypoints * 86 <= 16 << 20
-    assert dict(channel.stats.reasons)
+
+
+def test_headers_that_do_not_fit_wait_and_are_used_oldest_first() -> None:
+    """They come newest first; each hangs on the one before, and what was of use makes room for more."""
+    channel, sender, used = coded_channel(1, peer=AgentId(3)), Sender(), []
+    claims = channel.endpoint.claims
+    claims.is_of_use = lambda key, code, also: key.id - 1 in {0, *used} or any(k.id == key.id - 1 for k in also)
+
+    def take(items: list[Item], now_ns: int) -> list[int]:
+        return [r.keyframe for r in channel.receive([sender.packet(items)], now_ns) if isinstance(r, KeyframeHeader)]
+
+    first = keyframe_id(submap_id(3, 0, 0), 0)
+    headers = [header_of(3, i, 2000) for i in range(300)]  # 240 kB each of 32 MiB
+    at_once = [k for h in reversed(headers) for k in take([sender.record(h)], 0)]
+    assert at_once == [h.keyframe for h in headers[:-80:-1]][: len(at_once)] and 50 < len(at_once) < 79
+    used = [first - 1]  # what the oldest one hangs on
+    tile = Key(GridTile.KIND, 1)
+    in_time = take([sender.whole(tile, b"x")], 10**9)
+    assert in_time == [h.keyframe for h in headers[: len(in_time)]] and 20 < len(in_time) < 50
+    used += in_time
+    assert take([sender.whole(tile, b"y")], 2 * 10**9) == []
+    changed = replace(headers[150], T_p_k=np.diag([1.0, -1.0, -1.0, 1.0]))
+    assert take([sender.record(changed)], 2 * 10**9) == []  # a newer version waits as well
+    claims.earned += 100 << 20
+    rest = take([sender.whole(tile, b"z")], 3 * 10**9)
+    assert sorted(at_once + in_time + rest) == [h.keyframe for h in headers]
+    assert rest == sorted(rest)
 
 
 def test_an_agent_fills_no_more_than_its_first_share_until_something_was_of_use() -> None:
