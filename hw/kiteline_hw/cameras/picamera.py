@@ -3,6 +3,7 @@
 import contextlib
 import importlib
 import time
+from concurrent.futures import CancelledError
 from dataclasses import dataclass
 from typing import Any
 
@@ -39,6 +40,7 @@ class PiCamera:
         self._number = number
         self._settings = settings
         self._camera: Any = None
+        self._job: Any = None  # the request for the next image, queued in Picamera2
 
     def open(self) -> str:
         """Start the camera; what was chosen, for the user. Raises CameraError."""
@@ -74,11 +76,17 @@ class PiCamera:
     def read(self, timeout_s: float) -> Capture | None:
         """The next image, or None if none came in time. Raises CameraError."""
         try:
-            request = self._camera.capture_request(wait=timeout_s)
+            # A job that nobody waits for any more still takes an image and its buffer: one job is kept until it ends.
+            self._job = self._job or self._camera.capture_request(wait=False)
+            request = self._job.get_result(timeout=timeout_s)
         except TimeoutError:
             return None
+        except CancelledError:  # by `close` from another thread
+            return None
         except (RuntimeError, OSError) as error:
+            self._job = None
             raise CameraError(f"camera {self.name} failed ({error}): check its ribbon cable") from error
+        self._job = None
         try:
             stamp = request.get_metadata().get("SensorTimestamp")
             rows = np.asarray(request.make_array("main"), np.uint8)
@@ -90,11 +98,15 @@ class PiCamera:
 
     def close(self) -> None:
         """Stop the camera; it may be started again."""
-        camera, self._camera = self._camera, None
-        if camera is not None:
+        camera, self._camera, self._job = self._camera, None, None
+        if camera is None:
+            return
+        steps = [camera.stop, camera.close]
+        if hasattr(camera, "cancel_all_and_flush"):  # since 0.3.20; `stop` would wait behind the queued job
+            steps.insert(0, camera.cancel_all_and_flush)
+        for step in steps:  # a camera that cannot be stopped is released nevertheless
             with contextlib.suppress(RuntimeError, OSError):
-                camera.stop()
-                camera.close()
+                step()
 
 
 def open_source(argument: str, mono: bool, imu: bool, given: FileCalibration | None = None) -> CameraSource:
