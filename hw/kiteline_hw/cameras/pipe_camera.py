@@ -16,7 +16,11 @@ _PIPE_BYTES = 1 << 20  # a whole image fits, so that the program never waits for
 _FIRST_IMAGE_S = 12.0  # s until the first image: a stream begins with its next whole picture
 _HEAD = re.compile(rb"P5\s(\d{1,5})\s(\d{1,5})\s255\s")
 _HEAD_BYTES = 20  # bytes that a head has at most
-_LAST_WORDS = 300  # characters of what the program said that an error message repeats
+_WORDS = 300  # characters of a line of the program's errors that a message repeats
+_UNFINISHED_BYTES = 8192  # of a line of its errors that is kept until it ends
+_END_S = 0.5  # s that its last words are awaited
+_UNKNOWN_OPTION = "Unrecognized option"
+_TAG = re.compile(r"\[[^\]]* @ 0x[0-9a-f]+\] *")  # of the part of ffmpeg that speaks, with its address in memory
 
 
 class PipeCamera:
@@ -27,14 +31,16 @@ class PipeCamera:
 
     start_s = _FIRST_IMAGE_S
 
-    def __init__(self, name: str, command: Sequence[str], mend: str) -> None:
-        """mend: what to tell a user whose program ends."""
+    def __init__(self, name: str, command: Sequence[str], mend: str, older: Sequence[Sequence[str]] = ()) -> None:
+        """mend: what to tell a user whose program ends. older: commands for versions that do not know an option."""
         self.name = name
         self._command = tuple(command)
+        self._older = list(older)
         self._mend = mend
         self._process: subprocess.Popen[bytes] | None = None
         self._received = bytearray()
-        self._words = b""
+        self._unfinished = b""  # the line of its errors that has not ended yet
+        self._first_words = self._last_words = ""  # lines of its errors: the first since the last image; the last
         self._speaks = True  # the program's error output is open
 
     def open(self) -> str:
@@ -53,11 +59,15 @@ class PipeCamera:
             assert stream is not None
             os.set_blocking(stream.fileno(), False)
             _enlarge(stream.fileno())
-        self._received, self._words, self._speaks = bytearray(), b"", True
+        self._received, self._unfinished, self._speaks = bytearray(), b"", True
+        self._first_words = self._last_words = ""
         return f"{self.name}: by {os.path.basename(self._command[0])}"
 
     def read(self, timeout_s: float) -> Capture | None:
-        """The next image, or None if none came in time. Raises CameraError if the program ended, BadImage."""
+        """The next image, or None if none came in time. Raises CameraError if the program ended, BadImage.
+
+        A program that ends because it does not know an option is started again with the older command.
+        """
         process = self._process
         assert process is not None and process.stdout is not None and process.stderr is not None
         out, said = process.stdout.fileno(), process.stderr.fileno()
@@ -65,16 +75,19 @@ class PipeCamera:
         while (capture := self._take()) is None:
             wait_s = end_s - time.monotonic()
             ready, _, _ = select.select([out, said] if self._speaks else [out], [], [], max(0.0, wait_s))
+            data = _read(out) if out in ready else None
             if said in ready:
-                text = _read(said)
-                self._speaks = text != b""
-                self._words = (self._words + (text or b""))[-2 * _LAST_WORDS :]
-            if out in ready:
-                data = _read(out)
-                if data == b"":
-                    raise CameraError(f"camera {self.name} ended{self._last_words()}: {self._mend}")
-                self._received += data or b""
-            elif wait_s <= 0.0:
+                self._listen(said)
+            if data == b"":
+                words = self._words_at_end(process, said)
+                if not self._older or _UNKNOWN_OPTION not in words:
+                    raise CameraError(f"camera {self.name} ended{words and f' ({words})'}: {self._mend}")
+                self.close()
+                self._command = tuple(self._older.pop(0))
+                self.open()
+                return None
+            self._received += data or b""
+            if data is None and wait_s <= 0.0:
                 return None
         return capture
 
@@ -94,6 +107,7 @@ class PipeCamera:
             return None
         data = bytes(memoryview(self._received)[head.end() : end])
         del self._received[:end]
+        self._first_words = ""
         return Capture(None, None, RawPixels(width, height, "mono8", width, data))
 
     def close(self) -> None:
@@ -107,9 +121,26 @@ class PipeCamera:
             assert stream is not None
             stream.close()
 
-    def _last_words(self) -> str:
-        lines = self._words.decode(errors="replace").strip().splitlines()
-        return f" ({lines[-1].strip()[:_LAST_WORDS]})" if lines else ""
+    def _listen(self, said: int) -> None:
+        """Read what the program says now."""
+        text = _read(said)
+        self._speaks = text != b""
+        *lines, self._unfinished = (self._unfinished + (text or b"")).split(b"\n")
+        self._unfinished = self._unfinished[-_UNFINISHED_BYTES:]
+        if not self._speaks:
+            lines.append(self._unfinished)
+        for line in lines:
+            words = _TAG.sub("", line.decode(errors="replace")).strip()[:_WORDS]
+            if words:
+                self._first_words, self._last_words = self._first_words or words, words
+
+    def _words_at_end(self, process: subprocess.Popen[bytes], said: int) -> str:
+        """Why the program ended. Its first error names the cause; those after it follow from it."""
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(_END_S)
+        while self._speaks and select.select([said], [], [], 0.0)[0]:
+            self._listen(said)
+        return self._first_words or self._last_words
 
 
 def _read(fd: int) -> bytes | None:

@@ -23,17 +23,25 @@ def open_source(argument: str, mono: bool, imu: bool, given: FileCalibration | N
     stereo = (len(urls) == 2 or options.side_by_side) and not mono
     rig = live_options.read_rig("stream", options, stereo=stereo, given=given)
     cameras = [
-        PipeCamera(url, ffmpeg_command(url), f"check its address, for instance with `ffplay {shlex.quote(url)}`")
+        PipeCamera(
+            url,
+            ffmpeg_command(url),
+            f"check its address, for instance with `ffplay {shlex.quote(url)}`",
+            older=[ffmpeg_command(url, "-vsync")],
+        )
         for url in (urls[:1] if mono else urls)
     ]
     return CameraSource(f"stream:{text}", rig, cameras, options.fps, options.side_by_side)
 
 
-def ffmpeg_command(url: str) -> list[str]:
-    """ffmpeg's arguments: grey images of the stream's own size, each as it comes, none twice."""
+def ffmpeg_command(url: str, rate_option: str = "-fps_mode") -> list[str]:
+    """ffmpeg's arguments: grey images of the stream's own size, each as it comes, none twice.
+
+    rate_option: `-fps_mode` is known from version 5.1 on, `-vsync` before version 9.
+    """
     rtsp = ["-rtsp_transport", "tcp"] if url.startswith("rtsp") else []
     return [
-        "ffmpeg", "-nostdin", "-hide_banner", "-loglevel", "error", *_NO_DELAY, *rtsp, "-i", url, "-an", "-vsync",
+        "ffmpeg", "-nostdin", "-hide_banner", "-loglevel", "error", *_NO_DELAY, *rtsp, "-i", url, "-an", rate_option,
         "passthrough", "-f", "image2pipe", "-c:v", "pgm", "-pix_fmt", "gray", "-",
     ]  # fmt: skip
 

@@ -13,6 +13,7 @@ import pytest
 from kiteline_hw.cameras.camera import CameraError
 from kiteline_hw.cameras.live_source import CameraSource
 from kiteline_hw.cameras.pipe_camera import PipeCamera
+from kiteline_hw.cameras.stream import ffmpeg_command
 from kiteline_hw.ports import SourceError
 from kiteline_hw.sensors.raw_pixels import BadImage
 from kiteline_hw.sources.open import open_source
@@ -38,7 +39,7 @@ def test_images_of_a_pipe_are_cut_at_their_heads() -> None:
     with pytest.raises(BadImage, match="no PGM"):
         camera.read(5.0)
     assert camera.read(5.0).image.grey()[0, 0] == 9
-    with pytest.raises(CameraError, match=r"camera pipe ended( \(it is over\))?: mend it"):
+    with pytest.raises(CameraError, match=r"camera pipe ended \(it is over\): mend it"):
         camera.read(5.0)
     camera.close()
 
@@ -50,6 +51,59 @@ def test_a_silent_program_holds_nobody() -> None:
     assert camera.read(0.05) is None
     assert time.monotonic() - begin_s < 1.0
     camera.close()
+    camera.close()
+
+
+def ffmpeg_of(folder: Path, monkeypatch: pytest.MonkeyPatch, known: str) -> None:
+    """A model of ffmpeg on the path that knows one of the options for the rate, and refuses others as ffmpeg does."""
+    path = folder / "ffmpeg"
+    path.write_text(
+        f"#!{sys.executable}\nimport sys, time\n"
+        f"if {known!r} not in sys.argv:\n"
+        " option = next(a for a in ('-fps_mode', '-vsync') if a in sys.argv)\n"
+        " print(f\"Unrecognized option '{option[1:]}'.\", file=sys.stderr)\n"
+        " sys.exit('Error splitting the argument list: Option not found')\n"
+        "while True:\n sys.stdout.buffer.write(b'P5\\n64 48\\n255\\n' + bytes(64 * 48)); sys.stdout.flush(); "
+        "time.sleep(0.05)\n"
+    )
+    path.chmod(0o755)
+    monkeypatch.setenv("PATH", str(folder), prepend=":")
+
+
+@pytest.mark.parametrize("known", ["-fps_mode", "-vsync"])
+def test_every_version_of_ffmpeg_gives_images(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, known: str) -> None:
+    ffmpeg_of(tmp_path, monkeypatch, known)
+    (tmp_path / "camera.yaml").write_text(CALIBRATION)
+    source = open_source(f"stream:udp://127.0.0.1:5000?fps=20&calibration={tmp_path}/camera.yaml")
+    assert isinstance(source, CameraSource)
+    try:
+        assert source.poll(time.monotonic_ns() + 10_000_000_000) is not None
+        assert not any("ended" in line for line in source.take_messages())
+    finally:
+        source.close()
+
+
+def test_an_option_that_no_version_knows_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ffmpeg_of(tmp_path, monkeypatch, "-neither")
+    camera = PipeCamera("cam", ffmpeg_command("u"), "mend it", older=[ffmpeg_command("u", "-vsync")])
+    camera.open()
+    assert camera.read(10.0) is None  # ended, and begun with the other option
+    with pytest.raises(CameraError, match=r"ended \(Unrecognized option 'vsync'\.\): mend it"):
+        camera.read(10.0)
+    camera.close()
+
+
+def test_the_first_error_since_an_image_is_told() -> None:
+    camera = program(
+        "err = lambda s: (sys.stderr.write(s + '\\n'), sys.stderr.flush())\n"
+        "err('a damaged picture'); time.sleep(0.1)\n"
+        "out.write(b'P5\\n4 2\\n255\\n' + bytes(8)); out.flush(); time.sleep(0.2)\n"
+        "err('[tcp @ 0x5566] Connection refused'); err('Error opening input files')\n"
+    )
+    camera.open()
+    assert camera.read(5.0) is not None
+    with pytest.raises(CameraError, match=r"ended \(Connection refused\)"):
+        camera.read(5.0)
     camera.close()
 
 
