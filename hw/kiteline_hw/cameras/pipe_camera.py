@@ -20,13 +20,17 @@ _WORDS = 300  # characters of a line of the program's errors that a message repe
 _UNFINISHED_BYTES = 8192  # of a line of its errors that is kept until it ends
 _END_S = 0.5  # s that its last words are awaited
 _UNKNOWN_OPTION = "Unrecognized option"
-_TAG = re.compile(r"\[[^\]]* @ 0x[0-9a-f]+\] *")  # of the part of ffmpeg that speaks, with its address in memory
+_PROGRESS = re.compile(r"\[(?:trace|debug|verbose|info|warning)\]")  # lines that are no errors
+# ffmpeg says so of the pictures that it decodes. It scales them to the size of the first one without another word.
+_DECODED_SIZE = re.compile(r"\[graph .*\] w:(\d+) h:(\d+) pixfmt:")
+_TAG = re.compile(r"\[(?:[^\]]* @ 0x[0-9a-f]+|error|fatal|panic)\] *")  # the part of ffmpeg that speaks; its level
 
 
 class PipeCamera:
     """Images from a program, which is started again when it ends.
 
-    A pipe carries no capture times: images count from their arrival.
+    A pipe carries no capture times: images count from their arrival. ffmpeg has to be told `-loglevel level+verbose`:
+    it names the size of what it decodes at that level alone.
     """
 
     start_s = _FIRST_IMAGE_S
@@ -41,6 +45,7 @@ class PipeCamera:
         self._received = bytearray()
         self._unfinished = b""  # the line of its errors that has not ended yet
         self._first_words = self._last_words = ""  # lines of its errors: the first since the last image; the last
+        self._size: tuple[int, int] | None = None  # width and height of the decoded pictures, px
         self._speaks = True  # the program's error output is open
 
     def open(self) -> str:
@@ -60,7 +65,7 @@ class PipeCamera:
             os.set_blocking(stream.fileno(), False)
             _enlarge(stream.fileno())
         self._received, self._unfinished, self._speaks = bytearray(), b"", True
-        self._first_words = self._last_words = ""
+        self._first_words, self._last_words, self._size = "", "", None
         return f"{self.name}: by {os.path.basename(self._command[0])}"
 
     def read(self, timeout_s: float) -> Capture | None:
@@ -76,7 +81,8 @@ class PipeCamera:
             wait_s = end_s - time.monotonic()
             ready, _, _ = select.select([out, said] if self._speaks else [out], [], [], max(0.0, wait_s))
             data = _read(out) if out in ready else None
-            if said in ready:
+            # A new size is named before its first picture is written, so that it is read here before that is used.
+            if self._speaks:
                 self._listen(said)
             if data == b"":
                 words = self._words_at_end(process, said)
@@ -122,17 +128,28 @@ class PipeCamera:
             stream.close()
 
     def _listen(self, said: int) -> None:
-        """Read what the program says now."""
-        text = _read(said)
-        self._speaks = text != b""
-        *lines, self._unfinished = (self._unfinished + (text or b"")).split(b"\n")
+        """Read what the program says now. Raises CameraError if its pictures have another size than before."""
+        data = _read(said)
+        self._speaks = data != b""
+        *lines, self._unfinished = (self._unfinished + (data or b"")).split(b"\n")
         self._unfinished = self._unfinished[-_UNFINISHED_BYTES:]
         if not self._speaks:
             lines.append(self._unfinished)
         for line in lines:
-            words = _TAG.sub("", line.decode(errors="replace")).strip()[:_WORDS]
-            if words:
+            text = line.decode(errors="replace")
+            if size := _DECODED_SIZE.match(text):
+                self._take_size((int(size[1]), int(size[2])))
+            words = _TAG.sub("", text).strip()[:_WORDS]
+            if words and not _PROGRESS.search(text):
                 self._first_words, self._last_words = self._first_words or words, words
+
+    def _take_size(self, size: tuple[int, int]) -> None:
+        last, self._size = self._size or size, size
+        if size != last:
+            raise CameraError(
+                f"camera {self.name} sends {size[0]}x{size[1]} px instead of {last[0]}x{last[1]}: "
+                "set it to the size of the calibration"
+            )
 
     def _words_at_end(self, process: subprocess.Popen[bytes], said: int) -> str:
         """Why the program ended. Its first error names the cause; those after it follow from it."""

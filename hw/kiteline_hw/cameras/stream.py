@@ -41,8 +41,8 @@ def ffmpeg_command(url: str, rate_option: str = "-fps_mode") -> list[str]:
     """
     rtsp = ["-rtsp_transport", "tcp"] if url.startswith("rtsp") else []
     return [
-        "ffmpeg", "-nostdin", "-hide_banner", "-loglevel", "error", *_NO_DELAY, *rtsp, "-i", url, "-an", rate_option,
-        "passthrough", "-f", "image2pipe", "-c:v", "pgm", "-pix_fmt", "gray", "-",
+        "ffmpeg", "-nostdin", "-hide_banner", "-nostats", "-loglevel", "level+verbose", *_NO_DELAY, *rtsp, "-i", url,
+        "-an", rate_option, "passthrough", "-f", "image2pipe", "-c:v", "pgm", "-pix_fmt", "gray", "-",
     ]  # fmt: skip
 
 

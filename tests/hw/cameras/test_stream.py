@@ -5,6 +5,7 @@ import socket
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -104,6 +105,38 @@ def test_the_first_error_since_an_image_is_told() -> None:
     assert camera.read(5.0) is not None
     with pytest.raises(CameraError, match=r"ended \(Connection refused\)"):
         camera.read(5.0)
+    camera.close()
+
+
+def test_an_image_that_was_scaled_from_another_size_is_refused() -> None:
+    size = "'[graph 0 input from stream 0:0 @ 0x5566] [verbose] w:{} h:{} pixfmt:yuv420p tb:1/90000\\n'"
+    camera = program(
+        "def size(w, h):\n"
+        f" sys.stderr.write({size}.format(w, h)); sys.stderr.flush()\n"
+        " out.write(b'P5\\n4 2\\n255\\n' + bytes(8)); out.flush()\n"
+        "size(4, 2); size(4, 2); time.sleep(0.5); size(8, 4)\n"  # equal sizes: its colours changed
+        "time.sleep(60)"
+    )
+    camera.open()
+    assert camera.read(5.0) is not None and camera.read(5.0) is not None
+    with pytest.raises(CameraError, match="camera pipe sends 8x4 px instead of 4x2"):
+        camera.read(5.0)
+    camera.close()
+
+
+@pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="needs ffmpeg")
+def test_a_stream_of_a_real_ffmpeg_that_changes_its_size(tmp_path: Path) -> None:
+    stream = b""
+    for size in ("64x48", "128x80"):
+        command = ["ffmpeg", "-nostdin", "-loglevel", "error", "-f", "lavfi", "-i", f"testsrc=size={size}:rate=20",
+                   "-t", "1", "-c:v", "mpeg2video", "-g", "5", "-bf", "0", "-f", "mpegts", "-"]  # fmt: skip
+        stream += subprocess.run(command, stdout=subprocess.PIPE, check=True).stdout
+    (tmp_path / "both.ts").write_bytes(stream)
+    url = str(tmp_path / "both.ts")
+    camera = PipeCamera("cam", ffmpeg_command(url), "", older=[ffmpeg_command(url, "-vsync")])
+    camera.open()
+    with pytest.raises(CameraError, match="cam sends 128x80 px instead of 64x48"):
+        list(iter(partial(camera.read, 5.0), "never"))
     camera.close()
 
 
