@@ -23,6 +23,7 @@ from kiteline_hw.ports import SourceError, SourceReport
 from kiteline_hw.sensors.imu_buffer import ImuStream
 from kiteline_hw.sensors.raw_pixels import BadImage
 from kiteline_hw.sensors.split_imu import ImuJoiner
+from kiteline_hw.sensors.topic_clock import TopicClock, TopicClocks
 from kiteline_hw.sources.mcap_messages import BadMessage, read_image, read_imu, read_stamp
 from kiteline_hw.sources.open import open_source as open_recording
 
@@ -30,8 +31,6 @@ _WAITING = 4  # messages that wait for the thread that decodes; the oldest are d
 _MAX_SAMPLES = 8192  # buffered between two frames; 40 s at 200 Hz
 _IMU = "imu="
 _WAIT_NS = 1_000_000_000  # ns that a rate waits for the acceleration after it, which another topic brings
-_AT_ONCE_NS = 20_000  # ns between two readings of a clock without a pause between them
-_READINGS = 5  # of both clocks, at most
 
 
 class RosCamera:
@@ -39,11 +38,12 @@ class RosCamera:
 
     start_s = 3.0  # discovery takes a second or two
 
-    def __init__(self, topic: str, node: RosNode) -> None:
+    def __init__(self, topic: str, node: RosNode, clock: TopicClock) -> None:
         self.name = topic
         self._node = node
+        self._clock = clock
         self._subscription: Any = None
-        self._messages: queue.Queue[Any] = queue.Queue(_WAITING)
+        self._messages: queue.Queue[tuple[int, Any]] = queue.Queue(_WAITING)  # with their times
 
     def open(self) -> str:
         """Subscribe."""
@@ -54,9 +54,10 @@ class RosCamera:
         return f"{self.name}: {kind}, {found or 'not yet any'} publisher{'s' if found > 1 else ''}"
 
     def _take(self, message: Any) -> None:
+        t_ns = self._clock.to_ours(read_stamp(message, 0), time.monotonic_ns())
         while True:
             try:
-                self._messages.put_nowait(message)
+                self._messages.put_nowait((t_ns, message))
                 return
             except queue.Full:
                 try:
@@ -67,11 +68,11 @@ class RosCamera:
     def read(self, timeout_s: float) -> Capture | None:
         """The next image, or None if none came in time. Raises BadImage."""
         try:
-            message = self._messages.get(timeout=timeout_s)
+            t_ns, message = self._messages.get(timeout=timeout_s)
         except queue.Empty:
             return None
         try:
-            return Capture(monotonic_ns(message), None, read_image(message, {}))
+            return Capture(t_ns, None, read_image(message, {}))
         except BadMessage as error:
             raise BadImage(str(error)) from error
 
@@ -82,32 +83,17 @@ class RosCamera:
             self._node.unsubscribe(subscription)
 
 
-def monotonic_ns(message: Any) -> int | None:
-    """The stamp of a message, which is on the wall clock, on the monotonic one; None if it has none."""
-    stamp_ns = read_stamp(message, 0)
-    return None if stamp_ns == 0 else stamp_ns - _wall_less_monotonic_ns()
-
-
-def _wall_less_monotonic_ns() -> int:
-    """Difference of the two clocks. A thread that waits for its turn between two readings would add the wait."""
-    least_ns, difference_ns = 2**63, 0
-    for _ in range(_READINGS):
-        before_ns, wall_ns, after_ns = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
-        if after_ns - before_ns < least_ns:
-            least_ns, difference_ns = after_ns - before_ns, wall_ns - (before_ns + after_ns) // 2
-        if least_ns < _AT_ONCE_NS:
-            break
-    return difference_ns
-
-
 class RosSource:
     """A LiveSource: frames of one topic or two, and the inertial samples of another up to each frame."""
 
     ground_truth: Trajectory | None = None
     frame_count: int | None = None
 
-    def __init__(self, frames: CameraSource, node: RosNode, imu_topic: str, imu: ImuCalibration | None) -> None:
-        self._frames, self._node = frames, node
+    def __init__(
+        self, frames: CameraSource, node: RosNode, clocks: TopicClocks, imu_topic: str, imu: ImuCalibration | None
+    ) -> None:
+        """clocks: of the frames' topics, and for those of the IMU."""
+        self._frames, self._node, self._clocks = frames, node, clocks
         self.name, self.imu = frames.name, imu
         self._stream = ImuStream(frames.report)
         self._lock = threading.Lock()
@@ -115,9 +101,13 @@ class RosSource:
         self._joiner = ImuJoiner(frames.report, wait_ns=_WAIT_NS)
         gyro, comma, accel = imu_topic.partition(",")
         if gyro:
-            node.subscribe(node.types.Imu, gyro, partial(self._take_imu, self._add_gyro if comma else self._add))
+            self._subscribe(gyro, self._add_gyro if comma else self._add)
         if accel:
-            node.subscribe(node.types.Imu, accel, partial(self._take_imu, self._add_accel))
+            self._subscribe(accel, self._add_accel)
+
+    def _subscribe(self, topic: str, add: Callable[[int, tuple[float, ...]], None]) -> None:
+        clock = self._clocks.topic(f"imu {topic} tells no sample times")
+        self._node.subscribe(self._node.types.Imu, topic, partial(self._take_imu, add, clock))
 
     @property
     def rig(self) -> CameraRig:
@@ -137,21 +127,23 @@ class RosSource:
         """Right stamp minus left stamp over the last pairs: median, and the largest deviation from it."""
         return self._frames.skew_ns
 
-    def _take_imu(self, add: Callable[[int, tuple[float, ...]], None], message: Any) -> None:
+    def _take_imu(self, add: Callable[[int, tuple[float, ...]], None], clock: TopicClock, message: Any) -> None:
+        now_ns = time.monotonic_ns()
         try:
             rows = read_imu(message, 0)
         except BadMessage as error:
             self.report.skip("unreadable message", str(error))
             return
-        t_ns = monotonic_ns(message)
+        t_ns = clock.to_ours(read_stamp(message, 0), now_ns)
         with self._lock:
-            if t_ns is not None:
-                add(t_ns, rows[0][1])
+            add(t_ns, rows[0][1])
 
     def _add(self, t_ns: int, row: tuple[float, ...]) -> None:
         if not any(row[3:]):
             self.report.skip("imu sample without acceleration", "a topic of rates alone needs imu=GYRO,ACCEL")
-        elif len(self._stream) < _MAX_SAMPLES:
+        elif len(self._stream) >= _MAX_SAMPLES:
+            self.report.skip("imu sample beyond the buffer", f"at {t_ns} ns: no image came for too long")
+        else:
             self._stream.add(t_ns, row)
 
     def _add_gyro(self, t_ns: int, row: tuple[float, ...]) -> None:
@@ -189,7 +181,7 @@ class RosSource:
 
     def take_messages(self) -> list[str]:
         """Messages to the user since the last call."""
-        return self._frames.take_messages()
+        return self._frames.take_messages() + self._clocks.take_messages()
 
     def close(self) -> None:
         """End subscriptions, threads and node, within two seconds."""
@@ -214,10 +206,13 @@ def open_source(argument: str, mono: bool, imu: bool, given: FileCalibration | N
             f"ros2:{argument}: the IMU's noise and its place are not known: expected calibration=FILE with both (a "
             "recording of these topics with camera_info and tf_static, or Kalibr's camchain and imu.yaml), or no imu="
         )
-    node = RosNode()
-    cameras = [RosCamera(topic, node) for topic in (topics[:1] if mono else topics)]
+    node, clocks = RosNode(), TopicClocks()
+    cameras = [
+        RosCamera(topic, node, clocks.topic(f"camera {topic} tells no capture times"))
+        for topic in (topics[:1] if mono else topics)
+    ]
     frames = CameraSource(f"ros2:{text}", rig, cameras, options.fps, options.side_by_side)
-    return RosSource(frames, node, imu_topic if imu else "", calibration)
+    return RosSource(frames, node, clocks, imu_topic if imu else "", calibration)
 
 
 def _parse(argument: str) -> tuple[str, str, LiveOptions]:

@@ -16,6 +16,7 @@ from kiteline_core.frame import Frame, ImuBatch
 from kiteline_hw.cameras import ros2
 from kiteline_hw.cameras.ros2 import RosSource
 from kiteline_hw.ports import SourceError, is_live
+from kiteline_hw.sensors import topic_clock
 from kiteline_hw.sources.open import open_source
 
 W, H, S = 64, 48, 1_000_000_000
@@ -247,6 +248,46 @@ def test_samples_of_a_topic_of_rates_alone_are_left_out(graph: Graph, calibrated
     source.close()
 
 
+@pytest.mark.parametrize("ahead_s", [-86400, -2, 100])
+def test_topics_of_a_clock_that_is_off_still_fit_each_other(graph: Graph, calibrated: str, ahead_s: int) -> None:
+    source = open_source("ros2:/image?imu=/imu/data", calibration=calibrated)
+    assert isinstance(source, RosSource)
+    begun(source, graph, 2)
+    inertial(graph, "/imu/data", time.time_ns() + ahead_s * S, 0.0, 9.8)  # the quickest message
+    for _ in range(3):
+        time.sleep(0.04)
+        arrival_ns = time.monotonic_ns()
+        t_ns = time.time_ns() + ahead_s * S - 20_000_000
+        inertial(graph, "/imu/data", t_ns - 1_000_000, 0.1, 9.8)
+        image(graph, "/image", t_ns, 40)
+        samples, frame = polled(source), polled(source)
+        assert isinstance(samples, ImuBatch) and isinstance(frame, Frame)
+        assert frame.t_ns - samples.t_ns[-1] == pytest.approx(1_000_000, abs=100_000)
+        assert frame.t_ns == pytest.approx(arrival_ns - 20_000_000, abs=15_000_000)
+    told = [line for line in source.take_messages() if "on this computer's clock" in line]
+    assert len(told) == 2 and told[0].startswith("imu /imu/data") and told[1].startswith("camera /image"), told
+    assert f"s {'ahead' if ahead_s > 0 else 'behind'}" in told[0] and "chrony" in told[0]
+    assert source.report.skipped == {}
+    source.close()
+
+
+def test_samples_that_no_image_takes_are_counted(
+    graph: Graph, calibrated: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ros2, "_MAX_SAMPLES", 3)
+    source = open_source("ros2:/image?imu=/imu/data", calibration=calibrated)
+    assert isinstance(source, RosSource)
+    begun(source, graph, 2)
+    t_ns = time.time_ns() - 100_000_000
+    for k in range(5):
+        inertial(graph, "/imu/data", t_ns + 5_000_000 * k, 0.1, 9.8)
+    image(graph, "/image", t_ns + 30_000_000, 40)
+    samples = polled(source)
+    assert isinstance(samples, ImuBatch) and len(samples.t_ns) == 3
+    assert source.report.skipped == {"imu sample beyond the buffer": 2}
+    source.close()
+
+
 def test_a_pause_between_readings_of_the_clocks_does_not_move_a_stamp(monkeypatch: pytest.MonkeyPatch) -> None:
     for paused in range(4):
         now_ns, readings = [5 * S], [0]
@@ -259,9 +300,8 @@ def test_a_pause_between_readings_of_the_clocks_does_not_move_a_stamp(monkeypatc
             return begin_ns + now_ns[0]
 
         clocks = SimpleNamespace(monotonic_ns=lambda: read(0), time_ns=lambda: read(1000 * S))
-        monkeypatch.setattr(ros2, "time", clocks)
-        message = SimpleNamespace(header=header(1004 * S))
-        assert ros2.monotonic_ns(message) == pytest.approx(4 * S, abs=1000)
+        monkeypatch.setattr(topic_clock, "time", clocks)
+        assert topic_clock.wall_less_monotonic_ns() == pytest.approx(1000 * S, abs=1000)
 
 
 def test_a_middleware_that_fails_on_and_on_takes_no_processor(
