@@ -2,10 +2,12 @@
 
 The calibration is read from camera.yaml beside the images or one folder above: fx, fy, cx, cy, width, height, optional
 k1 k2 p1 p2 k3, for a pair baseline_m, and rate_hz (default 10) if the file names are no stamps. A name of 16 or more
-digits is a stamp in ns, one with a decimal point a stamp in seconds.
+digits is a stamp in ns, one with a decimal point a stamp in seconds. Other images are in the order of the numbers in
+their names. Left and right images are paired by their stamps, else by the numbers that vary in their names.
 """
 
 import glob
+import heapq
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,11 +16,12 @@ import numpy as np
 from kiteline_core.geometry.cameras import CameraRig, Lens
 from kiteline_hw.calibration.checks import checked_baseline
 from kiteline_hw.calibration.file_calibration import FileCalibration
-from kiteline_hw.ports import SourceError
-from kiteline_hw.sensors.frames import EncodedFrame
+from kiteline_hw.ports import SourceError, SourceReport
+from kiteline_hw.sensors.frames import EncodedFrame, pair_by_time, pair_tolerance_ns
+from kiteline_hw.sensors.image_names import in_natural_order, pair_keys
 from kiteline_hw.sensors.images import ImageFile
 from kiteline_hw.sources.calibration import camera_from_yaml
-from kiteline_hw.sources.recording import Recording, image_size
+from kiteline_hw.sources.recording import Recording, Stamped, frames_by_key, image_size
 from kiteline_hw.sources.text_files import read_yaml, seconds_to_ns, yaml_number
 
 _UNSTAMPED_HZ = 10.0  # rate of images whose names are no stamps
@@ -31,11 +34,9 @@ def open_source(pattern: str, mono: bool, imu: bool, given: FileCalibration | No
     if len(patterns) > 2:
         raise SourceError(f"images:{pattern}: expected one pattern, or two with a comma between")
     sides = [_list_files(p) for p in (patterns[:1] if mono else patterns)]
-    if len({len(files) for files in sides}) > 1:
-        raise SourceError(f"images:{pattern}: {len(sides[0])} left and {len(sides[1])} right images: expected as many")
     if given is not None:
         rig = given.rig_of_images(f"images:{pattern}", len(sides), image_size(sides[0]))
-        return _recording(pattern, rig, sides, _parse_times(sides[0], _UNSTAMPED_HZ))
+        return _recording(pattern, rig, sides, _UNSTAMPED_HZ)
     folder = sides[0][0].parent
     path = next((d / "camera.yaml" for d in (folder, folder.parent) if (d / "camera.yaml").is_file()), None)
     if path is None:
@@ -53,37 +54,58 @@ def open_source(pattern: str, mono: bool, imu: bool, given: FileCalibration | No
         T_c_r[0, 3] = yaml_number(table, "baseline_m", path)
         checked_baseline(T_c_r, f"{path}: baseline_m")
     rig = CameraRig(camera, right, np.eye(4), T_c_r, has_body=False)
-    times = _parse_times(sides[0], yaml_number(table, "rate_hz", path, _UNSTAMPED_HZ))
-    return _recording(pattern, rig, sides, times)
+    return _recording(pattern, rig, sides, yaml_number(table, "rate_hz", path, _UNSTAMPED_HZ))
 
 
-def _recording(pattern: str, rig: CameraRig, sides: list[list[Path]], times: list[int]) -> Recording:
-    return Recording(f"images:{pattern}", rig, len(times), lambda report: _read_frames(times, sides))
+def _recording(pattern: str, rig: CameraRig, sides: list[list[Path]], rate_hz: float) -> Recording:
+    """rate_hz: of images whose names are no stamps. Raises SourceError if the names do not tell what is a pair."""
+    name, lefts, rights = f"images:{pattern}", sides[0], sides[1] if len(sides) == 2 else []
+    stamped = [_stamped(side) for side in sides]
+    times = [t for t, _ in stamped[0]]
+    if rights and all(stamped):
+        return Recording(name, rig, len(lefts), lambda report: _pairs_by_time(stamped[0], stamped[1], report))
+    if not times:
+        if not rate_hz > 0:
+            raise SourceError(f"rate_hz is {rate_hz:g}: expected images a second")
+        times = [round(i * 1e9 / rate_hz) for i in range(len(lefts))]
+    keys = pair_keys(lefts, rights) if rights else (range(len(lefts)), ())
+    if keys is None:
+        raise SourceError(
+            f"{name}: the numbers of left and right images do not fit each other, {_first_mismatch(lefts, rights)}: "
+            "expected the two images of a pair with the same number, or with their stamps, as names"
+        )
+    return Recording(name, rig, len(lefts), lambda report: frames_by_key(times, lefts, rights, keys, report))
 
 
-def _read_frames(times: list[int], sides: list[list[Path]]) -> Iterator[EncodedFrame]:
-    for i, t in enumerate(times):
-        right = ImageFile(sides[1][i]) if len(sides) == 2 else None
-        yield EncodedFrame(t, ImageFile(sides[0][i]), right)
+def _first_mismatch(lefts: list[Path], rights: list[Path]) -> str:
+    """The first two names, in order, that are not the same on both sides."""
+    both = zip(lefts, rights, strict=False)
+    left, right = next((pair for pair in both if pair[0].name != pair[1].name), (lefts[0], rights[0]))
+    return f"first {left.name} and {right.name}"
+
+
+def _pairs_by_time(lefts: Stamped, rights: Stamped, report: SourceReport) -> Iterator[EncodedFrame]:
+    merged = heapq.merge(*([(t, side, path) for t, path in files] for side, files in enumerate((lefts, rights))))
+    tolerance_ns = pair_tolerance_ns(np.array([t for t, _ in lefts], np.int64))
+    for t, left, right in pair_by_time(merged, tolerance_ns, ("left image", "right image"), report):
+        yield EncodedFrame(t, ImageFile(left), None if right is None else ImageFile(right))
 
 
 def _list_files(pattern: str) -> list[Path]:
-    files = sorted(Path(p) for p in glob.glob(pattern) if Path(p).is_file())
+    """Files in the order of their stamps, else of the numbers in their names."""
+    files = in_natural_order([path for path in map(Path, glob.glob(pattern)) if path.is_file()])
     if not files:
         raise SourceError(f"images:{pattern}: no file matches: expected a pattern such as 'flight/*.png' (in quotes)")
-    return files
+    return [path for _, path in _stamped(files)] or files
 
 
-def _parse_times(files: list[Path], rate_hz: float) -> list[int]:
-    """Stamps in ns from the file names, else at the given rate."""
-    stems = [path.stem for path in files]
+def _stamped(files: list[Path]) -> Stamped:
+    """Files with their stamps in ns, in order of time; empty if a name is no stamp."""
     try:
-        if all(stem.isdecimal() and len(stem) >= 16 for stem in stems):
-            return [int(stem) for stem in stems]
-        if all("." in stem for stem in stems):
-            return [seconds_to_ns(stem) for stem in stems]
+        if all(path.stem.isdecimal() and len(path.stem) >= 16 for path in files):
+            return sorted((int(path.stem), path) for path in files)
+        if all("." in path.stem for path in files):
+            return sorted((seconds_to_ns(path.stem), path) for path in files)
     except ValueError:
         pass
-    if not rate_hz > 0:
-        raise SourceError(f"rate_hz is {rate_hz:g}: expected images a second")
-    return [round(i * 1e9 / rate_hz) for i in range(len(files))]
+    return []

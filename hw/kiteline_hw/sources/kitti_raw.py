@@ -15,8 +15,7 @@ from kiteline_core.geometry.cameras import CameraModel, CameraRig
 from kiteline_hw.calibration.checks import checked_baseline, checked_camera
 from kiteline_hw.ports import SourceError, SourceReport
 from kiteline_hw.sensors.frames import EncodedFrame
-from kiteline_hw.sensors.images import ImageFile
-from kiteline_hw.sources.recording import Recording, image_size, list_images
+from kiteline_hw.sources.recording import Recording, frames_by_key, image_size, list_images
 from kiteline_hw.sources.text_files import read_text, row_values
 
 F64 = NDArray[np.float64]
@@ -59,19 +58,8 @@ def pairs_by_name(
     times: list[int], lefts: list[Path], rights: list[Path], report: SourceReport
 ) -> Iterator[EncodedFrame]:
     """Frames of images with the same name on both sides; a left image without a partner comes alone."""
-    by_stem = {path.stem: path for path in rights}
-    for t, left in zip(times, lefts, strict=True):
-        if not rights:
-            yield EncodedFrame(t, ImageFile(left))
-        elif left.stem in by_stem:
-            yield EncodedFrame(t, ImageFile(left), ImageFile(by_stem[left.stem]))
-        else:
-            report.skip("missing right image", f"{left.name} has no partner")
-            yield EncodedFrame(t, ImageFile(left))
-    stems = {path.stem for path in lefts}
-    for path in rights:
-        if path.stem not in stems:
-            report.skip("missing left image", f"{path.name} has no partner")
+    keys = [path.stem for path in lefts], [path.stem for path in rights]
+    return frames_by_key(times, lefts, rights, keys, report)
 
 
 def rig_of(p_left: F64, p_right: F64 | None, size: tuple[int, int], name: str) -> CameraRig:

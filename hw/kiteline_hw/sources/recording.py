@@ -11,6 +11,7 @@ from kiteline_core.frame import Frame, ImuBatch, ImuCalibration, Trajectory
 from kiteline_core.geometry.cameras import CameraRig
 from kiteline_hw.ports import SourceError, SourceReport
 from kiteline_hw.sensors.frames import EncodedFrame, decode_frames
+from kiteline_hw.sensors.image_names import Keys, in_natural_order
 from kiteline_hw.sensors.images import ImageFile, decode_grey
 from kiteline_hw.sensors.imu_buffer import ImuSamples, NoImu
 from kiteline_hw.sensors.raw_pixels import BadImage
@@ -44,10 +45,29 @@ class Recording:
 
 
 def list_images(folder: Path) -> list[Path]:
-    """Image files of a folder by name; empty if there is no such folder."""
+    """Image files of a folder by name, numbers by their value; empty if there is no such folder."""
     if not folder.is_dir():
         return []
-    return sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith("."))
+    return in_natural_order(
+        [p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith(".")]
+    )
+
+
+def frames_by_key(
+    times: list[int], lefts: list[Path], rights: list[Path], keys: tuple[Keys, Keys], report: SourceReport
+) -> Iterator[EncodedFrame]:
+    """Frames of left and right images with the same key; a left image without a partner comes alone.
+
+    keys: of the left and of the right images. No right images: one camera.
+    """
+    by_key = dict(zip(keys[1], rights, strict=True))
+    for t, left, key in zip(times, lefts, keys[0], strict=True):
+        right = by_key.pop(key, None)
+        if right is None and rights:
+            report.skip("missing right image", f"{left.name} has no partner")
+        yield EncodedFrame(t, ImageFile(left), None if right is None else ImageFile(right))
+    for path in by_key.values():
+        report.skip("missing left image", f"{path.name} has no partner")
 
 
 def image_size(images: list[Path]) -> tuple[int, int]:
