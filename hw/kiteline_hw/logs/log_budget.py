@@ -1,17 +1,32 @@
-"""Limits what the logs of all starts take on disk: the oldest go first, also those of the flight under way."""
+"""Limits what the logs of all starts take on disk: the oldest go first, those of the flight under way last."""
 
 import os
+import re
 import threading
 from pathlib import Path
+from typing import NamedTuple
 
 _PARTS = 8  # files that the limit is cut into: an eighth of it at most goes at once
 _LEAST_PART_BYTES = 64 << 20  # bytes of a file on a disk with little room left
 _RESERVE_BYTES = 256 << 20  # bytes that logs leave free on their disk, for maps and numbers of starts
+_NAME = re.compile(r"(\d+)(?:_(\d+))?")  # after the stem: number of the start, number of the part
+
+
+class _Log(NamedTuple):
+    """A log of the folder. Its fields are in the order in which logs are compared: the oldest is the least."""
+
+    in_flight: bool  # of the start that is being written
+    start: int  # -1: the name has no such number
+    part: int
+    changed_ns: int  # decides only without numbers: a computer without a battery may begin with an old time
+    path: Path
+    size: int
 
 
 class LogBudget:
     """Keeps the logs `STEM*.mcap` of a folder within a limit, and within what the disk has. Touches nothing else there.
 
+    The oldest log is that with the lowest number of start, then of part, in its name.
     part_bytes: size at which a log goes on in another file. deleted: files so far. Never raises: a file that cannot be
     deleted counts as used.
     """
@@ -27,21 +42,21 @@ class LogBudget:
 
     def make_room(self, writing: Path | None = None) -> None:
         """Delete the oldest logs until there is room for another part. writing: the newest one, which stays."""
-        logs = self._logs()
-        used = sum(size for _, _, size in logs)
+        logs = self._logs(writing)
+        used = sum(log.size for log in logs)
         room = min(self._cap_bytes, used + self._free_bytes() - self._reserve_bytes)
         self.part_bytes = max(self._least_part_bytes, room // _PARTS)
         allowed = room - self.part_bytes
-        for _, path, size in logs:
+        for log in logs:
             if used <= allowed:
                 break
-            if path == writing:
+            if log.path == writing:
                 continue
             try:
-                path.unlink()
+                log.path.unlink()
             except OSError:
                 continue
-            used -= size
+            used -= log.size
             self.deleted += 1
 
     def make_room_beside(self, writing: Path) -> None:
@@ -50,8 +65,9 @@ class LogBudget:
             self._deleting = threading.Thread(target=self.make_room, args=(writing,), name="log-budget", daemon=True)
             self._deleting.start()
 
-    def _logs(self) -> list[tuple[int, Path, int]]:
-        """Time of the last change, path and size of each log, oldest first."""
+    def _logs(self, writing: Path | None) -> list[_Log]:
+        """All logs, the oldest first, those of the start that is being written last."""
+        flown = -1 if writing is None else self._numbers(writing)[0]
         found = []
         for path in self._folder.glob(f"{self._stem}*.mcap"):
             if path.stem.removeprefix(self._stem).replace("_", "").isdecimal():
@@ -59,8 +75,15 @@ class LogBudget:
                     status = path.stat()
                 except OSError:
                     continue
-                found.append((status.st_mtime_ns, path, status.st_size))
+                start, part = self._numbers(path)
+                in_flight = start == flown and start >= 0
+                found.append(_Log(in_flight, start, part, status.st_mtime_ns, path, status.st_size))
         return sorted(found)
+
+    def _numbers(self, path: Path) -> tuple[int, int]:
+        """Numbers of start and part in a log's name; (-1, 0) if it has none."""
+        match = _NAME.fullmatch(path.stem.removeprefix(self._stem))
+        return (int(match[1]), int(match[2] or 0)) if match else (-1, 0)
 
     def _free_bytes(self) -> int:
         try:

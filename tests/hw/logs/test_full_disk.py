@@ -123,6 +123,28 @@ def test_the_oldest_logs_go_until_there_is_room_and_nothing_else(tmp_path: Path)
     assert all((tmp_path / name).exists() for name in ("boot", "odometry.tum", "bootcamp.mcap", "session1.mcap"))
 
 
+@pytest.mark.parametrize("number", [3, 8])
+def test_a_clock_that_was_set_back_does_not_make_the_flight_under_way_the_oldest(tmp_path: Path, number: int) -> None:
+    """A computer without a battery for its clock; a lost state folder may give a start a lower number, too."""
+    for start, age in ((7, 0), (number, 2000)):
+        for part in range(12):
+            put(tmp_path, f"boot{start:05d}_{part}.mcap" if part else f"boot{start:05d}.mcap", 100, age - part)
+    LogBudget(tmp_path, "boot", 1600, 0).make_room(tmp_path / f"boot{number:05d}_11.mcap")
+    left = {path.stem for path in tmp_path.iterdir()}
+    assert left == {f"boot00007_{part}" for part in (10, 11)} | {
+        f"boot{number:05d}{f'_{part}' if part else ''}" for part in range(12)
+    }
+    LogBudget(tmp_path, "boot", 800, 0).make_room(tmp_path / f"boot{number:05d}_11.mcap")
+    assert {path.stem for path in tmp_path.iterdir()} == {f"boot{number:05d}_{part}" for part in range(5, 12)}
+
+
+def test_logs_without_numbers_are_as_old_as_their_last_change(tmp_path: Path) -> None:
+    for part, age in ((1, 5), (2, 9), (3, 1)):
+        put(tmp_path, f"turn_{part}.mcap", 100, age)
+    LogBudget(tmp_path, "turn", 280, 0).make_room()
+    assert sorted(path.stem for path in tmp_path.iterdir()) == ["turn_1", "turn_3"]
+
+
 def test_logs_within_the_limit_stay(tmp_path: Path) -> None:
     put(tmp_path, "boot00001.mcap", 300, 1)
     put(tmp_path, "boot00002_1.mcap", 200, 0)
