@@ -138,7 +138,10 @@ class AgentRuntime:
         self._log, self._budget = log, budget
         log.rig(self._log_shift_ns, source.rig, source.imu)
         log.flush()  # an agent that dies at once leaves a log that can be read
-        self._lines = live, odometry = LineFile(folder / "live.tum"), LineFile(folder / "odometry.tum")
+        prefix = options.trajectory_prefix
+        self._lines = live, odometry = (
+            LineFile(folder / f"{prefix}live.tum"), LineFile(folder / f"{prefix}odometry.tum")
+        )  # fmt: skip
         for file in self._lines:
             self._files.callback(file.close)
         return FlightRecord(log, live, odometry, options.agent, self.channel, config.log.every)

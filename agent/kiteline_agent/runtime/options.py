@@ -69,6 +69,12 @@ class AgentOptions:
     await_base_at_s: float | None = None  # look for a base again at this flight time
     await_bases: bool = False  # wait for a new base whenever one ends
 
+    @property
+    def trajectory_prefix(self) -> str:
+        """What names of trajectories begin with: `bootNNNNN.` beside a numbered log; each start keeps its own."""
+        stem = Path(self.log_name).stem
+        return f"{stem}." if stem.removeprefix(LOG_STEM).isdecimal() else ""
+
 
 def options_of(a: argparse.Namespace, folder: Path) -> AgentOptions:
     """Options from the command line, without the numbers of this start. folder: for the log."""

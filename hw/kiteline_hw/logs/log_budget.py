@@ -3,6 +3,8 @@
 import os
 import re
 import threading
+from collections import Counter
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -26,7 +28,8 @@ class _Log(NamedTuple):
 class LogBudget:
     """Keeps the logs `STEM*.mcap` of a folder within a limit, and within what the disk has. Touches nothing else there.
 
-    The oldest log is that with the lowest number of start, then of part, in its name.
+    The oldest log is that with the lowest number of start, then of part, in its name. The trajectories of a start,
+    `STEM<number>.*.tum`, count as well, and are deleted with the last part of its log.
     part_bytes: size at which a log goes on in another file. deleted: files so far. Never raises: a file that cannot be
     deleted counts as used.
     """
@@ -43,7 +46,9 @@ class LogBudget:
     def make_room(self, writing: Path | None = None) -> None:
         """Delete the oldest logs until there is room for another part. writing: the newest one, which stays."""
         logs = self._logs(writing)
-        used = sum(log.size for log in logs)
+        lines = self._trajectories()
+        parts = Counter(log.start for log in logs)
+        used = sum(log.size for log in logs) + sum(size for of_start in lines.values() for _, size in of_start)
         room = min(self._cap_bytes, used + self._free_bytes() - self._reserve_bytes)
         self.part_bytes = max(self._least_part_bytes, room // _PARTS)
         allowed = room - self.part_bytes
@@ -58,6 +63,11 @@ class LogBudget:
                 continue
             used -= log.size
             self.deleted += 1
+            parts[log.start] -= 1
+            for path, size in lines.get(log.start, []) if not parts[log.start] else []:
+                with suppress(OSError):
+                    path.unlink()
+                    used -= size
 
     def make_room_beside(self, writing: Path) -> None:
         """The same in a thread, for a loop that cannot wait for a disk; nothing if the last one still deletes."""
@@ -79,6 +89,16 @@ class LogBudget:
                 in_flight = start == flown and start >= 0
                 found.append(_Log(in_flight, start, part, status.st_mtime_ns, path, status.st_size))
         return sorted(found)
+
+    def _trajectories(self) -> dict[int, list[tuple[Path, int]]]:
+        """Path and size of each trajectory, by the number of its start."""
+        found: dict[int, list[tuple[Path, int]]] = {}
+        for path in self._folder.glob(f"{self._stem}*.*.tum"):
+            number = path.name.partition(".")[0].removeprefix(self._stem)
+            if number.isdecimal():
+                with suppress(OSError):
+                    found.setdefault(int(number), []).append((path, path.stat().st_size))
+        return found
 
     def _numbers(self, path: Path) -> tuple[int, int]:
         """Numbers of start and part in a log's name; (-1, 0) if it has none."""

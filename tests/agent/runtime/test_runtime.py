@@ -33,6 +33,7 @@ from kiteline_hw.ports import SourceError
 from kiteline_hw.sources.open import open_source
 from kiteline_hw.system import kernel_cache
 from kiteline_hw.system.process import StopSignal
+from kiteline_hw.system.start_numbers import Start
 from tests.agent.runtime.test_flight_parts import estimate
 from tests.entries import entries_of
 
@@ -205,6 +206,19 @@ def test_a_full_disk_does_not_stop_a_flight(
     poses = (tmp_path / "agent0" / "odometry.tum").read_text().splitlines()
     assert len(poses) == 30 - (min(until, 30) - full_from)
     assert all(len(line.split()) == 8 for line in poses)
+
+
+def test_each_start_keeps_its_trajectories(recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    options = AgentOptions(str(recording), str(tmp_path), log_name="boot.mcap")
+    for number, seconds in ((7, 0.0), (8, 1.0)):
+        fly(live._numbered(replace(options, seconds=seconds), Start(number, number)), 99, 99, monkeypatch)
+    first, second = (
+        len((tmp_path / f"boot0000{number}.odometry.tum").read_text().splitlines()) for number in (7, 8)
+    )  # fmt: skip
+    assert (first, second < first) == (30, True)
+    assert {path.name for path in tmp_path.glob("*.tum")} == {
+        f"boot0000{number}.{name}.tum" for number in (7, 8) for name in ("live", "odometry")
+    }
 
 
 def test_a_rig_file_that_cannot_be_written_is_told_once(

@@ -138,6 +138,18 @@ def test_a_clock_that_was_set_back_does_not_make_the_flight_under_way_the_oldest
     assert {path.stem for path in tmp_path.iterdir()} == {f"boot{number:05d}_{part}" for part in range(5, 12)}
 
 
+def test_trajectories_are_deleted_with_the_last_part_of_their_log(tmp_path: Path) -> None:
+    names = ["boot00007.mcap", "boot00007_1.mcap", "boot00008.mcap"]
+    lines = [f"boot{number:05d}.{kind}.tum" for number in (7, 8) for kind in ("live", "odometry")]
+    for name in [*names, *lines, "live.tum", "boot.live.tum"]:
+        put(tmp_path, name, 100, 0)
+    LogBudget(tmp_path, "boot", 760, 0).make_room(tmp_path / "boot00008.mcap")  # 700, and a part of 95 is to come
+    assert not (tmp_path / "boot00007.mcap").exists() and all((tmp_path / name).exists() for name in lines)
+    LogBudget(tmp_path, "boot", 680, 0).make_room(tmp_path / "boot00008.mcap")
+    left = sorted(path.name for path in tmp_path.iterdir())
+    assert left == ["boot.live.tum", "boot00008.live.tum", "boot00008.mcap", "boot00008.odometry.tum", "live.tum"]
+
+
 def test_logs_without_numbers_are_as_old_as_their_last_change(tmp_path: Path) -> None:
     for part, age in ((1, 5), (2, 9), (3, 1)):
         put(tmp_path, f"turn_{part}.mcap", 100, age)
