@@ -3,6 +3,7 @@
 from collections.abc import Collection, Iterator
 from pathlib import Path
 
+from kiteline_hw.logs.mcap_file import McapFile
 from kiteline_hw.logs.mcap_log_read import LogMessage, LogReader
 from kiteline_hw.logs.mcap_repair import REPAIRED
 from kiteline_hw.ports import SourceError
@@ -23,13 +24,18 @@ class WholeLog(LogReader):
             number = len(self._later) + 1
             part = self._part(path, number)
             if part is None:
-                if any(self._part(path, n) for n in _numbers(path) if n > number):
+                if any(self._part(path, n) for n in numbers_of_parts(path) if n > number):
                     self.cut = f"cut: its part {number} is missing"
                 break
             self._later.append(part)
             self.cut = part.cut or part.metadata.get(REPAIRED)
             for topic, count in part.topics.items():
                 self.topics[topic] = self.topics.get(topic, 0) + count
+
+    @property
+    def files(self) -> list[McapFile]:
+        """The files of the parts that are read, in order."""
+        return [self.file, *(part.file for part in self._later)]
 
     def _part(self, path: Path, number: int) -> LogReader | None:
         """A part of this log; None where the file is not there, holds nothing yet, or is another log's."""
@@ -47,7 +53,7 @@ class WholeLog(LogReader):
             yield from part.messages(topics)
 
 
-def _numbers(path: Path) -> list[int]:
+def numbers_of_parts(path: Path) -> list[int]:
     """Numbers of the files beside a log that are named as its parts."""
     ends = [other.stem.removeprefix(f"{path.stem}_") for other in path.parent.glob(f"{path.stem}_*{path.suffix}")]
     return sorted(int(end) for end in ends if end.isdecimal())

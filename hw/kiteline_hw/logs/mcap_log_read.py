@@ -102,21 +102,21 @@ class LogReader(Closing):
     """Reads a log, also a cut one. Raises SourceError if it is no MCAP file."""
 
     def __init__(self, path: Path | str) -> None:
-        self._file = McapFile(Path(path))
-        self.cut = self._file.cut
+        self.file = McapFile(Path(path))
+        self.cut = self.file.cut
         self.metadata: dict[str, str] = {}
-        for record in self._file.metadata:
+        for record in self.file.metadata:
             if record.name == "kiteline":
                 self.metadata = dict(record.metadata)
-        self.topics = {c.topic: self._file.counts.get(i, 0) for i, c in self._file.channels.items()}
+        self.topics = {c.topic: self.file.counts.get(i, 0) for i, c in self.file.channels.items()}
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[LogMessage]:
         """Messages of the topics (None: all), in the order of writing."""
-        channels = self._file.channels
+        channels = self.file.channels
         wanted = None if topics is None else [i for i, c in channels.items() if c.topic in topics]
-        for raw in self._file.messages(wanted, ordered=False):
+        for raw in self.file.messages(wanted, ordered=False):
             channel = channels[raw.channel]
-            schema = self._file.schema_of(raw.channel)
+            schema = self.file.schema_of(raw.channel)
             name = schema.name if schema is not None else ""
             yield LogMessage(channel.topic, raw.log_ns, name, raw.data, channel.metadata)
 

@@ -15,7 +15,7 @@ from kiteline_hw.logs import mcap_file
 from kiteline_hw.logs.log_budget import LogBudget
 from kiteline_hw.logs.mcap_file import McapFile
 from kiteline_hw.logs.mcap_log import LogWriter
-from kiteline_hw.ports import SourceError
+from kiteline_hw.ports import FrameSource, SourceError
 from kiteline_hw.sources.bags import bag_files, sqlite_bag
 from kiteline_hw.sources.bags.bag_files import unpacked
 from kiteline_hw.sources.bags.sqlite_bag import SqliteBag
@@ -82,6 +82,32 @@ def test_the_parts_of_a_log_are_one_recording(tmp_path: Path) -> None:
     assert [frame.t_ns for frame in frames] == [50_000_000 * k for k in range(20)] and source.frame_count == 20
     (tmp_path / "a" / "boot00003.mcap").unlink()  # the oldest part goes first
     assert 0 < len([item for item in open_source(str(tmp_path / "a")) if isinstance(item, Frame)]) < 20
+
+
+def frames_of(source: FrameSource) -> list[int]:
+    """Numbers of the frames of a log in parts."""
+    return [item.t_ns // 50_000_000 for item in source if isinstance(item, Frame)]
+
+
+def test_the_first_part_of_a_log_is_read_with_the_later_ones(tmp_path: Path) -> None:
+    assert log_in_parts(tmp_path / "a") > 3
+    log_in_parts(tmp_path / "b", "boot00004")
+    for path in (tmp_path / "b").iterdir():  # another flight beside it
+        path.rename(tmp_path / "a" / path.name)
+    first = tmp_path / "a" / "boot00003.mcap"
+    source = open_source(str(first))
+    assert frames_of(source) == list(range(20)) and source.frame_count == 20
+    assert source.name == f"mcap:{first}" and not source.report.skipped
+    later = frames_of(open_source(str(tmp_path / "a" / "boot00003_1.mcap")))
+    assert 0 < len(later) < 10  # a later part is that part alone
+    (tmp_path / "a" / "boot00003_2.mcap").unlink()
+    source = open_source(str(first))
+    assert frames_of(source) == list(range(later[-1] + 1))
+    assert source.report.notes == ["file cut: cut: its part 2 is missing"]
+    (tmp_path / "a" / "boot00003_1.mcap").unlink()
+    source = open_source(str(first))
+    assert frames_of(source) == list(range(later[0]))
+    assert source.report.notes == ["file cut: cut: its part 1 is missing"]
 
 
 def test_logs_of_two_flights_are_not_joined(tmp_path: Path) -> None:

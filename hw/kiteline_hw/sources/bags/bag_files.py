@@ -4,6 +4,7 @@ from pathlib import Path
 
 import zstandard
 
+from kiteline_hw.logs.log_parts import WholeLog, numbers_of_parts
 from kiteline_hw.logs.mcap_file import MOST_CHUNK_BYTES, McapFile
 from kiteline_hw.ports import SourceError
 from kiteline_hw.sources.bags.bag_heads import SQLITE_MAGIC, ZSTD_MAGIC, refuse_unreadable
@@ -15,19 +16,27 @@ Bag = McapFile | McapParts | SqliteBag
 
 
 def open_bag(path: Path) -> Bag:
-    """Open an MCAP file, a SQLite bag, or the bag in a folder. Raises SourceError."""
+    """Open an MCAP file, a log with its later parts, a SQLite bag, or the bag in a folder. Raises SourceError."""
     if path.is_dir():
         return _bag_in_folder(path)
     refuse_unreadable(path)
     with path.open("rb") as file:
         head = file.read(len(SQLITE_MAGIC))
-    return SqliteBag([path]) if head == SQLITE_MAGIC else McapFile(path)
+    return SqliteBag([path]) if head == SQLITE_MAGIC else _mcap(path)
+
+
+def _mcap(path: Path) -> Bag:
+    """An MCAP file; if it is the first part of a kiteline log, with the later parts beside it."""
+    if not numbers_of_parts(path):
+        return McapFile(path)
+    log = WholeLog(path)
+    return McapParts(path, log.files, log.cut)
 
 
 def _bag_in_folder(folder: Path) -> Bag:
     files = sorted(folder.glob("*.mcap"))
     if len(files) > 1:
-        return McapParts(folder, files)
+        return McapParts.in_folder(folder, files)
     if files:
         return McapFile(files[0])
     parts = sorted(folder.glob("*.db3"))

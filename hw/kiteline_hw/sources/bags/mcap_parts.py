@@ -19,38 +19,46 @@ _LOG_PART = re.compile(r"(.*?)(_\d+)?")
 
 
 class McapParts:
-    """The messages of all parts, with the attributes and methods of McapFile.
+    """The messages of all parts, with the attributes and methods of McapFile."""
 
-    Raises SourceError if the files are no parts of one bag: by their names or metadata.yaml, topics and times.
-    """
-
-    def __init__(self, folder: Path, paths: list[Path]) -> None:
-        self.path = folder
+    def __init__(self, path: Path, parts: list[McapFile], cut: str | None) -> None:
+        """path: of the recording. parts: in order. cut: where what is read ends too early, or None."""
+        self.path = path
+        self.cut = cut
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
         self.counts: dict[int, int] = {}
-        parts = [McapFile(path) for path in paths]
-        if not are_parts(folder, paths) and not _are_of_log(parts):
-            raise self._strangers(len(paths), "no metadata.yaml lists them, and they are not named BAG_0, BAG_1…")
-        self.cut = "; ".join(f"{part.path.name} is {part.cut}" for part in parts if part.cut) or None
-        parts = sorted((part for part in parts if any(part.counts.values())), key=lambda part: part.first_ns)
-        for before, after in pairwise(parts):
-            overlap_ns = before.last_ns - after.first_ns
-            if overlap_ns > min(_OVERLAP_NS, (before.last_ns - before.first_ns) // 2):
-                why = f"{after.path.name} begins {overlap_ns * 1e-9:.1f} s before"
-                raise self._strangers(len(paths), f"{why} {before.path.name} ends")
         self._parts: list[tuple[McapFile, dict[int, int]]] = []  # with this object's number of each channel
         for part in parts:
             numbers = {own: self._channel(part, own) for own in sorted(part.channels)}
-            used = {numbers[own] for own, count in part.counts.items() if count and own in numbers}
-            if self._parts and not used & self.counts.keys():
-                raise self._strangers(len(paths), f"{part.path.name} shares no topic with those before it")
             for own, count in part.counts.items():
                 if count and own in numbers:
                     self.counts[numbers[own]] = self.counts.get(numbers[own], 0) + count
             self._parts.append((part, numbers))
-        self.first_ns = parts[0].first_ns if parts else 0
-        self.last_ns = max((part.last_ns for part in parts), default=0)
+        used = [part for part in parts if any(part.counts.values())]
+        self.first_ns = min((part.first_ns for part in used), default=0)
+        self.last_ns = max((part.last_ns for part in used), default=0)
+
+    @classmethod
+    def in_folder(cls, folder: Path, paths: list[Path]) -> "McapParts":
+        """The files of a folder. Raises SourceError if they are no parts of one bag: by names, topics and times."""
+        parts = [McapFile(path) for path in paths]
+        if not are_parts(folder, paths) and not _are_of_log(parts):
+            raise _strangers(folder, parts, "no metadata.yaml lists them, and they are not named BAG_0, BAG_1…")
+        cut = "; ".join(f"{part.path.name} is {part.cut}" for part in parts if part.cut) or None
+        used = sorted((part for part in parts if any(part.counts.values())), key=lambda part: part.first_ns)
+        for before, after in pairwise(used):
+            overlap_ns = before.last_ns - after.first_ns
+            if overlap_ns > min(_OVERLAP_NS, (before.last_ns - before.first_ns) // 2):
+                why = f"{after.path.name} begins {overlap_ns * 1e-9:.1f} s before"
+                raise _strangers(folder, parts, f"{why} {before.path.name} ends")
+        topics: set[tuple[str, str]] = set()
+        for part in used:
+            own_topics = {_topic(part, own) for own, count in part.counts.items() if count and own in part.channels}
+            if topics and not own_topics & topics:
+                raise _strangers(folder, parts, f"{part.path.name} shares no topic with those before it")
+            topics |= own_topics
+        return cls(folder, used, cut)
 
     @property
     def notes(self) -> list[str]:
@@ -75,10 +83,9 @@ class McapParts:
     def _channel(self, part: McapFile, own: int) -> int:
         """This object's number of a channel of a part: one a topic and schema."""
         told, schema = part.channels[own], part.schema_of(own)
-        name = schema.name if schema is not None else ""
         for number, channel in self.channels.items():
             known = self.schemas.get(number)
-            if (channel.topic, known.name if known is not None else "") == (told.topic, name):
+            if (channel.topic, known.name if known is not None else "") == _topic(part, own):
                 return number
         number = len(self.channels) + 1
         self.channels[number] = Channel(
@@ -86,14 +93,21 @@ class McapParts:
             schema_id=number if schema is not None else 0,
         )  # fmt: skip
         if schema is not None:
-            self.schemas[number] = Schema(id=number, name=name, encoding=schema.encoding, data=schema.data)
+            self.schemas[number] = Schema(id=number, name=schema.name, encoding=schema.encoding, data=schema.data)
         return number
 
-    def _strangers(self, count: int, why: str) -> SourceError:
-        return SourceError(
-            f"{self.path}: {count} MCAP files that are no parts of one bag ({why}): name one, or join them with "
-            "`kiteline log merge OUT.mcap FILES…`"
-        )
+
+def _topic(part: McapFile, own: int) -> tuple[str, str]:
+    """Topic and name of the schema of a channel."""
+    schema = part.schema_of(own)
+    return part.channels[own].topic, schema.name if schema is not None else ""
+
+
+def _strangers(folder: Path, parts: list[McapFile], why: str) -> SourceError:
+    return SourceError(
+        f"{folder}: {len(parts)} MCAP files that are no parts of one bag ({why}): name one, or join them with "
+        "`kiteline log merge OUT.mcap FILES…`"
+    )
 
 
 def are_parts(folder: Path, paths: list[Path]) -> bool:
