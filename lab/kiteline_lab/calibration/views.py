@@ -70,7 +70,10 @@ class ViewCollector:
         """Look for the board in a frame's images; True if the view was kept."""
         self.frames += 1
         if not self.coverage:
-            self.coverage = [Coverage((image.shape[1], image.shape[0])) for image in images if image is not None]
+            first = [image for image in images[: self._cameras] if image is not None]
+            if len(first) < self._cameras:  # the size of each camera's images is needed
+                return False
+            self.coverage = [Coverage((image.shape[1], image.shape[0])) for image in first]
         eyes = [None if image is None else self._board.find(image) for image in images[: self._cameras]]
         if len(eyes) == 2 and eyes[0] is not None and eyes[1] is not None and not self._board.is_charuco:
             eyes[1] = same_order(eyes[0], eyes[1])

@@ -251,6 +251,14 @@ def shots(folder: Path, count: int, right: CameraModel | None, seed: int = 4) ->
     return f"images:{folder}/l/*.png" + (f",{folder}/r/*.png" if right is not None else "")
 
 
+def test_a_pair_whose_first_right_image_is_missing(tmp_path: Path) -> None:
+    shots(tmp_path, 3, RADTAN)
+    images = [[cv2.imread(str(tmp_path / side / f"{i:03}.png"), 0) for side in "lr"] for i in range(3)]
+    collector = ViewCollector(BOARD, 2)
+    kept = [collector.add(i, (left, right if i else None)) for i, (left, right) in enumerate(images)]
+    assert not kept[0] and any(kept) and len(collector.coverage) == 2
+
+
 def test_rendered_pictures_of_a_pair_by_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     right = CameraModel(640, 480, 433.0, 434.0, 318.0, 241.0, Lens.RADTAN, (-0.27, 0.065, -0.0002, 0.0005))
     source = shots(tmp_path, 10, right)
