@@ -17,6 +17,7 @@ from kiteline_codec.schema import (
     KeyframeHeader,
     LivePose,
     Record,
+    SubmapPlacement,
     WireError,
     messages,
     owners,
@@ -149,6 +150,8 @@ class CodedChannel:
         else:
             may_write = partial(owners.of_agent, peer)
             self.endpoint = Endpoint(config, session, ResidualCoder(), spill, may_write, owners.claimed_bytes)
+        self._from_base = peer is None
+        self._placed_by: int | None = None  # session of the base that has placed a submap
         self.undecodable = 0  # values whose code is no valid record: the other side has another schema
         self.noting = False  # whether `take_noted` is used
         self._noted: dict[Key, bytes] = {}
@@ -236,7 +239,17 @@ class CodedChannel:
                     records.append(messages.decode(update.key, update.code))
                 except WireError:
                     self.undecodable += 1
+        if self._from_base:
+            self._end_other_world(records)
         return records
+
+    def _end_other_world(self, records: Sequence[Record]) -> None:
+        """Remove what an earlier base wrote once a new one has placed a submap: what that left out lies elsewhere."""
+        session, earlier = self.endpoint.peer_session, self.endpoint.earlier
+        if any(isinstance(record, SubmapPlacement) for record in records):
+            self._placed_by, earlier.compared = session, False
+        elif self._placed_by == session:
+            self._removed += earlier.take_ended()
 
     def take_removed(self) -> list[Key]:
         """The keys that the other side removed since the last call."""

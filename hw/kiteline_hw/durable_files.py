@@ -25,6 +25,17 @@ def write_atomically(path: Path, content: bytes) -> None:
     sync_folder(path.parent)
 
 
+def link_newest(link: Path, target: Path) -> None:
+    """Let a symbolic link name a file of its folder, if the disk has links and no other file has the link's name."""
+    new = link.with_name(link.name + ".new")
+    with contextlib.suppress(OSError):
+        if link.exists() and not link.is_symlink():
+            return
+        new.unlink(missing_ok=True)
+        new.symlink_to(target.name)
+        os.replace(new, link)
+
+
 def sync_folder(folder: Path) -> None:
     """Wait until the names in a folder are on the disk: else a power cut may bring a replaced file back."""
     fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)

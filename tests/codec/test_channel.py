@@ -145,3 +145,33 @@ def test_three_packets_lost_in_a_row_leave_no_gap_of_a_second_between_poses(lost
     gaps = np.diff(arrived_ns) / 1e9
     assert sent > lost_after + 20
     assert 0.5 < gaps.max() <= 0.95
+
+
+def test_what_a_base_that_lost_its_map_wrote_ends_once_the_next_one_has_placed_a_submap() -> None:
+    """Its tiles and placements lie in another world. One with the same map loses nothing for good."""
+    rng, agent = np.random.default_rng(0), coded_channel(65)
+    tiles = [GridTile(n, 0, 0, 0.1, rng.integers(0, 8, (64, 64)).astype(np.int8)) for n in range(3)]
+    other_world = SubmapPlacement(SubmapId(0), se3.exp(np.array([9.0, 0.0, 0.0, 0.0, 0.0, 1.0])))
+    keys = [messages.key(tile) for tile in tiles]
+    now_ns, held = 0, set[Key]()
+
+    def run(base: CodedChannel, *records: Record) -> None:
+        nonlocal now_ns
+        for record in records:
+            base.put(record)
+        for _ in range(60):
+            now_ns += 50_000_000
+            held.update(messages.key(record) for record in agent.receive(base.poll(now_ns), now_ns))
+            held.difference_update(agent.take_removed())
+            base.receive(agent.poll(now_ns), now_ns)
+
+    placed = messages.key(other_world)
+    run(coded_channel(1, peer=AgentId(0)), SubmapPlacement(SubmapId(0), np.eye(4)), POSE, *tiles)
+    assert held == {placed, messages.key(POSE), *keys}
+    second = coded_channel(2, peer=AgentId(0))
+    run(second)
+    assert held == {placed, messages.key(POSE), *keys}, "where things are is not known better yet"
+    run(second, other_world, tiles[2])
+    assert held == {placed, keys[2]}
+    run(second, *tiles)  # by reference to what the agent still holds
+    assert held == {placed, *keys} and not agent.undecodable and agent.stats.rejected == 0

@@ -30,6 +30,7 @@ from kiteline_codec import warm as codec_warm
 from kiteline_codec.channel import CodedChannel, RecordChannel, settled
 from kiteline_core.config import ConfigError
 from kiteline_core.ids import AgentId
+from kiteline_hw.durable_files import link_newest
 from kiteline_hw.links.kinds import link_traits
 from kiteline_hw.lockstep.messages import Down, Phase, Up
 from kiteline_hw.lockstep.shared_core import CoreProcess
@@ -138,12 +139,12 @@ class AgentRuntime:
         self._log, self._budget = log, budget
         log.rig(self._log_shift_ns, source.rig, source.imu)
         log.flush()  # an agent that dies at once leaves a log that can be read
-        prefix = options.trajectory_prefix
-        self._lines = live, odometry = (
-            LineFile(folder / f"{prefix}live.tum"), LineFile(folder / f"{prefix}odometry.tum")
-        )  # fmt: skip
-        for file in self._lines:
+        paths = [folder / f"{options.trajectory_prefix}{name}" for name in ("live.tum", "odometry.tum")]
+        self._lines = live, odometry = LineFile(paths[0]), LineFile(paths[1])
+        for file, path in zip(self._lines, paths, strict=True):
             self._files.callback(file.close)
+            if options.trajectory_prefix:
+                link_newest(folder / path.name.removeprefix(options.trajectory_prefix), path)
         return FlightRecord(log, live, odometry, options.agent, self.channel, config.log.every)
 
     @property

@@ -322,6 +322,7 @@ class Endpoint:
             self._in.raise_watermark(version)
             self._in.newest = version
             self._peer_values.found_equal(version)
+            self.earlier.compared = True
         elif self._peer_values.found_different(version):
             self._traffic.mismatches += 1
         self._owe_answer(now_ns)
@@ -347,9 +348,8 @@ class Endpoint:
         digest = self._digest_due(now_ns)
         silence_ns = c.hello_ns if unheard else c.heartbeat_ns
         silent = self._sent_ns is None or now_ns - self._sent_ns >= silence_ns
-        if left < MIN_PACKET_BYTES or not (answer or digest or silent):
-            return None
-        return self._packet(now_ns, values=False, digest=digest)
+        sends = left >= MIN_PACKET_BYTES and (answer or digest or silent)
+        return self._packet(now_ns, values=False, digest=digest) if sends else None
 
     def _due(self, urgency: int | None, answers: bool, now_ns: int) -> bool:
         """True if values wait, and these are not so few and little urgent that they wait for a packet of others."""

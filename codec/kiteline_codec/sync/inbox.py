@@ -117,17 +117,27 @@ class Claims:
 class EarlierValues:
     """What earlier sessions of the peer wrote and its present one has not replaced, and the memory that it takes.
 
-    is_gone: whether nobody needs a value any more; such values end with the session that wrote them.
+    is_gone: whether nobody needs a value any more; such values end with the session that wrote them. compared: whether
+    all that the present session had to say has come: of what is still here, it has said nothing.
     """
 
     def __init__(self, claims: Claims) -> None:
         self.is_gone: Callable[[Key], bool] = lambda key: False
         self.codes: dict[Key, bytes] = {}
         self.bytes = 0
+        self.compared = self._ended = False
         self._claims = claims
 
+    def take_ended(self) -> list[Key]:
+        """Once a session, when it was compared: the keys of all that is here. Codes stay: a value may refer to them."""
+        if not self.compared or self._ended:
+            return []
+        self._ended = True
+        return sorted(self.codes)
+
     def keep(self, values: Mapping[Key, bytes]) -> None:
-        """Add values, and drop those that are gone."""
+        """Add values as a new session begins, and drop those that are gone."""
+        self.compared = self._ended = False
         for key in [key for key in self.codes if key in values or self.is_gone(key)]:
             if key not in values:
                 self._claims.release(key, self.codes[key])

@@ -216,9 +216,16 @@ def test_each_start_keeps_its_trajectories(recording: Path, tmp_path: Path, monk
         len((tmp_path / f"boot0000{number}.odometry.tum").read_text().splitlines()) for number in (7, 8)
     )  # fmt: skip
     assert (first, second < first) == (30, True)
-    assert {path.name for path in tmp_path.glob("*.tum")} == {
+    assert {path.name for path in tmp_path.glob("boot*.tum")} == {
         f"boot0000{number}.{name}.tum" for number in (7, 8) for name in ("live", "odometry")
     }
+    for name in ("live.tum", "odometry.tum"):
+        assert (tmp_path / name).readlink() == Path(f"boot00008.{name}")
+    (tmp_path / "live.tum").unlink()
+    (tmp_path / "live.tum").write_text("somebody's")
+    fly(live._numbered(replace(options, seconds=1.0), Start(9, 9)), 99, 99, monkeypatch)
+    assert (tmp_path / "live.tum").read_text() == "somebody's"
+    assert (tmp_path / "odometry.tum").readlink() == Path("boot00009.odometry.tum")
 
 
 def test_a_rig_file_that_cannot_be_written_is_told_once(
