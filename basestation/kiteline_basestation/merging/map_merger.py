@@ -237,15 +237,16 @@ class MapMerger:
         """Separate a merged map again: move it back, and unfuse its landmarks from those of the other map."""
         sparse_map, table = self._map, self._map.keypoints
         at, split = self.merges.index(merge), frozenset(merge.moved)
+        rest = sparse_map.map_id(merge.into)  # it may have been merged into another map since
         self.merges.remove(merge)
         for later in self.merges[at:]:  # they no longer hold what is apart from now on
             later.forget(split)
         self.undone += 1
-        self._corrections.cancel_pending(merge.into)
+        self._corrections.cancel_pending(rest)
         self._edges = [
             e for e in self._edges if (submap_of_keyframe(e.new) in split) == (submap_of_keyframe(e.old) in split)
         ]
-        self._unfused.pop(merge.into, None)
+        self._unfused.pop(rest, None)
         self._requery = [k for k in self._requery if submap_of_keyframe(k) not in split]
         inside = np.isin(sparse_map.keyframes.id[table.row[: sparse_map.slots]] >> SEQUENCE_BITS, sorted(split))
         roots = table.root[: sparse_map.slots]
@@ -257,7 +258,7 @@ class MapMerger:
             if submap != merge.map_id:
                 sparse_map.root_submaps[submap] = merge.map_id
             sparse_map.move_submap(submap, S_w_m)
-        return MergeResult(moved=frozenset({merge.into, merge.map_id}), split=split)
+        return MergeResult(moved=frozenset({rest, merge.map_id}), split=split)
 
     # -- saved state -------------------------------------------------------------------------------------------------
 

@@ -1,6 +1,8 @@
 """Maps are merged where they overlap, and not where they only look alike."""
 
-from collections.abc import Callable, Sequence
+import itertools
+import json
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -10,9 +12,11 @@ import pytest
 from kiteline_agent.exchange.correction_batches import ReceivedBatches
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.job_kinds import run_job
-from kiteline_basestation.jobs import JobDone
+from kiteline_basestation.jobs import Job, JobDone
 from kiteline_basestation.management import Command
 from kiteline_basestation.mapper import Mapper, MapperInput
+from kiteline_basestation.merging.loop_detector import Contradiction
+from kiteline_basestation.refinement.bundle_job import FULL_BUNDLE
 from kiteline_basestation.station import Station
 from kiteline_codec.channel import PlainChannel, plain_pair
 from kiteline_codec.schema import (
@@ -182,6 +186,46 @@ def test_submap_after_a_loss_is_merged_and_split_again(make_flight: MakeFlight, 
     assert output.withdrawn == ((a.agent, Key(SubmapPlacement.KIND, young, 0)),)  # its place was the merge's
     assert young not in mapper.placements and submap_of_keyframe(a.keyframes[0]) in mapper.placements
     assert mapper.step(MapperInput(((a.agent, ()),)), 10**12 + STEP_NS).withdrawn == ()
+
+
+def test_undoing_an_inner_merge_cancels_the_jobs_of_the_outer_map(make_flight: MakeFlight, words: Any) -> None:
+    """A full bundle of the outer map, which was at the worker, moved the separated keyframes by metres."""
+    worlds = [np.eye(4), ELSEWHERE, se3.exp(np.array([-2.0, 2.0, 0.1, 0.01, 0.02, -0.7]))]
+    outer, middle, inner = flights = [
+        make_flight(keyframes=12, turns=0.3, start=0.1 * n, variant=n, agent=n, T_w_m=world)
+        for n, world in enumerate(worlds)
+    ]
+    mapper = Mapper(WITHOUT_GRID, words)
+    merger = mapper.merger
+    assert merger is not None
+    found: list[Contradiction] = []
+    merger.detector.query = lambda keyframe: found.pop() if found else None  # type: ignore[method-assign]
+    feed(mapper, flights)
+    clock = itertools.count(10**12, STEP_NS)
+    merge_by_command(mapper, inner, middle, se3.inverse(worlds[1]) @ worlds[2], clock)
+    merge_by_command(mapper, middle, outer, worlds[1], clock)
+    maps = [submap_of_keyframe(flight.keyframes[0]) for flight in flights]
+    assert {mapper.map.map_id(submap) for submap in maps} == {maps[0]}
+    merger.search_overlap(maps[1], maps[0])  # after its last keyframe a full bundle is due
+    jobs: list[Job] = []
+    while not any(job.kind == FULL_BUNDLE.name for job in jobs):
+        jobs += mapper.step(MapperInput(()), next(clock)).jobs
+    found.append(Contradiction((maps[1], maps[2])))
+    merger.search_overlap(maps[1], maps[0])
+    mapper.step(MapperInput(()), next(clock))
+    assert merger.undone == 1 and mapper.map.map_id(maps[2]) == maps[2]
+    mapper.step(MapperInput((), tuple(run_job(job) for job in jobs)), next(clock))
+    errors_m = [np.linalg.norm((mapper.map.pose(k) - T)[:3, 3]) for k, T in zip(inner.keyframes, inner.true_T_m_k)]
+    assert max(errors_m) < 0.1
+
+
+def merge_by_command(mapper: Mapper, newer: Any, older: Any, T_older_newer: F64, clock: Iterator[int]) -> None:
+    """Merge the maps of two flights, and run the jobs that follow."""
+    order = {"map": f"{newer.agent}.1.0", "into": f"{older.agent}.1.0", "T_into_map": T_older_newer.ravel().tolist()}
+    output = mapper.step(MapperInput((), (), (Command(1, "merge", json.dumps(order)),)), next(clock))
+    assert output.answers[0].ok, output.answers[0].text
+    while not mapper.idle:
+        output = mapper.step(MapperInput((), tuple(run_job(job) for job in output.jobs)), next(clock))
 
 
 def test_placement_of_a_split_map_is_withdrawn(make_flight: MakeFlight, words: Any) -> None:
