@@ -84,7 +84,10 @@ class Keeper:
         for (agent, own, key), code in station.changed.items():
             channel = station.channels[agent]
             if code is None and isinstance(channel, CodedChannel):
-                code = channel.endpoint.own_value(key) if own else channel.endpoint.peer_value(key)
+                end = channel.endpoint
+                code = end.own_value(key) if own else end.peer_value(key)
+                if code is None and not own:  # the agent may have begun a new session since it wrote the value
+                    code = end.earlier.codes.get(key)
             if code is not None and (not self._deleted or submap_of(key) not in self._deleted):
                 batch.rows.append((int(agent), int(own), key.kind, key.id, key.part, code))
             elif code is None and own:

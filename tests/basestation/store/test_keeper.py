@@ -1,5 +1,6 @@
 """The keeper writes batches in order, repeats failed writes and does not block the loop."""
 
+import itertools
 import sqlite3
 import threading
 import time
@@ -17,9 +18,11 @@ from kiteline_basestation.store.checksums import StoreError
 from kiteline_basestation.store.keeper import WRITE_NS, Keeper
 from kiteline_basestation.store.saved_map import SavedMap
 from kiteline_basestation.store.store import Batch, Store, read
-from kiteline_codec.channel import CodedChannel
+from kiteline_codec.channel import CodedChannel, coded_channel
 from kiteline_codec.schema import KeyframeHeader, messages
 from kiteline_codec.sync.config import SyncConfig
+from kiteline_codec.sync.resumption import agent_session
+from kiteline_core.ids import AgentId
 
 MakeFlight = Callable[..., Any]
 
@@ -81,6 +84,23 @@ def test_slow_disk_does_not_block_the_loop(
     go.set()
     flown.keeper.close(flown.station)
     assert flown.keeper.batches == 2
+    assert kept_heads(tmp_path) == 12
+
+
+def test_what_an_agent_wrote_before_it_restarted_is_stored(make_flight: MakeFlight, tmp_path: Path) -> None:
+    """While the disk is stuck, changes of two sessions of the agent wait for one batch."""
+    base_end = coded_channel(1, peer=AgentId(0))
+    station, keeper = Station(BaseConfig(), lambda agent: base_end), Keeper(tmp_path)
+    keeper.begin(station, SavedMap(), SavedMap())
+    clock = itertools.count(0, WRITE_NS)
+    for boot in (1, 2):
+        agent_end, packets = coded_channel(agent_session(boot, boot)), ()
+        for record in make_flight(keyframes=6, turns=0.1, boot=boot).all_records():
+            agent_end.put(record)
+        for now_ns in itertools.islice(clock, 40):
+            agent_end.receive(packets, now_ns)
+            packets = dict(station.step({AgentId(0): agent_end.poll(now_ns)}, (), now_ns).packets)[AgentId(0)]
+    assert keeper.close(station)
     assert kept_heads(tmp_path) == 12
 
 
