@@ -1,5 +1,6 @@
 """A saved map is restored bit for bit; flights go on in it, maps of several stores are combined."""
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -10,12 +11,16 @@ from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.job_kinds import run_job
 from kiteline_basestation.jobs import JobDone
 from kiteline_basestation.management import Command
+from kiteline_basestation.mapper_state import MapperState, MapState
+from kiteline_basestation.merging.map_merger import MergerState
+from kiteline_basestation.merging.merges import MapMerge
 from kiteline_basestation.station import Import, Station
 from kiteline_basestation.store.combine import combine
 from kiteline_basestation.store.integrity import contradictions
 from kiteline_basestation.store.keeper import Keeper, snapshot
 from kiteline_basestation.store.restore import restore
-from kiteline_basestation.store.saved_map import SavedMap
+from kiteline_basestation.store.saved_map import SavedMap, SavedValues
+from kiteline_basestation.store.state_texts import state_of, texts_of
 from kiteline_basestation.store.store import read
 from kiteline_codec.channel import CodedChannel
 from kiteline_codec.schema import (
@@ -24,9 +29,15 @@ from kiteline_codec.schema import (
     messages,
 )
 from kiteline_codec.sync.config import SyncConfig
+from kiteline_core.geometry import se3
 from kiteline_core.ids import (
+    NO_KEYFRAME,
+    AgentId,
     KeyframeId,
+    SubmapId,
+    keyframe_id,
     submap_id,
+    submap_of_keyframe,
 )
 from tests.basestation.saved_flights import ELSEWHERE, STEP_NS, Agents, MakeFlight, new_station, whole
 
@@ -138,6 +149,71 @@ def test_combined_maps_are_merged_by_loop_closure(kept: list[SavedMap], words: A
         done = [run_job(job) for job in station.step({}, done, n * STEP_NS).jobs]
     assert station.mapper.summary()["merges"] == 1
     assert combine(kept[0], kept[0]).agents == kept[0].agents
+
+
+@pytest.mark.parametrize("is_newer_imported", [True, False])
+def test_a_store_and_a_newer_copy_of_it_are_combined(
+    make_flight: MakeFlight, words: Any, is_newer_imported: bool
+) -> None:
+    """Meanwhile its maps were merged with another one; an older copy adds nothing."""
+    worlds = [np.eye(4), ELSEWHERE, se3.inverse(ELSEWHERE)]
+    agents = Agents(
+        [
+            make_flight(keyframes=8, turns=0.2, start=0.1 * n, variant=n, agent=n, T_w_m=world)
+            for n, world in enumerate(worlds)
+        ]
+    )
+    station = new_station(words)
+    merger = station.mapper.merger
+    assert merger is not None
+    merger.detector.query = lambda keyframe: None  # type: ignore[method-assign]
+    agents.fly(station, 0, 20)
+    copies = []
+    for newer, older in ((2, 1), (1, 0)):
+        T_older_newer = se3.inverse(worlds[older]) @ worlds[newer]
+        order = {"map": f"{newer}.1.0", "into": f"{older}.1.0", "T_into_map": T_older_newer.ravel().tolist()}
+        output = station.step({}, agents.done, agents.now_ns, [Command(1, "merge", json.dumps(order))])
+        assert output.answers[0].ok
+        agents.done, agents.down = [run_job(job) for job in output.jobs], dict(output.packets)
+        agents.fly(station, 12, 24)
+        copies.append(snapshot(station, SavedMap()))
+    older_copy, newer_copy = copies
+    alone, again = new_station(words, session=2), new_station(words, session=2)
+    both = combine(older_copy, newer_copy) if is_newer_imported else combine(newer_copy, older_copy)
+    restore(alone, newer_copy, 0)
+    assert restore(again, both, 0).faults == ()
+    expected, found = whole(alone), whole(again)
+    del expected["placements"], found["placements"]
+    assert found == expected
+    done: list[JobDone] = []
+    for n in range(4):
+        done = [run_job(job) for job in again.step({}, done, n * STEP_NS).jobs]
+    assert again.mapper.placements.keys() == station.mapper.placements.keys()
+    assert contradictions(again.mapper) == []
+
+
+def test_stores_that_went_on_from_one_copy_are_combined() -> None:
+    """Each merged its submap with another one: what the map with more merges says is taken, the rest is apart."""
+    submaps = [submap_id(0, 1, n) for n in range(5)]
+    first = with_merges(submaps[:3], {submaps[1]: submaps[0]})
+    second = with_merges(submaps[1:], {submaps[1]: submaps[4], submaps[3]: submaps[4]})
+    third = with_merges(submaps[:2], {submaps[1]: submaps[0]})
+    for one, other in ((first, second), (second, first)):
+        state = state_of(combine(one, other).texts)
+        assert state.map.root_submaps == {submaps[1]: submaps[4], submaps[3]: submaps[4]}
+        assert {merge.into for merge in state.merger.merges} == {submaps[4]} and len(state.merger.merges) == 2
+    assert submaps[0] in map(submap_of_keyframe, state_of(combine(first, second).texts).merger.requery)
+    state = state_of(combine(first, third).texts)
+    assert state.map.root_submaps == {submaps[1]: submaps[0]} and len(state.merger.merges) == 1
+
+
+def with_merges(submaps: list[SubmapId], roots: dict[SubmapId, SubmapId]) -> SavedMap:
+    """A map with a keyframe in each submap, of which some are merged."""
+    headers = [KeyframeHeader(keyframe_id(s, 0), int(s), NO_KEYFRAME, np.eye(4), 0) for s in submaps]
+    values = SavedValues({messages.key(header): messages.encode(header) for header in headers}, {})
+    merges = tuple(MapMerge(submap, root, {submap: np.eye(4)}) for submap, root in roots.items())
+    state = MapperState(map=MapState(root_submaps=roots), merger=MergerState(merges=merges))
+    return SavedMap({AgentId(0): values}, texts_of(state))
 
 
 def test_maps_of_two_agents_with_one_number_are_refused(make_flight: MakeFlight, words: Any) -> None:
