@@ -265,7 +265,7 @@ class Mapper:
             "map_bytes": self.map.nbytes(),
             "agents": agents,
             "submaps_placed": len(self.placements),
-            "refused_records": self._intake.refused,
+            "refused_records": self._intake.refused + self.map.far_poses + self._placements.far,
             **(merger.counts if merger else NO_CLOSURES),
             "maps": len({self.map.map_id(s) for s in submaps}),
             "jobs_open": pending,

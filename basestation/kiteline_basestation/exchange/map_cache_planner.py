@@ -15,6 +15,7 @@ from kiteline_basestation.exchange.agent_velocity import AgentVelocity
 from kiteline_basestation.exchange.sharing import SharingPolicy
 from kiteline_basestation.map.map_tables import CULLED, LANDMARK, NO_POSE
 from kiteline_basestation.map.sparse_map import SparseMap
+from kiteline_basestation.map.world_poses import is_near
 from kiteline_codec.channel import RecordChannel
 from kiteline_codec.schema import CACHED_KINDS, CachedKeyframe, CachedLandmarks, GridTile, Key, LivePose, messages
 from kiteline_core.arrays import F64, I32, Bool
@@ -175,6 +176,8 @@ class MapCachePlanner:
             if self._map.map_id(submap_of_keyframe(keyframe)) != self._map.map_id(submap):
                 continue
             now = self._record(keyframe, submap)
+            if not is_near(now.T_m_k):
+                continue
             if entry.record.submap == submap:
                 change = se3.inverse(entry.record.T_m_k) @ now.T_m_k
                 moved, turned = np.linalg.norm(change[:3, 3]), np.linalg.norm(change[:3, :3] - np.eye(3)) / np.sqrt(2.0)
@@ -191,6 +194,8 @@ class MapCachePlanner:
         room = self._config.max_keyframes - len(cache.cached)
         for keyframe in [k for k in needed if k not in cache.cached][: max(0, min(ahead, room))]:
             record, scale = self._record(keyframe, submap), self._scale(keyframe, submap)
+            if not is_near(record.T_m_k):
+                continue
             landmarks, views = self._landmarks_record(agent, keyframe, scale)
             records: list[CachedKeyframe | CachedLandmarks] = [
                 record, *channel.profile.cached_sections(landmarks, views)

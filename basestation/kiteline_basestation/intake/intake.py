@@ -11,6 +11,7 @@ from kiteline_basestation.config import IntakeConfig
 from kiteline_basestation.inertial.ties import InertialTies
 from kiteline_basestation.map.map_tables import NO_POSE
 from kiteline_basestation.map.sparse_map import SparseMap
+from kiteline_basestation.map.world_poses import is_near
 from kiteline_codec.schema import (
     CameraIntrinsics,
     GravityAlignment,
@@ -79,7 +80,7 @@ class Intake:
         self._scans: list[KeyframeScan] = []  # that arrived and were not taken yet
         self._images: list[ScanImages] = []  # the same
         self.inertial_ties = InertialTies(sparse_map)
-        self.refused = 0  # records that contradict the map, or are of another agent than the one that wrote them
+        self.refused = 0  # records that contradict the map, are too far off, or of another agent than their writer
         self._handlers: dict[type[Record], Callable[[Any, int], None]] = {
             CameraIntrinsics: lambda record, now_ns: sparse_map.set_camera(record.agent, record.camera),
             StereoAlignment: lambda record, now_ns: sparse_map.set_stereo_alignment(record),
@@ -100,7 +101,7 @@ class Intake:
         if records and in_contact:
             self.last_contact_ns[agent] = now_ns
         for record in records:
-            if not _is_own(agent, record):
+            if not _is_own(agent, record) or _is_far(record):
                 self.refused += 1
                 continue
             if self.deleted and _submap_of(record) in self.deleted:
@@ -276,6 +277,15 @@ def _submap_of(record: Record) -> SubmapId | None:
     if isinstance(record, LivePose):
         return submap_of_keyframe(record.keyframe)
     return submap_of(record.key())
+
+
+def _is_far(record: Record) -> bool:
+    """True for a motion that leads farther than any flight; a keyframe's is checked where its pose is composed."""
+    if isinstance(record, LivePose):
+        return not is_near(record.T_k_c)
+    if isinstance(record, SubmapTie):
+        return not is_near(record.T_k_f)
+    return isinstance(record, GravityAlignment) and not is_near(record.T_l_m)
 
 
 def _is_own(agent: AgentId, record: Record) -> bool:

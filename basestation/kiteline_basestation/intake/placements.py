@@ -13,6 +13,8 @@ import numpy as np
 from kiteline_basestation.exchange.publisher import Publisher
 from kiteline_basestation.intake.intake import Intake
 from kiteline_basestation.map.sparse_map import SparseMap
+from kiteline_basestation.map.world_poses import is_near
+from kiteline_codec.coding.quantise import MAX_SCALE, MIN_SCALE
 from kiteline_codec.schema import SubmapPlacement
 from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3, sim3
@@ -42,6 +44,7 @@ class SubmapPlacements:
         self.S_w_m: dict[SubmapId, F64] = {}  # the first submap of all comes first
         self.unmerged: dict[SubmapId, F64] = {}  # S_w_m of submaps that have a placement without a merge
         self._recognised: set[SubmapId] = set()  # submaps whose placement rests on a merge with another submap
+        self.far = 0  # placements that were left out: they have no code
         self._scale_sigma: dict[SubmapId, float] = {}  # relative deviation of lengths, where accelerations told it
 
     @property
@@ -58,8 +61,7 @@ class SubmapPlacements:
         if np.allclose(gravity.T_l_m[:3, :3], sim3.rigid(self.S_w_m[first])[:3, :3], 0.0, 1e-9):
             return False
         scale = sim3.scale_of(self.S_w_m[first])
-        self._move_world(sim3.of(scale, gravity.T_l_m) @ sim3.inverse(self.S_w_m[first]))
-        return True
+        return self._move_world(sim3.of(scale, gravity.T_l_m) @ sim3.inverse(self.S_w_m[first]))
 
     def make_metric(self) -> bool:
         """Rescale w to metres when the agent of the first submap reports its scale. Returns True if it changed."""
@@ -69,8 +71,7 @@ class SubmapPlacements:
             return False
         if sim3.scale_of(self.S_w_m[first]) != 1.0 or metres == 1.0:
             return False
-        self._move_world(sim3.of(metres, np.eye(4)))
-        return True
+        return self._move_world(sim3.of(metres, np.eye(4)))
 
     def place_new(self, keyframe: KeyframeId) -> None:
         """Place the submap of a new keyframe: the first of all at w, a later one where the last one was left."""
@@ -94,8 +95,7 @@ class SubmapPlacements:
             T_w_c = sim3.place(S_w_before, T_before_k @ live.T_k_c)
             scale = sim3.scale_of(S_w_before) if self._map.is_up_to_scale(submap) else 1.0
             S_w_m = sim3.normalise(sim3.of(scale, T_w_c) @ se3.inverse(T_m_first))
-        self.unmerged[submap] = S_w_m
-        self._set(submap, S_w_m)
+        self._place(submap, S_w_m)
 
     def follow_ties(self) -> bool:
         """Place submaps that are not recognised by their agents' motion over a loss. True if one moved.
@@ -117,8 +117,7 @@ class SubmapPlacements:
         """Move the submaps that follow one without a break, as far as none is recognised, by S_new_old (4,4) in w."""
         later = SubmapId(submap + 1)
         while later in self.unmerged and later in self.S_w_m and self._map.submaps_of_map(later) == [later]:
-            self.unmerged[later] = S_w_m = self._moved(later, S_new_old, self.unmerged[later])
-            self._set(later, S_w_m)
+            self._place(later, self._moved(later, S_new_old, self.unmerged[later]))
             later = SubmapId(later + 1)
 
     def _place_by_tie(self, submap: SubmapId) -> bool:
@@ -136,9 +135,7 @@ class SubmapPlacements:
             return False
         T_w_first = sim3.place(S_w_before, T_before_k @ tie.T_k_f)
         scale = sim3.scale_of(S_w_before) if self._map.is_up_to_scale(submap) else 1.0
-        self.unmerged[submap] = S_w_m = sim3.normalise(sim3.of(scale, T_w_first) @ se3.inverse(T_m_first))
-        self._set(submap, S_w_m)
-        return True
+        return self._place(submap, sim3.normalise(sim3.of(scale, T_w_first) @ se3.inverse(T_m_first)))
 
     def rescale(self, factors: Mapping[SubmapId, float], scale_sigma: Mapping[SubmapId, float]) -> None:
         """Scale placements of submaps whose units grew in their maps, about their first keyframes.
@@ -222,17 +219,37 @@ class SubmapPlacements:
             self._scale_sigma[record.submap] = record.scale_sigma
             self._map.scaled_submaps.add(record.submap)
 
-    def _set(self, submap: SubmapId, S_w_m: F64, *, urgent: bool = False) -> None:
+    def _place(self, submap: SubmapId, S_w_m: F64) -> bool:
+        """Place a submap without a merge; False if it would lie too far off."""
+        if not self._set(submap, S_w_m):
+            return False
+        self.unmerged[submap] = S_w_m
+        return True
+
+    def _set(self, submap: SubmapId, S_w_m: F64, *, urgent: bool = False) -> bool:
+        """Set and publish a placement; False, and it stays as it is, if it has no code."""
+        if not _has_code(S_w_m):
+            self.far += 1
+            return False
         self.S_w_m[submap] = S_w_m
         recognised, sigma = submap in self._recognised, self._scale_sigma.get(submap, 0.0)
         self._publisher.publish_placement(submap, S_w_m, recognised=recognised, scale_sigma=sigma, urgent=urgent)
+        return True
 
-    def _move_world(self, S_new_old: F64, but: Collection[SubmapId] = ()) -> None:
-        """Move all placements, except some, to a rotated or rescaled world; submaps in metres keep their scale."""
-        self.unmerged = {s: self._moved(s, S_new_old, S) for s, S in self.unmerged.items()}
-        for submap, S_w_m in self.S_w_m.items():
-            if submap not in but:
-                self._set(submap, self._moved(submap, S_new_old, S_w_m))
+    def _move_world(self, S_new_old: F64, but: Collection[SubmapId] = ()) -> bool:
+        """Move all placements, except some, to a rotated or rescaled world; submaps in metres keep their scale.
+
+        False if the submap that defines w would lie too far off: then none moves.
+        """
+        moved = {s: self._moved(s, S_new_old, S_w_m) for s, S_w_m in self.S_w_m.items() if s not in but}
+        first = self.first
+        if first in moved and not _has_code(moved[first]):
+            return False
+        unmerged = {s: self._moved(s, S_new_old, S) for s, S in self.unmerged.items()}
+        self.unmerged = {s: S if _has_code(S) else self.unmerged[s] for s, S in unmerged.items()}
+        for submap, S_w_m in moved.items():
+            self._set(submap, S_w_m)
+        return True
 
     def _moved(self, submap: SubmapId, S_new_old: F64, S_w_m: F64) -> F64:
         """Placement of a submap in a moved world; one in metres moves rigidly, with its first keyframe."""
@@ -241,3 +258,8 @@ class SubmapPlacements:
         first = self._map.first_pose(submap)
         T_w_k = sim3.place(S_new_old, sim3.place(S_w_m, first))
         return sim3.normalise(sim3.of(sim3.scale_of(S_w_m), T_w_k) @ se3.inverse(first))
+
+
+def _has_code(S_w_m: F64) -> bool:
+    """True if a placement can be sent."""
+    return is_near(S_w_m) and MIN_SCALE <= sim3.scale_of(S_w_m) <= MAX_SCALE

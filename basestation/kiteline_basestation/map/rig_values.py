@@ -1,5 +1,7 @@
 """Calibrations and disparity offsets of the agents' cameras."""
 
+from bisect import bisect_right
+
 import numpy as np
 
 from kiteline_basestation.map.map_view import MapView
@@ -7,13 +9,17 @@ from kiteline_codec.schema import StereoAlignment
 from kiteline_core.arrays import F64
 from kiteline_core.geometry import disparity_offset
 from kiteline_core.geometry.cameras import RectifiedCamera
-from kiteline_core.ids import AgentId, agent_of_keyframe
+from kiteline_core.ids import AgentId, KeyframeId, agent_of_keyframe, submap_of_keyframe
 
 _REPAIRED_PX = 0.5  # difference of a number of a disparity offset; flights of one rig differ by a tenth
 
 
 class RigValues(MapView):
     """A map whose agents' cameras can be set."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.far_poses = 0  # poses that were left out: they are farther off than any flight leads
 
     def set_camera(self, agent: AgentId, camera: RectifiedCamera) -> None:
         """Set the rectified camera of an agent, also for its keyframes so far.
@@ -75,6 +81,20 @@ class RigValues(MapView):
             self.disparity_calibrated.discard(agent)
         if agent not in self.disparity_sigma_px:
             self.disparity_offset_px[agent] = self.good_offset_px[agent] = offset
+
+    def note_offset(self, keyframe: KeyframeId) -> None:
+        """Note the disparity offset that both sides know as a keyframe arrives: its motion was measured with it.
+
+        One that arrives late was measured before the next one of its submap, and shares the offset of that.
+        """
+        submap = self.submaps[submap_of_keyframe(keyframe)]
+        after = submap[bisect_right(submap, keyframe) :]
+        if after:
+            offset: F64 | None = self.offset_measured_with(after[0])
+        else:
+            offset = self.disparity_offset_px.get(agent_of_keyframe(keyframe))
+        if offset is not None and not np.array_equal(offset, self.offset_measured_with(keyframe)):
+            self.measured_with_px[keyframe] = offset
 
 
 def parameters(camera: RectifiedCamera) -> tuple[float, float, float, float, float]:

@@ -25,7 +25,7 @@ from kiteline_basestation.map.map_tables import (
 )
 from kiteline_basestation.map.map_view import Rows
 from kiteline_basestation.map.rig_values import RigValues, parameters
-from kiteline_basestation.map.world_poses import in_submap, place_in_world
+from kiteline_basestation.map.world_poses import in_submap, is_near, place_in_world
 from kiteline_core.arrays import F32, F64, I32, I64, U8, U16, Bool
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.geometry.cameras import RectifiedCamera
@@ -69,7 +69,7 @@ class SparseMap(RigValues):
                 grow(table, row + max(32, row // 4))
             self.rows[keyframe] = row
             self._enter(keyframe, row)
-            self._note_offset(keyframe)
+            self.note_offset(keyframe)
             table.id[row] = keyframe
             table.start[row] = self._allocate(row, keypoints)
             table.count[row] = keypoints
@@ -98,20 +98,6 @@ class SparseMap(RigValues):
         at = bisect_right(keyframes, keyframe)
         keyframes.insert(at, keyframe)
         self._rows_of.setdefault(submap, Rows()).insert(at, row)
-
-    def _note_offset(self, keyframe: KeyframeId) -> None:
-        """Note the disparity offset that both sides know as a keyframe arrives: its motion was measured with it.
-
-        One that arrives late was measured before the next one of its submap, and shares the offset of that.
-        """
-        submap = self.submaps[submap_of_keyframe(keyframe)]
-        after = submap[bisect_right(submap, keyframe) :]
-        if after:
-            offset: F64 | None = self.offset_measured_with(after[0])
-        else:
-            offset = self.disparity_offset_px.get(agent_of_keyframe(keyframe))
-        if offset is not None and not np.array_equal(offset, self.offset_measured_with(keyframe)):
-            self.measured_with_px[keyframe] = offset
 
     def put_new_landmarks(
         self, keyframe: KeyframeId, part: int, index: U16, uv: F32, inv_depth: F32, octave: U8,
@@ -161,11 +147,13 @@ class SparseMap(RigValues):
     # -- values of the base ------------------------------------------------------------------------------------------
 
     def set_pose(self, keyframe: KeyframeId, T_m_k: F64, *, carry: bool = True) -> None:
-        """Set the refined pose (4,4) of a keyframe. carry: descendants without a refined pose move along."""
+        """Set the refined pose (4,4) of a keyframe, unless it is too far off. carry: descendants without a refined pose
+        move along.
+        """
         row = self.rows[keyframe]
         had = self.keyframes.pose_source[row]
-        self.keyframes.T_m_k[row] = T_m_k
-        self._update_world_pose(row)
+        if not self._put_pose(row, T_m_k):
+            return
         self.keyframes.pose_source[row] = REFINED_POSE
         if had == NO_POSE:
             self._refresh_usable(row)
@@ -179,19 +167,21 @@ class SparseMap(RigValues):
         self.set_pose(keyframe, T_w_k, carry=carry)
 
     def set_world_poses(self, keyframes: Sequence[KeyframeId], T_w_k: F64) -> None:
-        """Set (n,4,4) in w of keyframes that have refined poses; submaps and descendants do not move."""
+        """Set (n,4,4) in w, but far ones, of keyframes with refined poses; submaps and descendants do not move."""
         rows = np.array([self.rows[k] for k in keyframes], np.int32)
         submaps = self.keyframes.id[rows] >> SEQUENCE_BITS
         for submap in map(SubmapId, np.unique(submaps).tolist()):
             inside = submaps == submap
-            self.keyframes.T_m_k[rows[inside]] = in_submap(T_w_k[inside], self.submap_poses.get(submap))
+            T_m_k = in_submap(T_w_k[inside], self.submap_poses.get(submap))
+            near = np.array([is_near(T) for T in T_m_k], np.bool_)
+            self.far_poses += int(np.count_nonzero(~near))
+            self.keyframes.T_m_k[rows[inside][near]] = T_m_k[near]
             self._update_world_poses(submap, rows[inside])
 
     def compose(self, keyframe: KeyframeId) -> None:
         """Compose the pose of a keyframe without a refined one from its parent's pose; its children stay."""
         table, row = self.keyframes, self.rows[keyframe]
-        table.T_m_k[row] = table.T_m_k[self.rows[KeyframeId(int(table.parent[row]))]] @ table.T_p_k[row]
-        self._update_world_pose(row)
+        self._put_pose(row, table.T_m_k[self.rows[KeyframeId(int(table.parent[row]))]] @ table.T_p_k[row])
 
     def move_submap(self, submap: SubmapId, S_w_m: F64) -> None:
         """Set S_w_m (4,4) of a submap; its keyframes and landmarks move along."""
@@ -355,17 +345,26 @@ class SparseMap(RigValues):
         """Set a pose from the parent's, and the poses of descendants that are composed from it."""
         table = self.keyframes
         parent = KeyframeId(int(table.parent[row]))
-        if parent == NO_KEYFRAME:
-            table.T_m_k[row] = table.T_p_k[row]
-        else:
+        T_m_k = table.T_p_k[row]
+        if parent != NO_KEYFRAME:
             above = self.rows.get(parent)
             if above is None or table.pose_source[above] == NO_POSE:
                 return
-            table.T_m_k[row] = table.T_m_k[above] @ table.T_p_k[row]
-        self._update_world_pose(row)
+            T_m_k = table.T_m_k[above] @ T_m_k
+        if not self._put_pose(row, T_m_k):
+            return
         table.pose_source[row] = COMPOSED
         self._refresh_usable(row)
         self._compose_children(KeyframeId(int(table.id[row])))
+
+    def _put_pose(self, row: int, T_m_k: F64) -> bool:
+        """Set the pose (4,4) of a keyframe; False, and it stays as it is, if that is too far off."""
+        if not is_near(T_m_k):
+            self.far_poses += 1
+            return False
+        self.keyframes.T_m_k[row] = T_m_k
+        self._update_world_pose(row)
+        return True
 
     def _update_world_pose(self, row: int) -> None:
         """Set T_w_k and scale of a keyframe from T_m_k and the pose of its submap."""
@@ -391,8 +390,8 @@ class SparseMap(RigValues):
             for row in self._children.get(above, []):
                 if table.pose_source[row] == REFINED_POSE:
                     continue
-                table.T_m_k[row] = table.T_m_k[self.rows[above]] @ table.T_p_k[row]
-                self._update_world_pose(row)
+                if not self._put_pose(row, table.T_m_k[self.rows[above]] @ table.T_p_k[row]):
+                    continue
                 if table.pose_source[row] == NO_POSE:
                     table.pose_source[row] = COMPOSED
                     self._refresh_usable(row)

@@ -6,6 +6,13 @@ from kiteline_basestation.map.map_tables import KeyframeTable
 from kiteline_core.arrays import F64, I32
 from kiteline_core.geometry import se3, sim3
 
+_FARTHEST_M = 1e7  # m along an axis: sums of a few such poses still have a code; only a faulty agent is farther
+
+
+def is_near(T: F64) -> bool:
+    """True if the translation of a pose (4,4) is within bounds, so that poses composed of it have a code."""
+    return all(abs(x) <= _FARTHEST_M for x in T[:3, 3].tolist())  # NaN is not
+
 
 def place_in_world(table: KeyframeTable, rows: I32, S_w_m: F64 | None, scale: float) -> None:
     """Set T_w_k and scale of keyframes of one submap from their T_m_k. S_w_m: (4,4) of the submap; None: identity."""
