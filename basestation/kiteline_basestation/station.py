@@ -101,6 +101,8 @@ class Station:
             (agent, tuple(channel.receive(packets.get(agent, ()), now_ns)))
             for agent, channel in sorted(self.channels.items())
         ]
+        for channel in self.channels.values():
+            channel.take_removed()  # the map keeps what it was given; else the keys would pile up
         self.received = sum(len(records) for _, records in arrivals)
         for agent, records in arrivals:
             self._track(agent, False, records)

@@ -11,10 +11,18 @@ from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.job_kinds import run_job
 from kiteline_basestation.station import Station
 from kiteline_codec.channel import CodedChannel, RecordChannel, coded_channel, plain_pair
-from kiteline_codec.schema import CameraIntrinsics, KeyframePose, Observations, Record, RefinedLandmarks
+from kiteline_codec.schema import (
+    CameraIntrinsics,
+    Key,
+    KeyframePose,
+    Observations,
+    Record,
+    RefinedLandmarks,
+    ScanImages,
+)
 from kiteline_codec.schema.owners import KEYFRAME_BYTES
 from kiteline_codec.sync.config import SyncConfig
-from kiteline_core.ids import AgentId
+from kiteline_core.ids import AgentId, keyframe_id, submap_id
 
 STEP_NS = 100_000_000
 
@@ -74,6 +82,24 @@ def test_nothing_is_planned_for_an_agent_that_has_left(
     agent_end.put(CameraIntrinsics(flight.agent, flight.camera))
     station.step({flight.agent: agent_end.poll(70 * 10**9)}, (), 70 * 10**9)
     assert planned[-1] == 70 * 10**9
+
+
+def test_keys_that_an_agent_removed_are_not_kept() -> None:
+    """An agent removes each of its images once it has arrived; over a day of flights the keys took up memory."""
+    agent, keyframe = AgentId(0), keyframe_id(submap_id(0, 1, 0), 0)
+    base_end, agent_end = coded_channel(1, peer=agent), coded_channel(65)
+    station = Station(BaseConfig(), lambda agent: base_end)
+    images = Key(ScanImages.KIND, keyframe, 0)
+    agent_end.put(ScanImages(keyframe, np.eye(4), 0, np.array([0.0, -1.0, 0.0]), b"image"))
+    packets: tuple[bytes, ...] = ()
+    for n in range(20):
+        agent_end.receive(packets, n * STEP_NS)
+        if n == 10:
+            assert base_end.endpoint.peer_value(images) is not None
+            agent_end.remove(images)
+        packets = dict(station.step({agent: agent_end.poll(n * STEP_NS)}, (), n * STEP_NS).packets)[agent]
+    assert base_end.endpoint.peer_value(images) is None
+    assert base_end.take_removed() == []
 
 
 def test_plain_channels_and_order_of_agents(make_flight: Callable[..., Any]) -> None:
