@@ -65,8 +65,8 @@ def sectors_of(config: GridConfig, scan: KeptScan, lattice: Lattice, hit: int) -
     """The sectors of a scan at a pose. hit: log-odds of a near view of an obstacle."""
     scale = scale_of(lattice)
     unit, ranges = scale / config.cell_m, scan.ranges()
-    bands = ranges[1].astype(np.uint8)
     middle, start, free, clear = (ranges[k] * unit for k in (0, 2, 3, 4))
+    bands = np.where(middle > 0.0, ranges[1], 0).astype(np.uint8)  # nothing stands in the camera
     obstacle = _surfaces(middle, bands, scan.step)
     near_m = np.where(np.isfinite(ranges[0]), ranges[0], 0.0)
     # Cells before an obstacle are free up to some deviations of its range, and at least a cell, before it.

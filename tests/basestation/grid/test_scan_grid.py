@@ -175,6 +175,19 @@ def test_scans_beyond_all_storeys_or_of_a_huge_scale_are_not_drawn() -> None:
     assert not grid.places
 
 
+def test_an_obstacle_in_the_camera_itself_is_none() -> None:
+    """No scan of ours has one; a faulty agent's may."""
+    scan = scan_of(ROOM, 0.5, 0.5, 0.3)
+    obstacle = scan.obstacle_m.copy()
+    obstacle[10:13] = 0.0
+    grid, clear = ScanGrid(CONFIG), ScanGrid(CONFIG)
+    grid.put(0, kept(replace(scan, obstacle_m=obstacle)), camera(0.5, 0.5, 0.3))
+    bands = np.where(obstacle > 0.0, scan.bands, 0).astype(np.uint8)
+    clear.put(0, kept(replace(scan, obstacle_m=obstacle, bands=bands)), camera(0.5, 0.5, 0.3))
+    assert grid.places
+    assert_equal(grid, clear)
+
+
 def test_ground_that_begins_beyond_the_range_needs_no_memory() -> None:
     pose = circle(1)[0]
     scan = scan_of(ROOM, *pose)
