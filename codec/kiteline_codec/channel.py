@@ -9,6 +9,7 @@ from kiteline_codec.pacing.profiles import EXACT, PROFILES, Profile
 from kiteline_codec.residuals.residual_coding import ResidualCoder
 from kiteline_codec.schema import (
     AGENT_KINDS,
+    KEYFRAME_KINDS,
     PASSING_KINDS,
     CachedKeyframe,
     CachedLandmarks,
@@ -25,9 +26,11 @@ from kiteline_codec.schema import (
 from kiteline_codec.sync.archive import Spill
 from kiteline_codec.sync.config import SyncConfig, SyncStats
 from kiteline_codec.sync.endpoint import Endpoint
+from kiteline_codec.sync.resumption import is_of_start
 from kiteline_codec.transport.link_traits import LinkTraits
 from kiteline_core.ids import AgentId
 
+_OF_AGENTS_KEYFRAMES = KEYFRAME_KINDS - AGENT_KINDS  # what a base says of an agent's own keyframes
 # Kinds that their writer does not use as the other side holds them. Of what the agent writes it uses poses alone: its
 # map holds what was measured.
 _SENT_ALONE = AGENT_KINDS - {KeyframeHeader.KIND} | {CachedKeyframe.KIND, CachedLandmarks.KIND, GridTile.KIND}
@@ -151,6 +154,7 @@ class CodedChannel:
             may_write = partial(owners.of_agent, peer)
             self.endpoint = Endpoint(config, session, ResidualCoder(), spill, may_write, owners.claimed_bytes)
         self._from_base = peer is None
+        self._aside: dict[Key, bytes] = {}  # not shared: of keyframes of the agent's earlier starts
         self._placed_by: int | None = None  # session of the base that has placed a submap
         self.undecodable = 0  # values whose code is no valid record: the other side has another schema
         self.noting = False  # whether `take_noted` is used
@@ -203,7 +207,10 @@ class CodedChannel:
             return record
         key = messages.key(record)
         code = messages.encode(record)
-        self.endpoint.put(key, code)
+        if self._is_of_another_start(key):
+            self._aside[key] = code
+        else:
+            self.endpoint.put(key, code)
         if isinstance(record, KeyframeHeader):
             self._pacer.keyframe(record.t_ns)
         if self.noting and not isinstance(record, LivePose) and key.kind not in PASSING_KINDS:
@@ -225,11 +232,20 @@ class CodedChannel:
 
     def remove(self, key: Key) -> None:
         """Remove a record."""
+        self._aside.pop(key, None)
         self.endpoint.remove(key)
+
+    def own_value(self, key: Key) -> bytes | None:
+        """The code of a record that was put; None if there is none."""
+        return self._aside.get(key) or self.endpoint.own_value(key)
+
+    def own_values(self) -> dict[Key, bytes]:
+        """The codes of all records that were put; a copy."""
+        return self.endpoint.own_values() | self._aside
 
     def receive(self, packets: Sequence[bytes], now_ns: int) -> list[Record]:
         """Take in packets from the link. Values that cannot be decoded are counted and left out."""
-        records = []
+        records, session = [], self.endpoint.peer_session
         for packet in packets:
             for update in self.endpoint.receive(packet, now_ns):
                 if update.code is None:
@@ -241,7 +257,22 @@ class CodedChannel:
                     self.undecodable += 1
         if self._from_base:
             self._end_other_world(records)
+        elif self.endpoint.peer_session != session:
+            self._set_aside()
         return records
+
+    def _set_aside(self) -> None:
+        """Send nothing of an agent's earlier starts to the one that began: it holds none of those keyframes."""
+        for key, code in self.endpoint.own_values().items():
+            if self._is_of_another_start(key):
+                self.endpoint.remove(key)
+                self._aside[key] = code
+
+    def _is_of_another_start(self, key: Key) -> bool:
+        """True for what a base says of a keyframe that the agent's present start did not make."""
+        session = self.endpoint.peer_session
+        of_keyframe = not self._from_base and session is not None and key.kind in _OF_AGENTS_KEYFRAMES
+        return of_keyframe and not is_of_start(key.id, session or 0)
 
     def _end_other_world(self, records: Sequence[Record]) -> None:
         """Remove what an earlier base wrote once a new one has placed a submap: what that left out lies elsewhere."""

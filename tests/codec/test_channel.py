@@ -1,5 +1,7 @@
 """Records from one end to the other: coded and plain."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -18,8 +20,9 @@ from kiteline_codec.schema import (
     messages,
 )
 from kiteline_codec.sync.config import SyncConfig
+from kiteline_codec.sync.resumption import agent_session
 from kiteline_core.geometry import se3
-from kiteline_core.ids import AgentId, KeyframeId, SubmapId
+from kiteline_core.ids import AgentId, KeyframeId, SubmapId, keyframe_id, submap_id
 
 POSE = KeyframePose(KeyframeId(7), se3.exp(np.array([1.00003, 2.0, 3.0, 0.1, 0.2, 0.3])))
 
@@ -149,7 +152,7 @@ def test_three_packets_lost_in_a_row_leave_no_gap_of_a_second_between_poses(lost
 
 def test_what_a_base_that_lost_its_map_wrote_ends_once_the_next_one_has_placed_a_submap() -> None:
     """Its tiles and placements lie in another world. One with the same map loses nothing for good."""
-    rng, agent = np.random.default_rng(0), coded_channel(65)
+    rng, agent = np.random.default_rng(0), coded_channel(agent_session(1, 0))
     tiles = [GridTile(n, 0, 0, 0.1, rng.integers(0, 8, (64, 64)).astype(np.int8)) for n in range(3)]
     other_world = SubmapPlacement(SubmapId(0), se3.exp(np.array([9.0, 0.0, 0.0, 0.0, 0.0, 1.0])))
     keys = [messages.key(tile) for tile in tiles]
@@ -175,3 +178,24 @@ def test_what_a_base_that_lost_its_map_wrote_ends_once_the_next_one_has_placed_a
     assert held == {placed, keys[2]}
     run(second, *tiles)  # by reference to what the agent still holds
     assert held == {placed, *keys} and not agent.undecodable and agent.stats.rejected == 0
+
+
+def test_a_new_start_of_an_agent_gets_nothing_of_keyframes_that_earlier_ones_made() -> None:
+    """It holds none of them. The base keeps what it said of them, for its store."""
+    base = coded_channel(1, peer=AgentId(3))
+    poses = [KeyframePose(keyframe_id(submap_id(3, boot, 0), 5), POSE.T_m_k) for boot in (1, 2)]
+    first, second = (coded_channel(agent_session(order, order)) for order in (1, 2))
+    cross(first, base)
+    base.put(poses[0])
+    assert [r.KIND for r in cross(base, first)[0]] == [KeyframePose.KIND]
+    cross(second, base)
+    for pose in poses:
+        base.put(replace(pose, T_m_k=np.eye(4)))
+    heard, _ = cross(base, second, 20)
+    assert [r.keyframe for r in heard if isinstance(r, KeyframePose)] == [poses[1].keyframe]
+    key = messages.key(poses[0])
+    assert base.arrived(key) and base.own_value(key) == base.own_values()[key]
+    assert base.own_value(key) == messages.encode(replace(poses[0], T_m_k=np.eye(4)))
+    assert base.endpoint.quiet
+    base.remove(key)
+    assert base.own_value(key) is None and base.endpoint.quiet

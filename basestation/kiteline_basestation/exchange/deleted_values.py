@@ -24,7 +24,7 @@ class DeletedValues:
         """
         if self._seen < len(deleted):
             self._seen = len(deleted)
-            keys = channel.endpoint.own_values()
+            keys = channel.own_values()
             self._keys = sorted((k for k in keys if k.kind in KEYFRAME_KINDS and submap_of(k) in deleted), reverse=True)
         if self._keys and not channel.endpoint.backlog_bytes:
             for key in self._keys[-_AT_ONCE:]:

@@ -85,7 +85,7 @@ class Keeper:
             channel = station.channels[agent]
             if code is None and isinstance(channel, CodedChannel):
                 end = channel.endpoint
-                code = end.own_value(key) if own else end.peer_value(key)
+                code = channel.own_value(key) if own else end.peer_value(key)
                 if code is None and not own:  # the agent may have begun a new session since it wrote the value
                     code = end.earlier.codes.get(key)
             if code is not None and (not self._deleted or submap_of(key) not in self._deleted):
@@ -149,7 +149,7 @@ def snapshot(station: Station, before: SavedMap) -> SavedMap:
         if isinstance(channel, CodedChannel):
             end = channel.endpoint
             old = before.agents.get(agent, SavedValues({}, {}))
-            own = {key: code for key, code in end.own_values().items() if not is_cached_key(key)}
+            own = {key: code for key, code in channel.own_values().items() if not is_cached_key(key)}
             changed = (station.changed or {}).items()
             imported = {key: code for (a, _, key), code in changed if a == agent and code is not None}
             agents[agent] = SavedValues({**old.received, **imported, **end.earlier_values(), **end.peer_values()}, own)

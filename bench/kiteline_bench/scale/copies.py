@@ -39,7 +39,7 @@ class PlaceCopies:
         channel = station.channels[link.agent]
         assert isinstance(channel, CodedChannel)
         self._channel = channel
-        codes = channel.endpoint.own_values().items()
+        codes = channel.own_values().items()
         self._own = [r for r in (messages.decode(key, code) for key, code in codes) if isinstance(r, _OWN)]
         self._state: MapperState | None = None  # before the copies that are being added
 

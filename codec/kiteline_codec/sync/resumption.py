@@ -66,7 +66,7 @@ def summaries(values: Mapping[Key, bytes], session: int) -> dict[Key, bytes]:
     Of an agent's keyframes only those of its present boot, as far as its session tells: it holds no others.
     """
     keys = [key for key, code in values.items() if len(code) >= _MIN_CODE_BYTES and key.kind != SUMMARY_KIND]
-    keys = [key for key in keys if key.kind not in _FROM_AGENT or _is_of(key.id, session)]
+    keys = [key for key in keys if key.kind not in _FROM_AGENT or is_of_start(key.id, session)]
     keys.sort(key=lambda key: (-key.id, key.kind, key.part))
     out: dict[Key, bytes] = {}
     for part, begin in enumerate(range(0, min(len(keys), _MAX_PARTS * _VALUES_PER_PART), _VALUES_PER_PART)):
@@ -88,12 +88,13 @@ def outlived(is_gone: Callable[[Key], bool], session: int) -> Callable[[Key], bo
 
     def of_other_boot(key: Key) -> bool:
         submap = submap_of(key)
-        return submap is not None and not _is_of(submap << SEQUENCE_BITS, session)
+        return submap is not None and not is_of_start(submap << SEQUENCE_BITS, session)
 
     return lambda key: key.kind == SUMMARY_KIND or (is_gone(key) and of_other_boot(key))
 
 
-def _is_of(keyframe: int, session: int) -> bool:
+def is_of_start(keyframe: int, session: int) -> bool:
+    """True if a keyframe is of the boot of an agent's session, as far as its few bits tell."""
     return (keyframe >> SEQUENCE_BITS + SUBMAP_BITS ^ session) & (1 << _BOOT_PART_BITS) - 1 == 0
 
 
