@@ -18,8 +18,8 @@ from kiteline_codec.transport.packet import MASK_BITS, Item
 from kiteline_codec.transport.sequence_window import SequenceWindow
 
 VALUE_BYTES = 350  # memory of a value beside its code, roughly; of a removal or of a value that came in part, too
-_AT_ONCE = 0.5  # share of the memory that values claim as they come
-_IN_TIME = 0.75  # the same with those that waited; the rest is for values that claim nothing, or are not used yet
+_FOR_WAITING = 2, 16 << 20  # part of the memory that is for claims of values that waited, but no more than these bytes
+_FOR_OTHERS = 4, 8 << 20  # of that, for values that claim nothing, or are not used yet
 _TRIED_NS = 200_000_000  # between two looks at those that wait
 _MOST_PIECES = 256  # gaps in a value that comes in part: a link has 64 packets in flight
 
@@ -77,7 +77,7 @@ class Claims:
     def fit(self, key: Key, code: bytes, limit: int) -> bool:
         """Count a value unless all claims would then be above their share of the limit: then it waits."""
         claimed = self._claimed_bytes(key, code)
-        if claimed and self.bytes + claimed > _AT_ONCE * limit:
+        if claimed and self.bytes + claimed > _without(limit, _FOR_WAITING):
             self._waiting.add(key)
             return False
         self._waiting.discard(key)
@@ -96,7 +96,7 @@ class Claims:
                 self._waiting.discard(key)
                 continue
             claimed = self._claimed_bytes(key, code)
-            if self.bytes + claimed > _IN_TIME * limit:
+            if self.bytes + claimed > _without(limit, _FOR_OTHERS):
                 break
             if self.is_of_use(key, code, due):
                 self.bytes += claimed
@@ -112,6 +112,11 @@ class Claims:
         claimed = self._claimed_bytes(key, code)
         self.bytes = max(0, self.bytes - claimed)
         self.earned = max(0, self.earned - claimed - len(code) - VALUE_BYTES)
+
+
+def _without(limit: int, reserved: tuple[int, int]) -> int:
+    part, most = reserved
+    return limit - min(limit // part, most)
 
 
 class EarlierValues:
