@@ -107,6 +107,7 @@ class FixedLagSmoother:
         floor = np.repeat([config.turn_floor_rad, config.velocity_floor_m_s, config.position_floor_m], 3)
         self._floor = np.diag(floor**2)  # of the covariance of an interval
         self._walk_square = np.array([calibration.gyro_walk, calibration.accel_walk]) ** 2
+        self.extra_walk = np.zeros(2)  # of the biases of gyro and accelerometer, while what corrects samples changes
         T_c_b = se3.inverse(camera.T_b_c)
         self._r_cb, self._t_cb = np.ascontiguousarray(T_c_b[:3, :3]), T_c_b[:3, 3].copy()
         self._intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy, camera.bf])
@@ -319,7 +320,7 @@ class FixedLagSmoother:
         self._imu_jac[k], self._imu_bias[k] = motion.jac, motion.bias
         by_length = self._imu_length[k]
         self._imu_info[k] = np.linalg.inv(motion.cov + self._floor + np.outer(by_length, by_length))
-        self._imu_walk[k] = 1.0 / (self._walk_square * motion.dt_s)
+        self._imu_walk[k] = 1.0 / ((self._walk_square + self.extra_walk**2) * motion.dt_s)
 
     def _put_points(self, k: int, points: VisualPoints | None) -> None:
         self._vis_h[k], self._vis_b[k] = 0.0, 0.0
@@ -381,6 +382,13 @@ def tilt_of(gravity: F64) -> F64:
     s, angle = float(np.hypot(up[0], up[1])), float(np.arctan2(np.hypot(up[0], up[1]), up[2]))
     k = angle / s if s > 1e-12 else 1.0
     return np.array([-k * up[1], k * up[0]])
+
+
+def tilt_by_direction(gravity: F64, across: F64) -> F64:
+    """Change (2,2) of the tilt, in rad, by turns of `gravity` (3,) towards the unit vectors across (3,2)."""
+    down, jac = np.empty(3), np.empty((3, 2))
+    inertial_kernels.down_of_tilt(tilt_of(gravity), down, jac)
+    return np.asarray(np.linalg.lstsq(jac, across, rcond=None)[0])
 
 
 def _tilt_jacobian(r: F64, tilt: F64) -> F64:

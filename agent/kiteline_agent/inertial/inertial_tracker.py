@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from kiteline_agent.inertial.bias_relaxation import BiasRelaxation
 from kiteline_agent.inertial.calibration.known_imu import KnownImuConfig
 from kiteline_agent.inertial.calibration.self_calibration import SelfCalibration
 from kiteline_agent.inertial.clocks.frame_clock import FrameClock
@@ -47,6 +48,7 @@ class InertialTracker:
             config, calibration, self._p_b_c, self._buffer, self.self_calibration.correct
         )
         self._reported_s = self._followed_s = config.calibration.offset_s  # offset last told; applied then or later
+        self._relaxation = BiasRelaxation()
         self.scale = ScaleFilter(calibration, config.gravity_m_s2, self._p_b_c)  # of a monocular map
         self._scale_watch = ScaleWatch(self.scale, self._p_b_c, self._has_come, self._between_frames)
         # the interval that was asked for last
@@ -387,3 +389,6 @@ class InertialTracker:
         elif change.any():
             self._bias = np.concatenate([self._bias[:3], self._bias[3:] + change])
             self._smoother.shift_accel_bias(change)
+        applied = self.self_calibration
+        walk = self._relaxation.walk(applied.offset_s, applied.gyro_matrix, applied.accel_matrix, dt_s)
+        self._smoother.extra_walk = walk

@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from kiteline_agent.inertial.fixed_lag import BodyVelocity, FixedLagSmoother, InertialState, tilt_of
+from kiteline_agent.inertial.fixed_lag import BodyVelocity, FixedLagSmoother, InertialState, tilt_by_direction, tilt_of
 from kiteline_agent.inertial.inertial_config import FixedLagConfig, StartDeviations
 from kiteline_agent.inertial.preintegration import Samples
+from kiteline_agent.initialisation.window.window_state import tangent
 from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
 from tests.agent.lag_flights import CALIBRATION, CAMERA, FRAME_STEPS, GRAVITY, STEP_S, Flight, make_flight, see
@@ -278,3 +279,13 @@ def test_a_new_map_takes_along_what_is_known() -> None:
         nees.append(e @ np.linalg.solve(s.cov[6:, 6:], e))
         assert smoother.add(flight.samples(38), None) is not None
     assert 8.0 < np.mean(nees) < 15.0  # 11 degrees of freedom, 99.9 % of the mean of 16
+
+
+@pytest.mark.parametrize("gravity", [(-9.8, 0.3, 0.2), (0.1, -0.2, -9.8), (0.0, 9.7, 1.0), (0.5, -0.7, 9.7)])
+def test_turns_of_gravity_are_told_as_changes_of_the_tilt(gravity: tuple[float, float, float]) -> None:
+    down = np.array(gravity) / np.linalg.norm(gravity)
+    across = tangent(down)
+    by_direction = tilt_by_direction(np.array(gravity), across)
+    for k in range(2):
+        turned = [tilt_of(down + sign * 1e-5 * across[:, k]) for sign in (-1.0, 1.0)]
+        np.testing.assert_allclose(by_direction[:, k], (turned[1] - turned[0]) / 2e-5, rtol=1e-3, atol=1e-3)

@@ -16,7 +16,8 @@ from kiteline_core.frame import ImuCalibration
 
 _RATE_NS = 12_000_000  # to either side of an instant, averaged for the rate there
 _LONGEST = 4.0  # times the window: longer ones have a gap
-_FRAMES = 64  # most frames that are kept
+_FRAMES = 64  # that are kept, and those of a window and this much longer, which fast cameras have more of
+_KEPT_S = 0.5  # s by which samples may come after their frames
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +49,9 @@ class PoseChain:
 
     def add(self, t_ns: int, T_m_b: F64) -> None:
         """Append the pose T_m_b (4,4) of a frame, by images alone."""
-        self._poses = [*self._poses, (t_ns, T_m_b.copy())][-_FRAMES:]
+        poses, oldest_ns = [*self._poses, (t_ns, T_m_b.copy())], t_ns - round((self._window_s + _KEPT_S) * 1e9)
+        first_kept = len(poses) - _FRAMES
+        self._poses = [pose for k, pose in enumerate(poses) if k >= first_kept or pose[0] >= oldest_ns]
 
     def clear(self) -> None:
         """Begin again after an image loss or in a new map."""

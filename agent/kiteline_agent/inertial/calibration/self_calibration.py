@@ -78,7 +78,7 @@ class SelfCalibration:
         self._unsteady = 1.0  # factor on the variance of poses by images, since the last window of moves
         self._depth_m = 0.0  # that the images saw, largest since the last window of moves
         self.offset_s = config.offset_s  # applied: camera stamp + offset = IMU time
-        self._gyro_matrix, self._accel_matrix = np.eye(3), np.eye(3)  # applied to samples
+        self.gyro_matrix, self.accel_matrix = np.eye(3), np.eye(3)  # applied to samples
         self._gyro_windows = 0  # in a row after which the gyro's axes differed significantly
         self._refuting_windows = 0  # in a row that refuted what earlier flights found
         self._has_found_mounting = False
@@ -107,8 +107,8 @@ class SelfCalibration:
             self._begin_gyro()
             self._follow_offset(np.inf)
         self._begin_accel()
-        self._gyro_matrix = self.gyro.matrix if self._corrects_gyro else np.eye(3)
-        self._accel_matrix = self.accel.matrix if self._corrects_accel else np.eye(3)
+        self.gyro_matrix = self.gyro.matrix if self._corrects_gyro else np.eye(3)
+        self.accel_matrix = self.accel.matrix if self._corrects_accel else np.eye(3)
 
     def _begin_gyro(self) -> None:
         """Begin the gyro's filter with what earlier flights found, and one without it beside."""
@@ -160,8 +160,8 @@ class SelfCalibration:
 
     def correct(self, samples: Samples) -> Samples:
         """Samples with the applied scales and axes, as the body's origin feels them."""
-        gyro = samples.gyro @ self._gyro_matrix.T if self._corrects_gyro else samples.gyro
-        accel = samples.accel @ self._accel_matrix.T if self._corrects_accel else samples.accel
+        gyro = samples.gyro @ self.gyro_matrix.T if self._corrects_gyro else samples.gyro
+        accel = samples.accel @ self.accel_matrix.T if self._corrects_accel else samples.accel
         if self._lever_m.any():
             rate = gyro - self.gyro.bias
             speed = np.cross(rate, self._lever_m)
@@ -325,7 +325,7 @@ class SelfCalibration:
     def _begin_with_mounting(self, found: Mounting) -> None:
         """Begin the gyro's filter anew; after more than a small change of the time offset all that is inertial, too."""
         self._has_found_mounting = True
-        change_rad = float(np.linalg.norm(se3.so3_log(found.rotation @ self._accel_matrix.T)))
+        change_rad = float(np.linalg.norm(se3.so3_log(found.rotation @ self.accel_matrix.T)))
         self.turned = change_rad > mounting_search.LEAST_ROTATION_RAD
         jumps = abs(found.offset_s - self.offset_s) > mounting_search.RESTART_S
         jumps |= not np.array_equal(found.axes, self._given_axes)
@@ -334,9 +334,9 @@ class SelfCalibration:
         self.gyro.set_bias(found.bias)
         self._given_axes, self._given_offset_s = found.axes, found.offset_s
         self.offset_s, self._corrects_offset = found.offset_s, True
-        self._gyro_matrix, self._corrects_gyro = found.axes, True
+        self.gyro_matrix, self._corrects_gyro = found.axes, True
         if self.turned:
-            self._accel_matrix, self._corrects_accel = found.rotation, True
+            self.accel_matrix, self._corrects_accel = found.rotation, True
         if jumps:
             self._restart()
 
@@ -354,7 +354,7 @@ class SelfCalibration:
     def _restart(self) -> None:
         """Begin the accelerometer's calibration anew, with the axes that are applied."""
         self.accel = self._unknown_accel()
-        self.accel.begin_with(self._accel_matrix, self._config.axes_sigma.reshape(3, 3))
+        self.accel.begin_with(self.accel_matrix, self._config.axes_sigma.reshape(3, 3))
         self._moves.clear()
         self._lever.clear()
         self._before, self.restarted = None, True
@@ -375,10 +375,10 @@ class SelfCalibration:
         change = np.zeros(3)
         share = 1.0 - float(np.exp(-dt_s / _APPLY_S))
         if self._corrects_gyro:
-            self._gyro_matrix = self._gyro_matrix + share * (self.gyro.matrix - self._gyro_matrix)
+            self.gyro_matrix = self.gyro_matrix + share * (self.gyro.matrix - self.gyro_matrix)
         if self._corrects_accel:
-            step = share * (self.accel.matrix - self._accel_matrix)
-            self._accel_matrix = self._accel_matrix + step
+            step = share * (self.accel.matrix - self.accel_matrix)
+            self.accel_matrix = self.accel_matrix + step
             change = step @ buffer.last_accel
         return change
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from kiteline_agent.inertial import initial_alignment
+from kiteline_agent.inertial.fixed_lag import tilt_by_direction
 from kiteline_agent.inertial.preintegration import BiasPrior, TimeOffset
 from kiteline_agent.inertial_start_config import InertialBundleConfig
 from kiteline_agent.initialisation.corner_tracks import CornerObservations
@@ -251,13 +252,15 @@ class InertialBundle:
         order = np.concatenate(
             [last + np.arange(9), STATE * n + np.arange(3), last + np.arange(9, 12), STATE * n + 3 + np.arange(2)]
         )
+        to_tilt = np.eye(len(order))
+        to_tilt[-2:, -2:] = tilt_by_direction(state.gravity, tangent(state.gravity))
         offset = TimeOffset(state.offset_s, float(np.sqrt(cov[STATE * n + OFFSET, STATE * n + OFFSET])))
         return WindowSolution(
             state, se3.from_rt(state.R[-1], state.p[-1]), state.v[-1],
             np.concatenate([state.gyro_bias, state.accel_bias[-1]]), state.gravity, offset,
-            cov[np.ix_(order, order)], cov[-TERMS:, -TERMS:].copy(), float(np.sqrt(variance)), system.cost,
-            self._converged, self._corners.reprojection_px, self._terms.mean_chi2(state),
-            self._terms.evidence(state, cov), self._corners.newest_depth_m(state),
+            to_tilt @ cov[np.ix_(order, order)] @ to_tilt.T, cov[-TERMS:, -TERMS:].copy(),
+            float(np.sqrt(variance)), system.cost, self._converged, self._corners.reprojection_px,
+            self._terms.mean_chi2(state), self._terms.evidence(state, cov), self._corners.newest_depth_m(state),
             np.sqrt(np.maximum(system.corners.inv[:, 2, 2], 0.0)) / state.rho,
         )  # fmt: skip
 

@@ -106,6 +106,18 @@ def test_a_hole_too_long_makes_an_interval_unknown() -> None:
     assert filled(gyro, accel, slice(300, 345)).between(295 * STEP_NS, 350 * STEP_NS) is None
 
 
+def test_steps_beside_clipped_samples_count_in_full() -> None:
+    gyro, accel = lively(400)
+    size = np.abs(accel[50:350]).max(axis=1)
+    at = 50 + int(size.argmax())
+    accel[at + 1] = accel[at]  # two samples at the end of the range
+    accel[np.abs(accel).max(axis=1) > size.max()] *= 0.9
+    density = interval(filled(gyro, accel), at - 5, at + 6).density
+    assert density is not None
+    assert (density[4:8, 1] > 10.0 * density[0, 1]).tolist() == [False, True, True, True]
+    assert (density[[0, 1, 2, 3, 4, 8, 9], 1] == density[0, 1]).all() and (density[:, 0] == density[0, 0]).all()
+
+
 def test_clipped_samples_are_doubted() -> None:
     gyro, accel = lively(400, 1.0)
     accel[300:310, 2] += 15.0
@@ -165,7 +177,10 @@ def test_samples_that_have_not_come_are_told_and_hardly_count() -> None:
     newest = 99 * STEP_NS
     assert not buffer.lacks(newest + 5 * STEP_NS) and buffer.lacks(newest + 6 * STEP_NS)
     near, far = interval(buffer, 90, 101), interval(buffer, 90, 109)
-    assert near.density is not None and near.density.max() < 0.01
+    assert near.density is not None and near.density[:-1].max() < 0.01
+    np.testing.assert_allclose(near.density[-1], np.sqrt(0.01) * np.array([0.3, 2.0]), rtol=1e-3)  # a held one
+    come = interval(buffer, 80, 99)
+    assert come.density is not None and come.density.max() < 0.01
     held = without_held(far)
     assert held.density is not None and held.density[:-1].max() < 0.01
     lasting_s = far.t_s[-1] - far.t_s[-2]
