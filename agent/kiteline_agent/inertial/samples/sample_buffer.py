@@ -118,7 +118,7 @@ class SampleBuffer:
             (stamps - from_ns).astype(np.float64) * 1e-9,
             np.ascontiguousarray(values[:, :3]),
             np.ascontiguousarray(values[:, 3:]),
-            self._densities(steps, lo, hi, to_ns),
+            self._densities(steps, lo, hi),
         )
 
     def within(self, from_ns: int, to_ns: int) -> F64:
@@ -138,14 +138,13 @@ class SampleBuffer:
         share = (t_ns - int(t[k - 1])) / (int(t[k]) - int(t[k - 1]))
         return np.asarray((1.0 - share) * self._values[k - 1] + share * self._values[k])
 
-    def _densities(self, steps: I64, lo: int, hi: int, to_ns: int) -> F64:
-        """Noise density (n,2) of the steps (n,) in ns up to an instant, between samples lo - 1 and hi."""
+    def _densities(self, steps: I64, lo: int, hi: int) -> F64:
+        """Noise density (n,2) of the steps (n,) in ns, between samples lo - 1 and hi."""
         out = np.empty((len(steps), 2))
         out[:] = self.density
         around = self._clipped[np.clip(np.arange(lo - 1, hi + 1), 0, len(self._t) - 1)]
         clipped = around[:-1] | around[1:]
         missed = steps > _GAP * self._step_ns if self._step_ns else np.zeros(len(steps), np.bool_)
-        missed[-1] |= to_ns > self._t[-1]  # a sample that is held says nothing of what comes after it
         if missed.any():
             dt_s = steps[missed] * 1e-9
             out[missed] = np.sqrt(out[missed] ** 2 + np.outer(dt_s, [_GAP_GYRO_RAD_S**2, _GAP_ACCEL_M_S2**2]))
