@@ -24,6 +24,7 @@ from kiteline_bench.scale.trials import ERROR, PLACE_M, STEP_NS, empty_station, 
 from kiteline_codec import warm as codec_warm
 from kiteline_codec.channel import coded_channel
 from kiteline_codec.schema import Record
+from kiteline_codec.sync.resumption import agent_session
 from kiteline_core.geometry import se3
 from kiteline_core.ids import AgentId
 from kiteline_hw.system.memory import return_large_arrays, rss_mib
@@ -56,7 +57,7 @@ class _Flown:
     def __init__(self) -> None:
         self.station: Station = empty_station()
         self._jobs = LockstepJobs()
-        self.link = Link(_AGENT, coded_channel(1, 0, "wifi", bounded=True))
+        self.link = Link(_AGENT, coded_channel(agent_session(1, 0), 0, "wifi", bounded=True))
         self.now_ns = 0
 
     def fly(self, groups: Sequence[Sequence[Record]]) -> list[float]:

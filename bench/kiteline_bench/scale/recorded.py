@@ -23,6 +23,7 @@ from kiteline_codec.schema import (
     StereoAlignment,
     messages,
 )
+from kiteline_codec.sync.resumption import agent_session
 from kiteline_core.arrays import F64, U8
 from kiteline_core.geometry import se3
 from kiteline_core.ids import (
@@ -95,7 +96,7 @@ def record_flight(source: str, most: int) -> RecordedFlight:
     """Fly a recording over a perfect link without a base, until it has `most` keyframes or ends. Raises SourceError."""
     opened = open_source(source)
     number = AgentId(0)
-    ours, theirs = coded_channel(1, 0, "wifi"), coded_channel(1, 0, "wifi", peer=number)
+    ours, theirs = coded_channel(agent_session(1, 0), 0, "wifi"), coded_channel(1, 0, "wifi", peer=number)
     ours.noting = True
     flying = FlyingAgent(opened.rig, opened.imu, channel=ours, identity=Identity(number, 0), vocabulary=False)
     codes: list[tuple[Key, bytes]] = list(ours.take_noted().items())

@@ -132,7 +132,7 @@ def large_map(flight: RecordedFlight, keyframes: int, flown_last: int | None = N
     flown_last: without the first place, only so many are flown; all between are copies of the first place.
     """
     station, worker = empty_station(), Workers()
-    flown = _Flown(station, Link(AgentId(0), coded_channel(1, 0, "wifi", bounded=True)), worker)
+    flown = _Flown(station, Link(AgentId(0), coded_channel(agent_session(1, 0), 0, "wifi", bounded=True)), worker)
     n = len(flight.keyframes)
     places = max(3, round(keyframes / n))
     boundary = (places - 1) * n  # the next keyframe is the first one's place again
