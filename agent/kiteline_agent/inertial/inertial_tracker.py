@@ -47,7 +47,7 @@ class InertialTracker:
         self._initialiser = ImuInitialiser(
             config, calibration, self._p_b_c, self._buffer, self.self_calibration.correct
         )
-        self._reported_s = self._followed_s = config.calibration.offset_s  # offset last told; applied then or later
+        self._reported_s = self._followed_s = config.calibration.offset_s  # time offset last told; applied then
         self._relaxation = BiasRelaxation()
         self.scale = ScaleFilter(calibration, config.gravity_m_s2, self._p_b_c)  # of a monocular map
         self._scale_watch = ScaleWatch(self.scale, self._p_b_c, self._has_come, self._between_frames)
@@ -110,16 +110,13 @@ class InertialTracker:
     def take_calibration_events(self) -> list[str]:
         """Lines for the log: the applied offset follows one that was not told yet, a correction of axes began."""
         events = self.self_calibration.take_events() + self.clock.take_events()
-        if (
-            abs(self.self_calibration.offset_s - self._followed_s) >= 1e-3
-        ):  # it follows in steps, each of which is no news
-            self._followed_s = self.self_calibration.offset_s
-            found_s, sigma_s = self.time_offset_s
+        applied_s, (found_s, sigma_s) = self.self_calibration.offset_s, self.time_offset_s
+        if abs(applied_s - self._followed_s) >= 1e-3:  # it follows in steps, each of which is no news
+            self._followed_s = applied_s
             if abs(found_s - self._reported_s) >= 1e-3:
                 self._reported_s = found_s
-                events.append(
-                    f"camera stamps + {1e3 * found_s:.1f} ms are the IMU's time (deviation {1e3 * sigma_s:.1f} ms)"
-                )
+                found_ms, sigma_ms = 1e3 * found_s, 1e3 * sigma_s
+                events.append(f"camera stamps + {found_ms:.1f} ms are the IMU's time (deviation {sigma_ms:.1f} ms)")
         return events
 
     def begin_with(self, known: KnownImuConfig) -> None:
