@@ -271,8 +271,9 @@ class CodedChannel:
     def _is_of_another_start(self, key: Key) -> bool:
         """True for what a base says of a keyframe that the agent's present start did not make."""
         session = self.endpoint.peer_session
-        of_keyframe = not self._from_base and session is not None and key.kind in _OF_AGENTS_KEYFRAMES
-        return of_keyframe and not is_of_start(key.id, session or 0)
+        if self._from_base or session is None or key.kind not in _OF_AGENTS_KEYFRAMES:
+            return False
+        return not is_of_start(key.id, session)
 
     def _end_other_world(self, records: Sequence[Record]) -> None:
         """Remove what an earlier base wrote once a new one has placed a submap: what that left out lies elsewhere."""

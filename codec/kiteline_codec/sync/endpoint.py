@@ -111,11 +111,6 @@ class Endpoint:
         held = self._in.held(key)
         return None if held is None else held[1]
 
-    @property
-    def _room_bytes(self) -> int:
-        """Memory for all that the peer claims."""
-        return self.claims.allowed_bytes(self.config) - self.earlier.bytes - self._in.held_bytes
-
     def earlier_values(self) -> dict[Key, bytes]:
         """What earlier sessions of the peer wrote and its present one has not replaced, by key; a copy."""
         return dict(self.earlier.codes)
@@ -246,6 +241,11 @@ class Endpoint:
     def _held(self, key: Key) -> tuple[int, bytes] | None:
         """Version and code of a value of either side."""
         return self._in.held(key) or self._out.held(key)
+
+    @property
+    def _room_bytes(self) -> int:
+        """Memory for all that the peer claims."""
+        return self.claims.allowed_bytes(self.config) - self.earlier.bytes - self._in.held_bytes
 
     def _take_summary(self, code: bytes) -> None:
         """Take in what the peer holds of earlier sessions of this side; a summary that cannot be read is ignored."""

@@ -115,6 +115,7 @@ class Claims:
 
 
 def _without(limit: int, reserved: tuple[int, int]) -> int:
+    """A limit less a part of it, which is at most so many bytes."""
     part, most = reserved
     return limit - min(limit // part, most)
 

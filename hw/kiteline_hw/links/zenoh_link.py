@@ -330,7 +330,7 @@ class ZenohHub(Closing):
 
 
 def open_agent_end(address: str, options: LinkOptions) -> ZenohLink:
-    """Connect to the base at an endpoint, in the background. Raises LinkError for one without a port."""
+    """Connect to the base at an endpoint, in the background. Raises LinkError for one that is none."""
     check_endpoint(address)
     return ZenohLink(address, options.agent, group=options.group, logins=options.logins)
 

@@ -29,7 +29,6 @@ _RETRY_S = 0.1  # s between two attempts to connect
 _ROUTER = "router/"  # before a locator: a Zenoh router listens there, and both sides connect
 _SOURCE_LINE = re.compile(r"\.? at /\S+\.rs:\d+\.?")
 _WITHOUT_PORT = re.compile(r"(?P<host>(router/)?(tcp|udp|tls|quic|ws)/(\[[^]]*\]|[^:?#]*)):?(?P<options>([?#].*)?)")
-
 _PROTOCOLS = ("tcp", "udp", "tls", "quic", "ws", "unixsock-stream", "unixpipe", "serial", "vsock")
 
 Role = Literal["client", "base"]

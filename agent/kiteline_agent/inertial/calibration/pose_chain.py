@@ -50,8 +50,10 @@ class PoseChain:
     def add(self, t_ns: int, T_m_b: F64) -> None:
         """Append the pose T_m_b (4,4) of a frame, by images alone."""
         poses, oldest_ns = [*self._poses, (t_ns, T_m_b.copy())], t_ns - round((self._window_s + _KEPT_S) * 1e9)
-        first_kept = len(poses) - _FRAMES
-        self._poses = [pose for k, pose in enumerate(poses) if k >= first_kept or pose[0] >= oldest_ns]
+        first = max(len(poses) - _FRAMES, 0)
+        while first and poses[first - 1][0] >= oldest_ns:
+            first -= 1
+        self._poses = poses[first:]
 
     def clear(self) -> None:
         """Begin again after an image loss or in a new map."""

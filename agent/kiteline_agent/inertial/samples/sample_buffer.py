@@ -142,13 +142,13 @@ class SampleBuffer:
         """Noise density (n,2) of the steps (n,) in ns, between samples lo - 1 and hi."""
         out = np.empty((len(steps), 2))
         out[:] = self.density
-        around = self._clipped[np.clip(np.arange(lo - 1, hi + 1), 0, len(self._t) - 1)]
-        clipped = around[:-1] | around[1:]
         missed = steps > _GAP * self._step_ns if self._step_ns else np.zeros(len(steps), np.bool_)
         if missed.any():
             dt_s = steps[missed] * 1e-9
             out[missed] = np.sqrt(out[missed] ** 2 + np.outer(dt_s, [_GAP_GYRO_RAD_S**2, _GAP_ACCEL_M_S2**2]))
-        if clipped.any():
+        if self._clipped[max(lo - 1, 0) : hi + 1].any():
+            ends = self._clipped[np.clip(np.arange(lo - 1, hi + 1), 0, len(self._t) - 1)]
+            clipped = ends[:-1] | ends[1:]
             extra = np.array([_CLIPPED_GYRO_RAD_S, _CLIPPED_ACCEL_M_S2]) * clipped
             out = np.sqrt(out**2 + steps[:, None] * 1e-9 * extra**2)
         return out
