@@ -61,8 +61,8 @@ class Station:
         if agent not in self.channels:
             self.channels[agent] = channel = self._open_channel(agent)
             if isinstance(channel, CodedChannel):
-                channel.endpoint.earlier.is_gone = lambda key: submap_of(key) in self.mapper.deleted
-                channel.endpoint.claims.is_of_use = self._is_of_use
+                channel.endpoint.received.earlier.is_gone = lambda key: submap_of(key) in self.mapper.deleted
+                channel.endpoint.received.claims.is_of_use = self._is_of_use
             self._batches[agent] = CorrectionBatches(agent, self._publish)
             self._deleted_values[agent] = DeletedValues()
         return self.channels[agent]
@@ -116,7 +116,7 @@ class Station:
         output = self.mapper.step(given, now_ns)
         for agent, keyframes in self.mapper.take_confirmed().items():
             if isinstance(end := self.channels.get(agent), CodedChannel):
-                end.endpoint.claims.earned += KEYFRAME_BYTES * keyframes
+                end.endpoint.received.claims.earned += KEYFRAME_BYTES * keyframes
         self.published = len(output.urgent) + sum(len(records) for _, records in output.publish)
         for agent, placement in output.urgent:
             self.join(agent)

@@ -277,7 +277,7 @@ class CodedChannel:
 
     def _end_other_world(self, records: Sequence[Record]) -> None:
         """Remove what an earlier base wrote once a new one has placed a submap: what that left out lies elsewhere."""
-        session, earlier = self.endpoint.peer_session, self.endpoint.earlier
+        session, earlier = self.endpoint.peer_session, self.endpoint.received.earlier
         if any(isinstance(record, SubmapPlacement) for record in records):
             self._placed_by, earlier.compared = session, False
         elif self._placed_by == session:

@@ -119,7 +119,7 @@ def test_keyframes_that_agree_with_older_ones_earn_their_agent_memory(make_fligh
     base_end = coded_channel(1, peer=flight.agent)
     station = Station(BaseConfig(), lambda agent: base_end)
     fly(station, CodedChannel(SyncConfig(), 1), flight)
-    assert base_end.endpoint.claims.earned >= 11 * KEYFRAME_BYTES  # all but the first
+    assert base_end.endpoint.received.claims.earned >= 11 * KEYFRAME_BYTES  # all but the first
 
 
 def test_keyframes_that_are_made_up_earn_nothing(make_flight: Callable[..., Any]) -> None:
@@ -132,7 +132,7 @@ def test_keyframes_that_are_made_up_earn_nothing(make_flight: Callable[..., Any]
     station = Station(BaseConfig(), lambda agent: base_end)
     fly(station, CodedChannel(SyncConfig(), 1), flight)
     assert station.mapper.counts.keyframes == 12
-    assert base_end.endpoint.claims.earned <= KEYFRAME_BYTES
+    assert base_end.endpoint.received.claims.earned <= KEYFRAME_BYTES
 
 
 def test_a_base_that_meets_an_agent_late_takes_all_it_has(make_flight: Callable[..., Any]) -> None:

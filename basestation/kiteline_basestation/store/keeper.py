@@ -84,10 +84,8 @@ class Keeper:
         for (agent, own, key), code in station.changed.items():
             channel = station.channels[agent]
             if code is None and isinstance(channel, CodedChannel):
-                end = channel.endpoint
-                code = channel.own_value(key) if own else end.peer_value(key)
-                if code is None and not own:  # the agent may have begun a new session since it wrote the value
-                    code = end.earlier.codes.get(key)
+                # the agent may have begun a new session since it wrote the value
+                code = channel.own_value(key) if own else channel.endpoint.received.value(key)
             if code is not None and (not self._deleted or submap_of(key) not in self._deleted):
                 batch.rows.append((int(agent), int(own), key.kind, key.id, key.part, code))
             elif code is None and own:

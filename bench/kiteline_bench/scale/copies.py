@@ -51,7 +51,7 @@ class PlaceCopies:
         for _ in range(_ROUNDS):
             packets = self._link.exchange(given, now_ns)
             received = channel.receive(packets, now_ns)
-            channel.endpoint.claims.earned += KEYFRAME_BYTES * len(received)
+            channel.endpoint.received.claims.earned += KEYFRAME_BYTES * len(received)
             mapper.restore(agent, tuple(received), (), now_ns)
             self._link.down = channel.poll(now_ns)
             if not packets and not given:

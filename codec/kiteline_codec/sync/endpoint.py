@@ -6,7 +6,7 @@ No message is queued. Packets are described in SPEC.md, states in `agreement`.
 """
 
 import contextlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 from kiteline_codec.coding.packing import Writer
 from kiteline_codec.pacing.budget import SlidingBudget
@@ -18,8 +18,9 @@ from kiteline_codec.sync import resumption
 from kiteline_codec.sync.agreement import OwnState, OwnValues, PeerValues
 from kiteline_codec.sync.archive import Spill
 from kiteline_codec.sync.config import MIN_PACKET_BYTES, SyncConfig, SyncStats, Traffic
-from kiteline_codec.sync.inbox import Claims, EarlierValues, Inbox, Update
+from kiteline_codec.sync.inbox import Inbox, Update
 from kiteline_codec.sync.outbox import Known, Outbox
+from kiteline_codec.sync.received import Received
 from kiteline_codec.sync.round_trip import RoundTrip
 from kiteline_codec.sync.send_queue import Order
 from kiteline_codec.transport.packet import (
@@ -54,15 +55,12 @@ class Endpoint:
         self._out = Outbox(
             config.order, config.oldest_every, self._compress if coder else None, config.resident_bytes, spill
         )
-        self._spill = spill
-        self._in = Inbox(config.resident_inbox_bytes, spill)
+        self.received = Received(config, spill, claimed_bytes)
         self._budget = SlidingBudget(config.budget_bytes, config.burst_bytes)
         self.peer_session: int | None = None  # None before the first packet of the peer
         self._own_values = OwnValues()
         self._peer_values = PeerValues()
         self._may_write = may_write
-        self.claims = Claims(claimed_bytes)
-        self.earlier = EarlierValues(self.claims)
         self._resumable: dict[Key, int] = {}  # checksums of what the peer holds of earlier sessions of this side
         self._overtaken_below = 0  # packets with lower numbers have been overtaken by enough acknowledged ones
         self._unanswered = 0  # packets to acknowledge, and news to send
@@ -99,7 +97,7 @@ class Endpoint:
 
     def peer_values(self) -> dict[Key, bytes]:
         """What the peer's session wrote, by key; a copy."""
-        return {key: code for key, code in self._in.codes().items() if key.kind != resumption.SUMMARY_KIND}
+        return self.received.codes()
 
     def own_value(self, key: Key) -> bytes | None:
         """The code of a value that this side shares; None if there is none."""
@@ -113,11 +111,11 @@ class Endpoint:
 
     def earlier_values(self) -> dict[Key, bytes]:
         """What earlier sessions of the peer wrote and its present one has not replaced, by key; a copy."""
-        return dict(self.earlier.codes)
+        return dict(self.received.earlier.codes)
 
     def resume(self, values: Mapping[Key, bytes]) -> None:
         """Take over values of earlier sessions of the peer from a store; the peer need not send them again."""
-        self.earlier.resume(values)
+        self.received.earlier.resume(values)
 
     # ---- agreement
 
@@ -157,6 +155,11 @@ class Endpoint:
 
     # ---- receiving
 
+    @property
+    def _in(self) -> Inbox:
+        """What the peer's present session wrote."""
+        return self.received.present
+
     def receive(self, packet: bytes, now_ns: int) -> list[Update]:
         """Take in a packet. Returns the values that changed. Never raises: bad packets are counted."""
         self._traffic.received(packet)
@@ -191,27 +194,16 @@ class Endpoint:
                 items = self._own_items(self._expanded(items))
             except WireError as e:
                 return self._refuse(str(e))
-            room = self._room_bytes + self._in.held_bytes - self.claims.bytes
-            if not self._in.room_for(items, room, self.config.max_assembly_bytes):
+            if not self.received.room_for(items):
                 self._refuse("no memory left for it")
                 return updates
             self._in.packets.mark(number)
             self._owe_answer(now_ns)
             self._in.raise_watermark(watermark)
-            for item in items:
-                known = self._in.held(item.key) is not None
-                update = self._in.apply(item)
-                if update is not None:
-                    if update.key.kind in PREDICTOR_KINDS:
-                        self._out.predictors_changed()
-                    if update.key.kind == resumption.SUMMARY_KIND:
-                        self._take_summary(update.code or b"")
-                        continue
-                    known = (known or update.key in self.earlier.codes) and not self.claims.waits(update.key)
-                    self.earlier.drop(update.key)
-                    if update.code is None or known or self.claims.fit(update.key, update.code, self._room_bytes):
-                        updates.append(update)
-        updates += self.claims.due(lambda k: self.peer_value(k) or self.earlier.codes.get(k), self._room_bytes, now_ns)
+            changed, usable = self.received.take(items)
+            self._note_received(changed)
+            updates += usable
+        updates += self.received.due(now_ns)
         self._compare(header, now_ns)
         return updates
 
@@ -229,7 +221,7 @@ class Endpoint:
             return items
         if self._coder is None:
             raise WireError("a residual code, which this side does not read")
-        return resumption.expand_items(items, self._coder, self._held, self.earlier.codes)
+        return resumption.expand_items(items, self._coder, self._held, self.received.earlier.codes)
 
     def _own_items(self, items: list[Item]) -> list[Item]:
         """The items without those of values that the peer may not write, which are counted."""
@@ -242,10 +234,13 @@ class Endpoint:
         """Version and code of a value of either side."""
         return self._in.held(key) or self._out.held(key)
 
-    @property
-    def _room_bytes(self) -> int:
-        """Memory for all that the peer claims."""
-        return self.claims.allowed_bytes(self.config) - self.earlier.bytes - self._in.held_bytes
+    def _note_received(self, changed: Sequence[Update]) -> None:
+        """Let own values be coded by what the peer holds now."""
+        for update in changed:
+            if update.key.kind in PREDICTOR_KINDS:
+                self._out.predictors_changed()
+            if update.key.kind == resumption.SUMMARY_KIND:
+                self._take_summary(update.code or b"")
 
     def _take_summary(self, code: bytes) -> None:
         """Take in what the peer holds of earlier sessions of this side; a summary that cannot be read is ignored."""
@@ -264,14 +259,12 @@ class Endpoint:
         if self.peer_session is not None:
             self._traffic.restarts += 1
         self.peer_session = session
-        self.earlier.keep(self.peer_values())
-        self._in.close()
-        self._in = Inbox(self.config.resident_inbox_bytes, self._spill)
+        self.received.begin_session()
         self._resumable.clear()
-        self._out.restart(resumption.outlived(self.earlier.is_gone, session))
+        self._out.restart(resumption.outlived(self.received.earlier.is_gone, session))
         if self._coder is not None:
             self._coder.restart()
-            for key, code in resumption.summaries(self.earlier.codes, session).items():
+            for key, code in resumption.summaries(self.received.earlier.codes, session).items():
                 self._out.put(key, code, self.config.order(key))
         self._own_values.new_session()
         self._peer_values.new_session()
@@ -322,7 +315,7 @@ class Endpoint:
             self._in.raise_watermark(version)
             self._in.newest = version
             self._peer_values.found_equal(version)
-            self.earlier.compared = True
+            self.received.earlier.compared = True
         elif self._peer_values.found_different(version):
             self._traffic.mismatches += 1
         self._owe_answer(now_ns)

@@ -85,7 +85,7 @@ def test_what_an_agent_said_of_deleted_maps_ends_with_its_session(make_flight: M
         now_ns = agents.now_ns + STEP_NS
         end = station.channels[flight.agent]
         assert isinstance(end, CodedChannel)
-        held.append(end.endpoint.earlier.bytes)
+        held.append(end.endpoint.received.earlier.bytes)
         assert sum(map(len, end.endpoint.peer_values().values())) > 2000
     assert max(held) < 2000
 

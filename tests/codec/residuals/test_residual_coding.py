@@ -254,9 +254,9 @@ def test_a_refused_residual_code_is_followed_by_the_code_itself() -> None:
     for record in records[:-1]:
         a.put(messages.key(record), messages.encode(record))
     run(2000)
-    for key in [k for k in b._in._values if k.kind == NewLandmarks.KIND]:
-        version, code = b._in._values[key]
-        b._in._values[key] = (version + 1000, code)  # as if they were other versions
+    for key in [k for k in b.received.present._values if k.kind == NewLandmarks.KIND]:
+        version, code = b.received.present._values[key]
+        b.received.present._values[key] = (version + 1000, code)  # as if they were other versions
     a.put(messages.key(records[-1]), messages.encode(records[-1]))
     run(3000)
     assert b.stats.rejected >= 1

@@ -192,7 +192,7 @@ def test_long_values_cross_in_fragments() -> None:
     pair.settle()
     assert pair.b.peer_values() == {Key(GridTile.KIND, 1): long}
     assert pair.updates[1] == [(Key(GridTile.KIND, 1), long)]
-    assert pair.b._in.assembly_bytes == 0
+    assert pair.b.received.present.assembly_bytes == 0
 
 
 def test_removals_are_forgotten_once_they_have_arrived_and_old_packets_do_not_undo_them() -> None:
@@ -203,7 +203,7 @@ def test_removals_are_forgotten_once_they_have_arrived_and_old_packets_do_not_un
         pair.a.remove(key)
     pair.settle()
     assert pair.b.peer_values() == {}
-    assert not pair.b._in._removed
+    assert not pair.b.received.present._removed
     assert len(pair.a._out) == 0
     for _, packet in pair.sent[0]:
         pair.b.receive(packet, pair.now_ns)
@@ -226,7 +226,7 @@ def test_states_that_differ_are_found_and_mended(end: int, loss: float) -> None:
     pair = Pair(loss=loss)
     values = [fill(pair.a, 1, 20, NewLandmarks.KIND), fill(pair.b, 2, 20, KeyframePose.KIND, 30)]
     pair.settle()
-    inbox = pair.ends[end]._in
+    inbox = pair.ends[end].received.present
     first = min(inbox._values)
     inbox._drop_value(first)  # as if memory had been damaged
     inbox._values[Key(60, 1)] = (3, b"never sent")

@@ -102,7 +102,8 @@ def test_a_packet_longer_than_any_is_refused() -> None:
 
 
 def memory_of(end: Endpoint) -> int:
-    return end._in.held_bytes + end._in.assembly_bytes + end.earlier.bytes + end.claims.bytes
+    got = end.received
+    return got.present.held_bytes + got.present.assembly_bytes + got.earlier.bytes + got.claims.bytes
 
 
 def test_values_in_part_stay_within_their_limit_however_they_are_begun() -> None:
@@ -112,15 +113,15 @@ def test_values_in_part_stay_within_their_limit_however_they_are_begun() -> None
     mib = 1 << 20
     for _ in range(600):
         end.receive(sender.packet([sender.item(key, mib, 0, b"x")]), 0)  # a newer version
-    assert end._in.assembly_bytes <= config.max_assembly_bytes
+    assert end.received.present.assembly_bytes <= config.max_assembly_bytes
     for i in range(100):
         begun = [sender.item(Key(GridTile.KIND, 2 + 100 * i + j), mib, 0, b"x") for j in range(20)]
         end.receive(sender.packet(begun), 0)
-    assert sum(len(a.data) for a in end._in._assemblies.values()) <= config.max_assembly_bytes
+    assert sum(len(a.data) for a in end.received.present._assemblies.values()) <= config.max_assembly_bytes
     for i in range(500):
         heads = [sender.item(Key(GridTile.KIND, 50_000 + 50 * i + j), 2, 0, b"x") for j in range(50)]
         end.receive(sender.packet(heads), 0)
-    assert end._in.assembling <= config.max_assembly_bytes // 350
+    assert end.received.present.assembling <= config.max_assembly_bytes // 350
     assert dict(end.stats.reasons)["no memory left for it"] > 0
 
 
@@ -130,7 +131,7 @@ def test_a_value_in_a_thousand_pieces_is_dropped_before_it_costs_time() -> None:
         end.receive(
             sender.packet([Item(key, 1, 1 << 20, 2 * (50 * i + j), b"x") for j in range(50)]), 0
         )  # every other byte
-    pieces = [len(a.received) for a in end._in._assemblies.values()]
+    pieces = [len(a.received) for a in end.received.present._assemblies.values()]
     assert all(n <= 256 for n in pieces)
 
 
@@ -139,12 +140,12 @@ def test_small_values_and_removals_count_with_what_they_take() -> None:
     end, sender = Endpoint(config, 1), Sender()
     for i in range(200):
         end.receive(sender.packet([sender.whole(Key(GridTile.KIND, 60 * i + j), b"x") for j in range(60)]), 0)
-    assert len(end._in) <= (1 << 20) // 350
+    assert len(end.received.present) <= (1 << 20) // 350
     end = Endpoint(config, 1)
     sender = Sender()
     for i in range(200):
         end.receive(sender.packet([sender.item(Key(GridTile.KIND, 60 * i + j), None, 0, b"") for j in range(60)]), 0)
-    assert len(end._in._removed) <= (1 << 20) // 350
+    assert len(end.received.present._removed) <= (1 << 20) // 350
 
 
 def test_values_of_earlier_sessions_count() -> None:
@@ -175,7 +176,7 @@ def test_headers_claim_the_map_that_they_name() -> None:
 def test_headers_that_do_not_fit_wait_and_are_used_oldest_first() -> None:
     """They come newest first; each hangs on the one before, and what was of use makes room for more."""
     channel, sender, used = coded_channel(1, peer=AgentId(3)), Sender(), []
-    claims = channel.endpoint.claims
+    claims = channel.endpoint.received.claims
     claims.is_of_use = lambda key, code, also: key.id - 1 in {0, *used} or any(k.id == key.id - 1 for k in also)
 
     def take(items: list[Item], now_ns: int) -> list[int]:
@@ -211,10 +212,10 @@ def test_an_agent_fills_no_more_than_its_first_share_until_something_was_of_use(
         return memory_of(channel.endpoint)
 
     assert 0.9 * UNUSED_BYTES < fill(0) <= UNUSED_BYTES + (1 << 20)
-    channel.endpoint.claims.earned += 8 << 20
+    channel.endpoint.received.claims.earned += 8 << 20
     assert 0.9 * (UNUSED_BYTES + (8 << 20)) < fill(2000) <= UNUSED_BYTES + (9 << 20)
-    channel.endpoint.claims.earned += 1 << 40
-    assert channel.endpoint.claims.allowed_bytes(channel.endpoint.config) == 2 << 30
+    channel.endpoint.received.claims.earned += 1 << 40
+    assert channel.endpoint.received.claims.allowed_bytes(channel.endpoint.config) == 2 << 30
 
 
 def test_what_a_store_holds_leaves_the_first_share_free() -> None:

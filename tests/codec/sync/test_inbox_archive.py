@@ -52,7 +52,7 @@ def test_memory_is_bounded_and_the_two_sides_agree() -> None:
     most = 0
     for keyframe in range(300):
         line.say(keyframe)
-        most = max(most, line.b._in.resident_bytes)
+        most = max(most, line.b.received.present.resident_bytes)
     pages = 300 * (300 + 5 * 20)
     assert most <= LIMIT + pages
     assert line.b.stats.values == 1500
@@ -61,7 +61,7 @@ def test_memory_is_bounded_and_the_two_sides_agree() -> None:
     line.a.remove(Key(FusedLandmarks.KIND, 7))
     line.settle()
     assert line.b.peer_values() == line.a.own_values()
-    assert line.b._in.resident_bytes <= LIMIT + pages
+    assert line.b.received.present.resident_bytes <= LIMIT + pages
 
 
 def test_values_of_the_last_base_stay_readable() -> None:
@@ -98,7 +98,7 @@ def test_without_a_spill_old_values_are_packed() -> None:
     line = Line(None)
     for keyframe in range(300):
         line.say(keyframe)
-    packed = line.b._in
+    packed = line.b.received.present
     assert len(packed._values) < 200 and len(packed) == 1500
     assert packed._resident.bytes <= LIMIT
     held = sum(len(page.packed or b"") for page in packed._archive._pages.values())
@@ -116,7 +116,7 @@ def test_values_are_read_where_they_are_packed() -> None:
     line = Line(None)
     for keyframe in range(60):
         line.say(keyframe)
-    inbox = line.b._in
+    inbox = line.b.received.present
     packed = list(inbox._archive)
     assert len(packed) > 20
     own = line.a.own_values()

@@ -27,7 +27,7 @@ def test_maps_that_come_are_corrected_and_deleted_leave_nothing(
     draw, spill, now_ns = random.Random(1), SpillFile(tmp_path), 0
     agent = Endpoint(SyncConfig(resident_bytes=8_000, resident_inbox_bytes=4_000), 1, spill=spill)
     base = Endpoint(SyncConfig(resident_inbox_bytes=8_000), 1)
-    base.earlier.is_gone = lambda key: key.id < gone_below
+    base.received.earlier.is_gone = lambda key: key.id < gone_below
     gone_below = 0
     held, disk = list[Counter[str]](), list[int]()
 

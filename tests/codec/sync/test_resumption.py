@@ -95,9 +95,9 @@ def test_what_the_base_wrote_is_not_sent_again_to_an_agent_that_goes_on() -> Non
 
 def test_values_that_are_gone_leave_an_endpoint_when_its_agent_starts_again() -> None:
     base = Endpoint(SyncConfig(), 1, coder=ResidualCoder(), claimed_bytes=lambda key, code: 100)
-    base.claims.earned = 1 << 20
+    base.received.claims.earned = 1 << 20
     gone: set[int] = set()
-    base.earlier.is_gone = lambda key: submap_of(key) in gone
+    base.received.earlier.is_gone = lambda key: submap_of(key) in gone
     sizes = []
     for order, boot in enumerate(range(4, 9), start=1):
         agent = end(resumption.agent_session(order, boot))
@@ -106,7 +106,14 @@ def test_values_that_are_gone_leave_an_endpoint_when_its_agent_starts_again() ->
         base.put(Key(RefinedLandmarks.KIND, keyframe_id(submap_id(1, boot, 0), 3)), bytes(40))
         talk(agent, base, order * 10**10, 400)
         assert base.peer_values() == values(boot) and base.digest_equal
-        sizes.append((len(base.earlier_values()), base.earlier.bytes, base.claims.bytes, len(base.own_values())))
+        sizes.append(
+            (
+                len(base.earlier_values()),
+                base.received.earlier.bytes,
+                base.received.claims.bytes,
+                len(base.own_values()),
+            )
+        )
         gone.add(submap_id(1, boot, 0))
     assert sizes == [(0, 0, 9000, 1)] * 5
 

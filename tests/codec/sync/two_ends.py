@@ -138,7 +138,7 @@ class TwoEnds:
         for i, end in enumerate(self.ends):
             assert end.peer_values() == self.held[1 - i]
             assert {k: v for k, v in self.shown[i].items() if k not in end.earlier_values()} == self.held[1 - i]
-            assert not end._in._removed
+            assert not end.received.present._removed
             assert end.stats.dirty == 0
 
     def arrive(self, to: int, packet: bytes) -> None:
@@ -249,4 +249,4 @@ class ManyCorrections(TwoEnds):
         super().check()
         for end in self.ends:
             newest = 4 * (350 + 300)  # of one keyframe
-            assert end._in.resident_bytes <= 1500 + newest + 6 * 300 + 24 * 20
+            assert end.received.present.resident_bytes <= 1500 + newest + 6 * 300 + 24 * 20
