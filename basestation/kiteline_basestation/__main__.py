@@ -4,14 +4,16 @@ import secrets
 import time
 from collections.abc import Sequence
 from functools import partial
+from pathlib import Path
 
 from kiteline_basestation.runtime.live import fly_live
 from kiteline_basestation.runtime.lockstep import fly_lockstep
-from kiteline_basestation.runtime.options import BaseOptions, options_of, parser
+from kiteline_basestation.runtime.options import LOG_STEM, BaseOptions, options_of, parser
 from kiteline_core import config as configuration
 from kiteline_core.errors import KitelineError
 from kiteline_hw.links.kinds import link_forms
 from kiteline_hw.links.sealing import sealing_of
+from kiteline_hw.logs.log_budget import newest_start
 from kiteline_hw.system import process
 from kiteline_hw.system.start_numbers import numbers_in
 
@@ -38,7 +40,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         p.error("--paired-only: whom a router lets in is told to that router, not to this base")
     # Time since a fixed date: a base on another machine, without this one's files, still begins a later session.
     least = max(0, int(time.time()) - _EPOCH_S) // _UNIT_S << _DRAWN_BITS | secrets.randbelow(1 << _DRAWN_BITS)
-    start = numbers_in(process.kept_folder("base")).next(max(1, least))
+    # Above those of the logs, too: the log of a lower session would count as older than they.
+    least = max(1, least, 1 + newest_start(Path(a.log), LOG_STEM) if a.log else 0)
+    start = numbers_in(process.kept_folder("base")).next(least)
     if start.kept:
         process.print_lines([f"the number of this session cannot be kept: {start.kept}"])
     process.outlive_terminal()

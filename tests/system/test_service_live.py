@@ -110,6 +110,19 @@ def test_the_number_of_a_start_outlives_the_logs(serve: Serve, recording: Path, 
 
 
 @pytest.mark.usefixtures("forked")
+def test_a_log_is_newer_than_those_before_it_where_the_number_was_lost(
+    serve: Serve, recording: Path, tmp_path: Path
+) -> None:
+    logs = tmp_path / "logs" / "agent0"
+    logs.mkdir(parents=True)
+    for name in ("boot98765.mcap", "boot98766_2.mcap", "bootlegs.mcap", "boot98767.live.tum"):
+        (logs / name).write_bytes(b"")
+    program, _ = serve("agent", recording, "--log", tmp_path / "logs")
+    program.wait(timeout=100)
+    assert (logs / "boot98767.mcap").exists()
+
+
+@pytest.mark.usefixtures("forked")
 def test_a_start_that_fails_takes_no_number(serve: Serve, recording: Path, tmp_path: Path) -> None:
     for words in (("no-such-recording.mcap",), (recording, "--link", "zenoh:tcp/127.0.0.1:7", "--key", "no-key")):
         program, _ = serve("agent", *words)

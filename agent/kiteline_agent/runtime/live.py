@@ -33,6 +33,7 @@ from kiteline_core.frame import ImuBatch, OdometryBatch
 from kiteline_hw.links.kinds import link_traits
 from kiteline_hw.links.open import open_link
 from kiteline_hw.links.sealed_link import SealedLink
+from kiteline_hw.logs.log_budget import newest_start
 from kiteline_hw.ports import ByteLink, ControllerLink, LinkError, link_messages
 from kiteline_hw.system import kernel_cache, process
 from kiteline_hw.system.clock import MonotonicClock
@@ -70,7 +71,9 @@ def fly_live(
             return
         key = _key_of(options)
         if numbers is not None:
-            start = numbers.next()
+            # above those of the logs: if the kept number was lost, the newest log would else count as the oldest
+            least = 1 + newest_start(Path(options.folder), LOG_STEM) if options.log_name else 1
+            start = numbers.next(least)
             options = _numbered(options, start)
             if start.kept:
                 process.print_lines([f"the number of this start is drawn, as it cannot be kept: {start.kept}"])

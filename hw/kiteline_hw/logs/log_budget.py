@@ -12,6 +12,7 @@ _PARTS = 8  # files that the limit is cut into: an eighth of it at most goes at 
 _LEAST_PART_BYTES = 64 << 20  # bytes of a file on a disk with little room left
 _RESERVE_BYTES = 256 << 20  # bytes that logs leave free on their disk, for maps and numbers of starts
 _NAME = re.compile(r"(\d+)(?:_(\d+))?")  # after the stem: number of the start, number of the part
+_MOST_START = 1 << 48  # numbers of starts are lower
 
 
 class _Log(NamedTuple):
@@ -111,3 +112,10 @@ class LogBudget:
         except OSError:
             return self._cap_bytes + self._reserve_bytes
         return disk.f_bavail * disk.f_frsize
+
+
+def newest_start(folder: Path, stem: str) -> int:
+    """The highest number of a start in the names `STEM<number>*.mcap` of a folder; 0 without any. Never raises."""
+    names = (_NAME.fullmatch(path.stem.removeprefix(stem)) for path in folder.glob(f"{stem}*.mcap"))
+    numbers = (int(name[1]) for name in names if name)
+    return max((number for number in numbers if number < _MOST_START), default=0)

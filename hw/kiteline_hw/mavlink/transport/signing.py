@@ -58,6 +58,7 @@ class StampFile:
             stored = int(path.read_text(encoding="ascii"))
         self.first = max(stored, round((wall_s() - _EPOCH_S) * _TICKS), 1)
         self._reserved = self._asked = self.first  # on disk; when it was written last, or tried
+        self._writing = False
         self.fault = ""
         self._store(self.first)
 
@@ -66,6 +67,10 @@ class StampFile:
         if stamp < self._reserved - _AHEAD // 2 or stamp < self._asked + _AGAIN:
             return
         self._asked = stamp
+        if self._writing:  # two writes would share a file
+            self.fault = self._fault("the disk does not answer") if stamp > self._reserved else self.fault
+            return
+        self._writing = True
         self._beside(lambda: self._store(stamp))
 
     def _store(self, stamp: int) -> None:
@@ -73,9 +78,14 @@ class StampFile:
         try:
             write_atomically(self._path, str(stamp + _AHEAD).encode())
         except OSError as error:
-            self.fault = f"{self._path}: cannot keep the stamp of MAVLink's signatures ({error.strerror or error})"
+            self.fault = self._fault(error.strerror or str(error))
         else:
             self.fault, self._reserved = "", stamp + _AHEAD
+        finally:
+            self._writing = False
+
+    def _fault(self, reason: str) -> str:
+        return f"{self._path}: cannot keep the stamp of MAVLink's signatures ({reason})"
 
 
 class SigningMavlink(common.MAVLink):  # type: ignore[misc]  # pymavlink's classes are untyped

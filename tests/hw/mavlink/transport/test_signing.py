@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from kiteline_hw import durable_files
 from kiteline_hw.mavlink.codec import MavlinkCodec
 from kiteline_hw.mavlink.messages import Heartbeat, RadioStatus, TimeSync
 from kiteline_hw.mavlink.transport import signing
@@ -70,27 +71,54 @@ def test_a_long_flight_keeps_the_stored_stamp_ahead(tmp_path: Path) -> None:
         assert int((tmp_path / "stamp").read_text(encoding="ascii")) > stamp
 
 
-def test_messages_never_wait_for_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A card that stalls, and one that is full: no message waits, and the disk is asked every few seconds."""
+def test_messages_never_wait_for_a_card_that_stalls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No message waits, no second write begins beside the first, and the user is told before stamps may go back."""
     now_s, asked, free = WALL_S, [], threading.Event()
 
     def stalls(path: Path, content: bytes) -> None:
         asked.append(now_s - WALL_S)
         if not free.wait(20.0):
             raise AssertionError("the message waited for the disk")
-        raise OSError(errno.ENOSPC, "No space left on device")
+        durable_files.write_atomically(path, content)
 
     stamps = StampFile(tmp_path / "stamp", lambda: now_s)
     codec = MavlinkCodec(1, 1, Signing(KEY, stamps, lambda: now_s))
     monkeypatch.setattr(signing, "write_atomically", stalls)
+    for _ in range(590):
+        now_s += 0.1
+        codec.encode(TimeSync(0, 1))
+    assert not free.is_set() and not stamps.fault and len(asked) == 1 and asked[0] > 29.0  # it is ahead by a minute
+    for _ in range(100):
+        now_s += 0.1
+        codec.encode(TimeSync(0, 1))
+    assert "does not answer" in stamps.fault and len(asked) == 1
+    free.set()
+    deadline = time.monotonic() + 10.0
+    while stamps.fault and time.monotonic() < deadline:
+        time.sleep(0.01)
+    for _ in range(100):
+        now_s += 0.1
+        stamp = stamp_of(codec.encode(TimeSync(0, 1)))
+    while len(asked) < 2 and time.monotonic() < deadline:
+        time.sleep(0.01)
+    while int((tmp_path / "stamp").read_text(encoding="ascii")) <= stamp and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert not stamps.fault and int((tmp_path / "stamp").read_text(encoding="ascii")) > stamp
+
+
+def test_a_full_card_is_asked_every_few_seconds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    now_s, asked = WALL_S, []
+
+    def is_full(path: Path, content: bytes) -> None:
+        asked.append(now_s - WALL_S)
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    stamps = StampFile(tmp_path / "stamp", lambda: now_s, beside=lambda work: work())
+    codec = MavlinkCodec(1, 1, Signing(KEY, stamps, lambda: now_s))
+    monkeypatch.setattr(signing, "write_atomically", is_full)
     for _ in range(600):
         now_s += 0.1
         codec.encode(TimeSync(0, 1))
-    assert not free.is_set() and not stamps.fault
-    free.set()
-    deadline = time.monotonic() + 10.0
-    while not stamps.fault and time.monotonic() < deadline:
-        time.sleep(0.01)
     assert "No space left" in stamps.fault
     assert 4 <= len(asked) <= 7 and asked[0] > 29.0  # the stored stamp is ahead by a minute
 
