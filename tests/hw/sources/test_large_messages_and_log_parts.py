@@ -84,6 +84,24 @@ def test_the_parts_of_a_log_are_one_recording(tmp_path: Path) -> None:
     assert 0 < len([item for item in open_source(str(tmp_path / "a")) if isinstance(item, Frame)]) < 20
 
 
+def test_a_part_that_is_missing_between_others_is_told(tmp_path: Path) -> None:
+    count = log_in_parts(tmp_path / "a")
+    (tmp_path / "a" / "boot00003.mcap").unlink()
+    source = open_source(str(tmp_path / "a"))
+    assert frames_of(source)[-1] == 19 and not source.report.notes  # the oldest part was deleted to make room
+    for n in range(2, count - 1):
+        (tmp_path / "a" / f"boot00003_{n}.mcap").unlink()
+    source = open_source(str(tmp_path / "a"))
+    assert 0 < len(frames_of(source)) < 18
+    verb = "is" if count == 4 else "are"
+    missing = ", ".join(map(str, range(2, count - 1)))
+    assert source.report.notes == [f"file cut: of its parts, {missing} {verb} missing"]
+    for old, new in (("boot00003_1", "boot00003_20261128"), (f"boot00003_{count - 1}", "boot00003_20261130")):
+        (tmp_path / "a" / f"{old}.mcap").rename(tmp_path / "a" / f"{new}.mcap")
+    source = open_source(str(tmp_path / "a"))
+    assert frames_of(source) and not source.report.notes  # dates
+
+
 def frames_of(source: FrameSource) -> list[int]:
     """Numbers of the frames of a log in parts."""
     return [item.t_ns // 50_000_000 for item in source if isinstance(item, Frame)]

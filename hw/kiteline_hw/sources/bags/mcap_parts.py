@@ -14,6 +14,7 @@ from kiteline_hw.ports import SourceError
 
 _OVERLAP_NS = 200_000_000  # ns; topics are written by threads of their own, so that stamps cross where a part ends
 _MOST_METADATA_BYTES = 1 << 20
+_MOST_PARTS = 1000  # higher numbers in names are dates or times
 _NUMBERED = re.compile(r"(.*)_(\d+)")
 _LOG_PART = re.compile(r"(.*?)(_\d+)?")
 
@@ -22,7 +23,7 @@ class McapParts:
     """The messages of all parts, with the attributes and methods of McapFile."""
 
     def __init__(self, path: Path, parts: list[McapFile], cut: str | None) -> None:
-        """path: of the recording. parts: in order. cut: where what is read ends too early, or None."""
+        """path: of the recording. parts: in order. cut: where what is read ends too early or has a gap, or None."""
         self.path = path
         self.cut = cut
         self.schemas: dict[int, Schema] = {}
@@ -45,7 +46,7 @@ class McapParts:
         parts = [McapFile(path) for path in paths]
         if not are_parts(folder, paths) and not _are_of_log(parts):
             raise _strangers(folder, parts, "no metadata.yaml lists them, and they are not named BAG_0, BAG_1…")
-        cut = "; ".join(f"{part.path.name} is {part.cut}" for part in parts if part.cut) or None
+        gaps = [f"{part.path.name} is {part.cut}" for part in parts if part.cut] + _missing(paths)
         used = sorted((part for part in parts if any(part.counts.values())), key=lambda part: part.first_ns)
         for before, after in pairwise(used):
             overlap_ns = before.last_ns - after.first_ns
@@ -58,7 +59,7 @@ class McapParts:
             if topics and not own_topics & topics:
                 raise _strangers(folder, parts, f"{part.path.name} shares no topic with those before it")
             topics |= own_topics
-        return cls(folder, used, cut)
+        return cls(folder, used, "; ".join(gaps) or None)
 
     @property
     def notes(self) -> list[str]:
@@ -125,6 +126,19 @@ def _numbered(paths: list[Path]) -> bool:
     """True if the files are named as rosbag2 names parts."""
     found = [_NUMBERED.fullmatch(path.stem) for path in paths]
     return all(found) and len({match[1] for match in found if match}) == 1
+
+
+def _missing(paths: list[Path]) -> list[str]:
+    """A line on the parts that are missing between others, by the numbers in their names; the oldest may have gone."""
+    names = [match for path in paths if (match := _LOG_PART.fullmatch(path.stem))]
+    numbers = {int((name[2] or "_0")[1:]) for name in names}
+    if len(numbers) < len(paths) or len({name[1] for name in names}) > 1 or max(numbers) >= _MOST_PARTS:
+        return []
+    missing = sorted(set(range(min(numbers), max(numbers))) - numbers)
+    if not missing:
+        return []
+    listed = ", ".join(map(str, missing[:5])) + (" and more" if len(missing) > 5 else "")
+    return [f"of its parts, {listed} {'is' if len(missing) == 1 else 'are'} missing"]
 
 
 def _listed(folder: Path, paths: list[Path]) -> bool:
