@@ -59,3 +59,20 @@ class CalibrationEvidence:
         cov = deviation[:, None] * np.linalg.inv(scaled) * deviation
         errors = cov @ self._side
         return errors, cov, 0.5 * float(errors @ self._side) - 0.5 * float(np.linalg.slogdet(scaled)[1])
+
+
+def good_covariance(variance: F64, roll: float, worn: float, information: F64) -> F64:
+    """Covariance (10,10) px^2 of the errors of a good calibration.
+
+    variance: (10,) of the errors before the flight. roll: share of that of disparities along y which the right camera's
+    rows allow. worn: probability of a worn rig. information: (5,5) on which the map's disparity offset rests if the
+    calibration is good: what the offset leaves is the posterior.
+    """
+    out = np.diag(variance)
+    out[2, 2] *= roll
+    if information.any():
+        of_disparities = slice(0, DISPARITY_SHAPES)
+        before = out[of_disparities, of_disparities]
+        after = np.linalg.inv(np.linalg.inv(before) + information)
+        out[of_disparities, of_disparities] = worn * before + (1.0 - worn) * after
+    return out

@@ -24,7 +24,7 @@ from kiteline_agent.covariance.calibration_error_kernels import (
     pose_covariance,
     sensitivity,
 )
-from kiteline_agent.covariance.calibration_evidence import CalibrationEvidence
+from kiteline_agent.covariance.calibration_evidence import CalibrationEvidence, good_covariance
 from kiteline_agent.covariance.evaluation_schedule import EvaluationSchedule
 from kiteline_agent.covariance.odometry_drift import covariance_by_map
 from kiteline_agent.covariance.pose_quality import LOST_BELOW, probability_good
@@ -74,6 +74,7 @@ class PoseCovariance:
         self._evidence = CalibrationEvidence(self._good_variance)
         self._disparity_error: F64 | None = None  # as set last
         self._worn = 0.0  # probability of a worn rig
+        self._good_information = np.zeros((DISPARITY_SHAPES, DISPARITY_SHAPES))  # see set_disparity_error
         self._worn_cov = np.zeros((CALIBRATION, CALIBRATION))  # beyond a good calibration
         half = 0.5 * local_map.camera.width / local_map.camera.fx  # edge of the image, normalised
         self._at_edge = np.array([1.0, half, half, half**2, half**2])  # px there for a pixel of each term of an offset
@@ -281,14 +282,16 @@ class PoseCovariance:
         self._set_calibration()
         return np.asarray(-self._shift @ errors)
 
-    def set_disparity_error(self, cov: F64, worn: float) -> None:
-        """Set the covariance (5,5) px^2 of the map's disparity offset, and the probability that the rig is worn."""
+    def set_disparity_error(self, cov: F64, worn: float, good_information: F64) -> None:
+        """Set the covariance (5,5) px^2 of the map's disparity offset, the probability that the rig is worn, and the
+        information (5,5) 1/px^2 on which the offset rests if it is a good calibration's.
+        """
         if cov is not self._disparity_error:
             self._disparity_error = cov
             at_edge, lens = self._at_edge, np.arange(DISPARITY_SHAPES, CALIBRATION - 1)
             self._worn_cov[:DISPARITY_SHAPES, :DISPARITY_SHAPES] = at_edge[:, None] * cov * at_edge
             self._worn_cov[lens, lens] = worn * _WORN_LENS_PX**2
-            self._worn = worn
+            self._worn, self._good_information = worn, good_information / np.outer(at_edge, at_edge)
             self._set_calibration()
 
     def set_roll(self, rms_px: float) -> None:
@@ -298,8 +301,8 @@ class PoseCovariance:
             self._set_calibration()
 
     def _set_calibration(self) -> None:
-        good = np.diag(self._good_variance * self._evidence.level**2)
-        good[2, 2] *= self._roll
+        variance = self._good_variance * self._evidence.level**2
+        good = good_covariance(variance, self._roll, self._worn, self._good_information)
         self._calibration[:CALIBRATION, :CALIBRATION] = good + self._worn_cov
         self._extrinsic = self._extrinsic_cov()
 

@@ -79,8 +79,8 @@ class DisparityAlignment:
         self._pair_t_ns: int | None = None  # of that one
         self.pairs = 0  # compared so far
         self._estimate, self.cov = none(), np.linalg.inv(self._prior)
-        # If the rig is not worn: what was expected of it, and its most probable offset.
-        self.expected_px, self._good_estimate = none(), none()
+        # If the rig is not worn: what was expected of it, its most probable offset, and the information about that.
+        self.expected_px, self._good_estimate, self._good_h = none(), none(), np.zeros((TERMS, TERMS))
         self._prior_log_odds = math.log(_WORN_SHARE / (1.0 - _WORN_SHARE))  # of a worn rig
         self._log_odds = self._prior_log_odds  # by disparities alone
         self.worn = self.rig_worn = _WORN_SHARE  # probability of it: by disparities alone, and with rows
@@ -88,6 +88,7 @@ class DisparityAlignment:
         self.applied = False  # the rig is worn: an offset found here was applied
         self._applied_sigma_px = np.inf  # of the estimate that was applied
         self.is_good_offset = False  # the map's offset is a good calibration's, found here
+        self._follows_good = False  # it is, or it is none since that is near enough
         self._base_sigma_px: float | None = None  # of the map's offset, if the base found it; inf for a good rig's
         self.expected_cov = self._expected_cov()  # beside the error of a good calibration
         self._events: list[str] = []
@@ -139,6 +140,11 @@ class DisparityAlignment:
             self.expected_cov = self._expected_cov()
 
     @property
+    def good_information(self) -> F64:
+        """(5,5) 1/px^2, on which the map's offset rests if it is a good calibration's; zero for any other."""
+        return self._good_h if self._follows_good else np.zeros((TERMS, TERMS))
+
+    @property
     def sigma_px(self) -> float:
         """Standard deviation of the estimate, rms over the image."""
         return self._rms_px(np.asarray(self.cov))
@@ -169,7 +175,8 @@ class DisparityAlignment:
         """
         if self.applied and (sigma_px is None or sigma_px > self.sigma_px):
             return False
-        self._base_sigma_px, self.is_good_offset = np.inf if sigma_px is None else sigma_px, False
+        self._base_sigma_px = np.inf if sigma_px is None else sigma_px
+        self.is_good_offset = self._follows_good = False
         if not (self._pair_h.any() or self._evicted_h.any()):
             self.expected_px = np.array(offset)  # of earlier flights: what this one tells would count twice
         self._map.set_disparity_offset(offset)
@@ -283,6 +290,7 @@ class DisparityAlignment:
     def _solve_good(self, h: F64, b: F64) -> None:
         """Estimate the offset if the calibration is good: about the expected one, from information h (5,5), b (5,)."""
         self._good_estimate = self.expected_px + np.linalg.solve(h + self._good, b - h @ self.expected_px)
+        self._good_h = h
 
     def _is_sure(self) -> bool:
         """True if the rig is worn though pairs tell less whose landmarks fit badly: some may be on people who walk.
@@ -350,7 +358,8 @@ class DisparityAlignment:
         # Forward motion hardly tells a worn rig from a good one: until then the good one's offset is the better guess.
         doubtful = self.rig_worn > 0.5 if tells else self._refuted
         worn = self.applied or self._earlier_h.any() or np.isfinite(self._base_sigma_px or np.inf)
-        return None if worn or doubtful else self._apply_good()
+        self._follows_good = not (worn or doubtful)
+        return self._apply_good() if self._follows_good else None
 
     def _rows_are_worn(self) -> bool:
         """True if the rows of the right camera alone tell that the rig is worn."""
@@ -361,7 +370,8 @@ class DisparityAlignment:
         found_here = self.applied or self._refuted or self.is_good_offset
         change = self._set(self._estimate, _LEAST_CHANGE_PX if found_here else _LEAST_PX)
         if change is not None:
-            self.applied, self._refuted, self.is_good_offset, self._base_sigma_px = True, False, False, None
+            self.applied, self._base_sigma_px = True, None
+            self._refuted = self.is_good_offset = self._follows_good = False
             self._applied_sigma_px = self.sigma_px
             self._events.append(f"disparities in the middle are {self._estimate[0]:+.2f} px too large, by parallax")
         return change

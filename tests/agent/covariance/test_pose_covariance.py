@@ -20,6 +20,7 @@ from kiteline_core.ids import KeyframeId, SubmapId
 from tests.agent.seen_scenes import CAMERA, SHAPES, map_of, scene, seen_with, tracked
 
 X, NOTHING = scene(), np.zeros(SHAPES)  # points, and no error of calibration
+UNTOLD = np.zeros((5, 5))  # information about the offset of a good calibration
 T_C_M = se3.exp(np.array([0.3, -0.1, 0.2, 0.05, -0.1, 0.08]))
 
 
@@ -63,12 +64,29 @@ def test_a_rig_that_may_be_worn_is_less_certain_until_it_is_known() -> None:
     pose, (local_map, covariance) = PoseState(), begun()
     covariance.update(tracked_at(local_map, T_C_M))
     good = covariance.of_poses(pose, se3.inverse(T_C_M))[0]
-    covariance.set_disparity_error(0.2 * np.eye(5), 0.5)
+    covariance.set_disparity_error(0.2 * np.eye(5), 0.5, UNTOLD)
     doubtful = covariance.of_poses(pose, se3.inverse(T_C_M))[0]
-    covariance.set_disparity_error(np.zeros((5, 5)), 0.0)
+    covariance.set_disparity_error(np.zeros((5, 5)), 0.0, UNTOLD)
     assert np.trace(doubtful[:3, :3]) > 4.0 * np.trace(good[:3, :3])
     assert np.linalg.eigvalsh(doubtful - good)[0] > -1e-12
     np.testing.assert_allclose(covariance.of_poses(pose, se3.inverse(T_C_M))[0], good)
+
+
+def test_a_good_calibration_s_offset_that_is_followed_leaves_its_posterior() -> None:
+    pose, (local_map, covariance) = PoseState(), begun()
+    covariance.update(tracked_at(local_map, T_C_M))
+
+    def told(worn: float, information: F64) -> F64:
+        covariance.set_disparity_error(np.zeros((5, 5)), worn, information)
+        return covariance.of_poses(pose, se3.inverse(T_C_M))[0]
+
+    before = told(0.0, UNTOLD)
+    prior = np.linalg.inv(np.diag(covariance._good_variance[:5] / covariance._at_edge**2))
+    as_much, certain = told(0.0, prior), told(0.0, 1e9 * np.eye(5))
+    np.testing.assert_allclose(before - as_much, 0.5 * (before - certain), rtol=1e-5, atol=1e-12)  # variances halve
+    assert np.trace(certain) < 0.5 * np.trace(before)
+    half_worn, doubtful = told(0.5, prior), told(0.5, UNTOLD)
+    np.testing.assert_allclose(doubtful - half_worn, 0.5 * (before - as_much), rtol=1e-5, atol=1e-12)
 
 
 def test_rows_without_a_slope_rule_out_a_roll_and_nothing_else() -> None:
@@ -90,7 +108,7 @@ def test_disparity_errors_that_cancel_cost_less_than_their_parts() -> None:
     noise = covariance.of_poses(pose, se3.inverse(T_C_M))[0]
 
     def added(offset: F64) -> F64:
-        covariance.set_disparity_error(np.outer(offset, offset), 0.0)
+        covariance.set_disparity_error(np.outer(offset, offset), 0.0, UNTOLD)
         return covariance.of_poses(pose, se3.inverse(T_C_M))[0] - noise
 
     offset = np.array([0.3, 0.0, 0.0, -0.9, 0.0])  # little is left where the points are

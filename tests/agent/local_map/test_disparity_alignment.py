@@ -211,6 +211,23 @@ def test_a_small_offset_is_found_by_several_keyframes(seed: int, way: F64) -> No
     assert flight.alignment.is_good_offset and off_px(flight.map.disparity_offset - off) < 0.6 * off_px(off)
 
 
+@pytest.mark.parametrize("way", [SIDEWAYS, AHEAD])
+def test_the_information_about_a_good_calibration_tells_what_its_offset_leaves(way: F64) -> None:
+    """Of eight rigs: it leaves a third of the squares, and no more than the posterior by the information says."""
+    px = 0.7 * GOOD_PX
+    before, left, told = [], [], []
+    for seed, rig in enumerate(np.random.default_rng(7).normal(0.0, px, (8, TERMS))):
+        flight = Flight(rig, seed, way)
+        assert not flight.alignment.good_information.any()
+        flight.fly(80)
+        information = flight.alignment.good_information
+        assert information.any() and not flight.alignment.applied
+        before.append(off_px(rig) ** 2)
+        left.append(off_px(rig - flight.map.disparity_offset) ** 2)
+        told.append(flight.alignment._rms_px(np.linalg.inv(np.eye(TERMS) / px**2 + information)) ** 2)
+    assert np.mean(left) < 0.35 * np.mean(before) and 0.2 * np.mean(told) < np.mean(left) < np.mean(told)
+
+
 def test_a_good_calibration_s_offset_begins_at_what_the_base_tells() -> None:
     off = np.array([-0.15, -0.1, 0.1, -0.15, 0.0])
     flight = Flight(off, 0, AHEAD)
@@ -269,8 +286,8 @@ class Camera:
         self.forgotten = 0
         self.left: list[tuple[F64, F64]] = []
 
-    def set_disparity_error(self, cov: F64, worn: float) -> None:
-        self.error, self.worn = cov, worn
+    def set_disparity_error(self, cov: F64, worn: float, good_information: F64) -> None:
+        self.error, self.worn, self.good_information = cov, worn, good_information
 
     def correct_disparities(self, change: F64) -> None:
         self.left.append((change, self.error))
@@ -293,7 +310,7 @@ def test_the_odometry_keeps_the_error_that_the_map_had(seed: int) -> None:
     for change, error in camera.left:
         assert change @ np.linalg.solve(error, change) <= 1.0  # it was within a deviation of what was found
     assert np.trace(camera.error) < 0.3 * np.trace(camera.left[0][1])  # the map is better now
-    assert camera.worn == flight.alignment.rig_worn
+    assert camera.worn == flight.alignment.rig_worn and not camera.good_information.any()
 
 
 def begun(offset: F64, seed: int, way: F64) -> Flight:
