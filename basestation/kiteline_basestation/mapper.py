@@ -124,7 +124,9 @@ class Mapper:
                 self._set_aside(done, now_ns)
             else:
                 self.failures.pop(done.kind, None)
-                changes += self._finish[done.kind](done, now_ns)
+                changed = self._finish[done.kind](done, now_ns)
+                self._local_bundles.void(changed.moved, changed.bent)  # the next result may be of one
+                changes += changed
         answers = []
         for command in given.commands:
             answer, changed = self._manager.answer(command, now_ns)
@@ -300,12 +302,10 @@ class Mapper:
         """Update bundles, placements and the grid after whole maps moved. Returns placements that are void."""
         for keyframe in changes.requeried:
             self._local_bundles.add(keyframe)
-        if changes.bent:
-            self._local_bundles.cancel_around(changes.bent)
+        self._local_bundles.void(changes.moved, changes.bent)
         withdrawn = self._placements.separate(changes.split)
         self._placements.rescale(changes.rescaled, changes.scale_sigma)
         for map_id in sorted(changes.moved):
-            self._local_bundles.cancel(map_id)
             self._placements.update_map(map_id)
             self.grid_updates.rebuild()
         return tuple(

@@ -60,20 +60,19 @@ class LocalBundles:
         self._waiting.setdefault(submap, []).append(keyframe)
         self._blocked.discard(submap)
 
-    def cancel(self, map_id: SubmapId) -> None:
-        """Ignore the results of pending bundles of a map that has moved; they are due again."""
-        self._cancel([job for job, (submap, _) in self._pending.items() if self._map.map_id(submap) == map_id])
+    def void(self, maps: Collection[SubmapId], rows: Collection[int]) -> None:
+        """Ignore the results of pending bundles of maps or with keyframes that have moved; they are due again.
 
-    def cancel_around(self, rows: Collection[int]) -> None:
-        """Ignore the results of pending bundles with keyframes in `rows`, which have moved; they are due again."""
+        rows: of such keyframes in the table.
+        """
         gone = set(rows)
-        self._cancel([job for job, (_, w) in self._pending.items() if not gone.isdisjoint(w.rows.tolist())])
-
-    def _cancel(self, jobs: Collection[int]) -> None:
-        for job in jobs:
+        void = [job for job, (submap, window) in self._pending.items()
+                if self._map.map_id(submap) in maps or not gone.isdisjoint(window.rows.tolist())]  # fmt: skip
+        for job in void:
             submap, _ = self._pending.pop(job)
             self.add(self._map.submaps[submap][-1])
-        self._blocked.clear()
+        if maps or rows:
+            self._blocked.clear()
 
     def delete(self, submaps: Collection[SubmapId]) -> None:
         """Drop all that concerns deleted submaps."""
