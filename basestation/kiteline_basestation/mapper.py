@@ -125,7 +125,7 @@ class Mapper:
             else:
                 self.failures.pop(done.kind, None)
                 changed = self._finish[done.kind](done, now_ns)
-                self._local_bundles.void(changed.moved, changed.bent)  # the next result may be of one
+                self._local_bundles.void(changed.moved, changed.bent)  # whose results may be the next ones
                 changes += changed
         answers = []
         for command in given.commands:
