@@ -61,19 +61,17 @@ class RightCamera:
         before = disparities.pairs
         change = disparities.add(t_ns, track.T_c_m, track.rows[track.inlier], track.observed[track.inlier])
         self._work.pairs += disparities.pairs - before
-        if change is None:
-            covariance.set_disparity_error(disparities.expected_cov, disparities.rig_worn, disparities.good_information)
-            return False, []
-        moves = disparities.moves_map(change)
-        if moves:
+        cov, known = disparities.expected_cov, (disparities.rig_worn, disparities.good_information)
+        moves = change is not None and disparities.moves_map(change)
+        if change is not None and moves:
             # the odometry frame keeps the error that the map had until now
-            covariance.set_disparity_error(
-                disparities.expected_cov + np.outer(change, change), disparities.rig_worn, disparities.good_information
-            )
+            covariance.set_disparity_error(cov + np.outer(change, change), *known)
             self._camera.correct_disparities(change)
             if disparities.voids_turns(change):
                 self._camera.motion.forget_turns()
-        covariance.set_disparity_error(disparities.expected_cov, disparities.rig_worn, disparities.good_information)
+        covariance.set_disparity_error(cov, *known)
+        if change is None:
+            return False, []
         self._found_px = self._map.disparity_offset
         self._sigma_px = disparities.sigma_px if disparities.applied else None
         self._put(self.rows.estimate_px)

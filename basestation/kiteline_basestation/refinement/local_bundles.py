@@ -65,14 +65,15 @@ class LocalBundles:
 
         rows: of such keyframes in the table.
         """
+        if not (maps or rows):
+            return
         gone = set(rows)
         void = [job for job, (submap, window) in self._pending.items()
                 if self._map.map_id(submap) in maps or not gone.isdisjoint(window.rows.tolist())]  # fmt: skip
         for job in void:
             submap, _ = self._pending.pop(job)
             self.add(self._map.submaps[submap][-1])
-        if maps or rows:
-            self._blocked.clear()
+        self._blocked.clear()
 
     def delete(self, submaps: Collection[SubmapId]) -> None:
         """Drop all that concerns deleted submaps."""

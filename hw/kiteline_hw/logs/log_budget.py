@@ -78,7 +78,7 @@ class LogBudget:
 
     def _logs(self, writing: Path | None) -> list[_Log]:
         """All logs, the oldest first, those of the start that is being written last."""
-        flown = -1 if writing is None else self._numbers(writing)[0]
+        flown = -1 if writing is None else _numbers(writing, self._stem)[0]
         found = []
         for path in self._folder.glob(f"{self._stem}*.mcap"):
             if path.stem.removeprefix(self._stem).replace("_", "").isdecimal():
@@ -86,7 +86,7 @@ class LogBudget:
                     status = path.stat()
                 except OSError:
                     continue
-                start, part = self._numbers(path)
+                start, part = _numbers(path, self._stem)
                 in_flight = start == flown and start >= 0
                 found.append(_Log(in_flight, start, part, status.st_mtime_ns, path, status.st_size))
         return sorted(found)
@@ -101,11 +101,6 @@ class LogBudget:
                     found.setdefault(int(number), []).append((path, path.stat().st_size))
         return found
 
-    def _numbers(self, path: Path) -> tuple[int, int]:
-        """Numbers of start and part in a log's name; (-1, 0) if it has none."""
-        match = _NAME.fullmatch(path.stem.removeprefix(self._stem))
-        return (int(match[1]), int(match[2] or 0)) if match else (-1, 0)
-
     def _free_bytes(self) -> int:
         try:
             disk = os.statvfs(self._folder)
@@ -116,6 +111,11 @@ class LogBudget:
 
 def newest_start(folder: Path, stem: str) -> int:
     """The highest number of a start in the names `STEM<number>*.mcap` of a folder; 0 without any. Never raises."""
-    names = (_NAME.fullmatch(path.stem.removeprefix(stem)) for path in folder.glob(f"{stem}*.mcap"))
-    numbers = (int(name[1]) for name in names if name)
-    return max((number for number in numbers if number < _MOST_START), default=0)
+    starts = (_numbers(path, stem)[0] for path in folder.glob(f"{stem}*.mcap"))
+    return max((start for start in starts if 0 <= start < _MOST_START), default=0)
+
+
+def _numbers(path: Path, stem: str) -> tuple[int, int]:
+    """Numbers of start and part in a log's name; (-1, 0) if it has none."""
+    match = _NAME.fullmatch(path.stem.removeprefix(stem))
+    return (int(match[1]), int(match[2] or 0)) if match else (-1, 0)

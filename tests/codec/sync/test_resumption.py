@@ -106,14 +106,8 @@ def test_values_that_are_gone_leave_an_endpoint_when_its_agent_starts_again() ->
         base.put(Key(RefinedLandmarks.KIND, keyframe_id(submap_id(1, boot, 0), 3)), bytes(40))
         talk(agent, base, order * 10**10, 400)
         assert base.peer_values() == values(boot) and base.digest_equal
-        sizes.append(
-            (
-                len(base.earlier_values()),
-                base.received.earlier.bytes,
-                base.received.claims.bytes,
-                len(base.own_values()),
-            )
-        )
+        got = base.received
+        sizes.append((len(base.earlier_values()), got.earlier.bytes, got.claims.bytes, len(base.own_values())))
         gone.add(submap_id(1, boot, 0))
     assert sizes == [(0, 0, 9000, 1)] * 5
 

@@ -68,7 +68,8 @@ class StampFile:
             return
         self._asked = stamp
         if self._writing:  # two writes would share a file
-            self.fault = self._fault("the disk does not answer") if stamp > self._reserved else self.fault
+            if stamp > self._reserved:
+                self.fault = self._fault("the disk does not answer")
             return
         self._writing = True
         self._beside(lambda: self._store(stamp))
@@ -80,7 +81,7 @@ class StampFile:
         except OSError as error:
             self.fault = self._fault(error.strerror or str(error))
         else:
-            self.fault, self._reserved = "", stamp + _AHEAD
+            self._reserved, self.fault = stamp + _AHEAD, ""
         finally:
             self._writing = False
 
