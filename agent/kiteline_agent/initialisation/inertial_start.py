@@ -10,7 +10,7 @@ from kiteline_agent.governor.cost_model import Work
 from kiteline_agent.inertial.clocks.frame_clock import FrameClock
 from kiteline_agent.inertial.imu_prior import ImuPrior
 from kiteline_agent.inertial.preintegration import BiasPrior, Samples, TimeOffset, preintegrate
-from kiteline_agent.inertial.samples.imu_watch import SILENT_S
+from kiteline_agent.inertial.samples.imu_watch import SILENT_S, has_recent
 from kiteline_agent.inertial.samples.sample_buffer import SampleBuffer
 from kiteline_agent.initialisation import corner_tracks
 from kiteline_agent.initialisation.contradiction import ContradictionWatch, contradicts, exceeds_lens_errors
@@ -135,7 +135,7 @@ class InertialStart:
     def add_samples(self, ctx: FrameContext) -> bool:
         """Buffer the IMU samples of a frame. False if none has come for SILENT_S."""
         self._buffer.push(ctx.imu)
-        if self._last_samples_ns is None or (ctx.imu is not None and len(ctx.imu.t_ns)):
+        if self._last_samples_ns is None or has_recent(ctx.imu, ctx.t_ns):
             self._last_samples_ns = ctx.t_ns
         return (ctx.t_ns - self._last_samples_ns) * 1e-9 <= SILENT_S
 

@@ -21,6 +21,7 @@ from kiteline_hw.sensors.sensor_bits import SensorBits
 PAIR_TOLERANCE_NS = 5_000_000  # ns; left and right image of a moving vehicle must not be further apart
 DEPTH_TOLERANCE_NS = 20_000_000  # ns; what the TUM tools use: free-running depth cameras lag by up to half a period
 
+_END_NS = 2**63 - 1  # ns; no sample is later
 _SKEWS = 100  # pairs over which the skew is measured
 _GOOD_SKEW_NS = 500_000  # ns; at a turn of 1 rad/s an image of 450 px focal length is a quarter of a pixel off
 
@@ -129,7 +130,7 @@ def decode_frames(
     both images of a stereo or depth camera, is usable. grey: the bits of images of 16, where they are known.
     """
     last_ns = -(2**63)
-    delivered = paired = 0
+    delivered = paired = sampled = 0
     report.notes += doubts(rig.left, "left") + ([] if rig.right is None else doubts(rig.right, "right"))
     grey = SensorBits() if grey is None else grey
     for encoded in frames:
@@ -149,6 +150,7 @@ def decode_frames(
         last_ns = encoded.t_ns
         batch = imu.take_until(encoded.t_ns)
         if batch is not None:
+            sampled += 1
             yield batch
         delivered += 1
         paired += frame.depth_m is not None if rig.right is None else frame.right is not None
@@ -157,6 +159,11 @@ def decode_frames(
         why = "; ".join(report.notes) or "it holds no images"
         pair = "pair of images" if rig.right is not None else "image with its depth"
         raise SourceError(f"{name}: not one usable {'frame' if delivered == 0 else pair} ({why})")
+    if sampled == 0 and (late := imu.take_until(_END_NS)) is not None:
+        report.notes.append(
+            f"imu: its samples begin {1e-9 * (int(late.t_ns[0]) - last_ns):.1f} s after the last image by their "
+            "stamps, and none is used: expected stamps of one clock for both"
+        )
 
 
 class _WrongSize(Exception):

@@ -255,6 +255,18 @@ def kept_s(seconds: float, config: CornerTracksConfig, oldest_s: float = 0.0) ->
     return np.array([k.t_ns for k in tracks.keyframes]) / SECOND
 
 
+@pytest.mark.parametrize(("behind_s", "begins"), [(0.0, True), (2.0, True), (1e9, False)])
+def test_samples_of_another_clock_are_no_samples(behind_s: float, begins: bool) -> None:
+    start = InertialStart(CAMERA, CALIBRATION, AgentConfig(), Work())
+    waits = []
+    for k in range(100):
+        t_ns = 2 * 10**18 + 50_000_000 * k
+        stamps = t_ns - round(behind_s * 1e9) - 5_000_000 * np.arange(10, dtype=np.int64)[::-1]
+        ctx: Any = SimpleNamespace(t_ns=t_ns, imu=ImuBatch(stamps, np.zeros((10, 3)), np.ones((10, 3))))
+        waits.append(start.add_samples(ctx))
+    assert all(waits[:60]) and waits[-1] == begins  # without samples a map begins from two views
+
+
 def test_a_long_window_keeps_every_second_of_its_old_keyframes() -> None:
     config = CornerTracksConfig(keyframes=20)
     np.testing.assert_array_equal(kept_s(4.0, config), np.arange(0.0, 4.01, 0.25))

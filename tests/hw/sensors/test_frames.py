@@ -8,9 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kiteline_core.frame import UNMEASURED, Frame, ImuBatch, OdometryBatch
+from kiteline_core.geometry.cameras import CameraModel, CameraRig
 from kiteline_hw.logs.mcap_log import ODOMETER, LogReader, LogWriter
 from kiteline_hw.ports import SourceError, SourceReport
-from kiteline_hw.sensors.frames import PAIR_TOLERANCE_NS, pair_by_time, pair_tolerance_ns
+from kiteline_hw.sensors.frames import PAIR_TOLERANCE_NS, EncodedFrame, decode_frames, pair_by_time, pair_tolerance_ns
+from kiteline_hw.sensors.images import encode_image
 from kiteline_hw.sensors.imu_buffer import ImuStream, ImuTable
 from kiteline_hw.sensors.odometry_buffer import OdometerStream, insert_before_frames, reported_covariance
 
@@ -79,12 +81,29 @@ def test_stream_and_table_keep_the_same_samples(samples: list[tuple[int, bool]],
     assert all((np.diff(b.t_ns) > 0).all() and np.isfinite(b.gyro).all() for b in got)
 
 
-def test_one_stamp_far_ahead_is_dropped_alone() -> None:
+@pytest.mark.parametrize("wrong", [4])
+def test_one_stamp_far_ahead_is_dropped_alone(wrong: int) -> None:
     times = np.arange(10, dtype=np.int64) * 5_000_000
-    times[4] += 3600 * 10**9
-    report = SourceReport()
+    times[wrong] += 3600 * 10**9
+    report, of_stream = SourceReport(), SourceReport()
     batch = ImuTable(times, np.zeros((10, 3)), np.zeros((10, 3)), report).take_until(10**12)
     assert len(batch.t_ns) == 9 and report.skipped == {"imu stamp not increasing": 1}
+    stream = ImuStream(of_stream)
+    for t_ns in times.tolist():
+        stream.add(t_ns, (0.0,) * 6)
+    assert np.array_equal(stream.take_until(10**12).t_ns, batch.t_ns) and of_stream.skipped == report.skipped
+
+
+def test_samples_that_are_all_stamped_after_the_images_are_told() -> None:
+    camera = CameraModel(8, 4, 5.0, 5.0, 3.5, 1.5)
+    rig, image = CameraRig(camera, None, np.eye(4), None), encode_image(np.zeros((4, 8), np.uint8))
+    frames = [EncodedFrame(50_000_000 * k, image) for k in range(20)]
+    times = np.arange(200, dtype=np.int64) * 5_000_000
+    for shift_ns, notes in ((0, 0), (60_950_000_000, 1)):
+        report = SourceReport()
+        table = ImuTable(times + shift_ns, np.zeros((200, 3)), np.ones((200, 3)), report)
+        assert sum(isinstance(item, Frame) for item in decode_frames(frames, table, rig, report, "made")) == 20
+        assert len(report.notes) == notes and all("begin 60.0 s after the last image" in note for note in report.notes)
 
 
 @pytest.mark.parametrize(("skew_ns", "told"), [(0, False), (300_000, False), (2_000_000, True), (-2_000_000, True)])

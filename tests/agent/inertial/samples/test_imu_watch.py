@@ -33,6 +33,17 @@ def test_an_imu_that_never_speaks_is_told_of() -> None:
     assert told == ["imu: silent for 3.0 s, the images alone carry the pose"]
 
 
+def test_samples_of_another_clock_are_told_once_and_that_they_are_right_again() -> None:
+    watch = ImuWatch(3.0, 9.81)
+    told = {}
+    for k in range(200):
+        t_ns = 100 * 10**9 + k * _FRAME_NS
+        for line in watch.frame(t_ns, samples(t_ns if k >= 100 else k * _FRAME_NS)):
+            told[k] = line
+    assert list(told) == [60, 100] and told[100] == "imu: samples again"
+    assert told[60].startswith("imu: its samples are stamped 100.0 s before the images and are not used")
+
+
 @pytest.mark.parametrize("accel_m_s2", [1.0, 0.3, 9810.0])  # in g, without gravity, in mm/s^2
 def test_accelerations_that_are_not_gravity_are_told_once(accel_m_s2: float) -> None:
     watch = ImuWatch(3.0, 9.81)
