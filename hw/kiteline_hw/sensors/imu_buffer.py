@@ -8,6 +8,7 @@ from kiteline_core.arrays import F64, I64, Bool
 from kiteline_core.frame import ImuBatch
 from kiteline_hw.ports import SourceReport
 
+_NONE_NS = -(2**63)  # ns; before any sample
 _LEAP_NS = 1_000_000_000  # ns; no IMU pauses that long and then goes back in time
 
 
@@ -30,7 +31,7 @@ class ImuTable:
     """Samples of a whole recording. t_ns: (n,). gyro: (n,3) rad/s. accel: (n,3) m/s^2."""
 
     def __init__(self, t_ns: I64, gyro: F64, accel: F64, report: SourceReport) -> None:
-        keep = _usable(t_ns, gyro, accel, -(2**63), report)
+        keep = _usable(t_ns, gyro, accel, _NONE_NS, report)
         self._t_ns, self._gyro, self._accel = t_ns[keep], gyro[keep], accel[keep]
         self._next = 0
 
@@ -49,7 +50,7 @@ class ImuStream:
         self._report = report
         self._t_ns: list[int] = []
         self._rows: list[tuple[float, ...]] = []
-        self._last_ns = -(2**63)
+        self._last_ns = _NONE_NS
 
     def __len__(self) -> int:
         """The number of buffered samples."""
@@ -86,8 +87,10 @@ def _usable(t_ns: I64, gyro: F64, accel: F64, last_ns: int, report: SourceReport
     for t in t_ns[~finite]:
         report.skip("imu sample not finite", f"at {t} ns")
     if len(t_ns) > 2:
-        # A single stamp far ahead of both neighbours is wrong itself; otherwise all later samples would be dropped.
+        # A single stamp far ahead of both neighbours is wrong itself; otherwise all later samples would be dropped. So
+        # is the first of all, which has but one neighbour.
         ahead = np.zeros(len(t_ns), np.bool_)
+        ahead[0] = last_ns == _NONE_NS and int(t_ns[0]) - int(t_ns[1]) > _LEAP_NS
         ahead[1:-1] = (t_ns[1:-1] - t_ns[:-2] > _LEAP_NS) & (t_ns[1:-1] > t_ns[2:])
         for t in t_ns[ahead & finite]:
             report.skip("imu stamp not increasing", f"at {t} ns, far ahead of its neighbours")
