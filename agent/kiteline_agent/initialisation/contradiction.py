@@ -1,4 +1,4 @@
-"""Images and IMU that contradict each other: how a window shows it, and the event once it lasts."""
+"""What keeps windows from a scale: images and IMU that contradict each other, or too little motion; and the events."""
 
 import numpy as np
 
@@ -11,6 +11,13 @@ _WARNING = (
     "imu: images and IMU contradict each other, so that no scale is known: check the camera's place in the IMU's axes "
     "(T_BS), the intrinsics, the units (rad/s, m/s^2) and the time offset (one of up to 0.15 s is found)"
 )
+_NO_SCALE = (
+    "imu: no scale is known after {:.0f} s in motion, and there is no pose before: speed up and slow down, in changing "
+    "directions; if that was flown, check the signs of the accelerations, and that samples come at 200 Hz, or fewer as "
+    "means over their steps"
+)
+_WAITS_S = 10.0  # s of windows in motion without a scale, after which it is said: most starts know it after 6 s
+_APART_S = 2.5  # s between two windows, at most: between those further apart the vehicle stood still
 _BOTH_LENS_CHI2 = 12.0  # with _BOTH_GYRO_NOISE: a focal length that is off by a tenth has 13
 _BOTH_GYRO_NOISE = 1.7  # with _BOTH_LENS_CHI2: a focal length that is off by a tenth has 1.9, worn rigs 1.2
 _ACCEL_BIAS = 5.0  # deviations of the accelerometer's bias: that of missing gravity is 40
@@ -47,7 +54,8 @@ def exceeds_lens_errors(
 class ContradictionWatch:
     """Reports once that all windows of some seconds contradict, and again after one that does not.
 
-    certain: they do by the IMU, every one, or for so long that no window will tell more.
+    Windows that tell no scale for long are reported once in a flight, unless they contradicted. certain: windows
+    contradict by the IMU, every one, or for so long that none will tell more.
     """
 
     def __init__(self, config: ContradictionConfig) -> None:
@@ -55,10 +63,29 @@ class ContradictionWatch:
         self._since_ns: int | None = None  # first of the windows that contradict
         self._by_imu_since_ns: int | None = None  # first of those in a row that do by more than the lens
         self._told = False
+        self._window_ns: int | None = None  # of the last window of this start
+        self._moved_s, self._wait_told = 0.0, False
         self.certain = False
+
+    def begin_again(self) -> None:
+        """A map has begun: the next start waits for its scale anew."""
+        self._window_ns, self._moved_s = None, 0.0
 
     def note(self, t_ns: int, *, contradicts: bool | None, by_imu: bool = True) -> list[str]:
         """Process a window that ends at t_ns; returns the events for the log. contradicts: None if it tells neither."""
+        return self._note_contradiction(t_ns, contradicts, by_imu) or self._note_wait(t_ns)
+
+    def _note_wait(self, t_ns: int) -> list[str]:
+        """Count the time in motion without a scale."""
+        if self._window_ns is not None:
+            self._moved_s += min(1e-9 * (t_ns - self._window_ns), _APART_S)
+        self._window_ns = t_ns
+        if self._wait_told or self._moved_s < _WAITS_S:
+            return []
+        self._wait_told = True
+        return [_NO_SCALE.format(self._moved_s)]
+
+    def _note_contradiction(self, t_ns: int, contradicts: bool | None, by_imu: bool) -> list[str]:
         if contradicts is None:
             self._by_imu_since_ns = None  # as with people all over the view, who shake it
             return []
@@ -73,5 +100,5 @@ class ContradictionWatch:
         self.certain = (by_imu and t_ns - by_imu_ns >= lasts_ns) or t_ns - since_ns >= unsure_ns
         if self._told or t_ns - since_ns < lasts_ns:
             return []
-        self._told = True
+        self._told = self._wait_told = True
         return [_WARNING]

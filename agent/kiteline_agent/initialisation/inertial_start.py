@@ -142,9 +142,9 @@ class InertialStart:
     def clear(self) -> None:
         """A map is tracked: begin anew after it."""
         self._tracks.clear()
-        self._attempt = self._before = self._tried_ns = None
-        self._noise = self._vibration = None
+        self._attempt = self._before = self._tried_ns = self._noise = self._vibration = None
         self._by_stamps = False
+        self._contradiction.begin_again()
 
     @property
     def contradicted(self) -> bool:

@@ -152,3 +152,21 @@ def test_a_contradiction_is_told_once_it_lasts_and_again_after_an_end() -> None:
         events = watch.note(500_000_000 * k, contradicts=k not in (3, 30) if tells else None)
         said += [k] * len(events)
     assert said == [15, 42]
+
+
+def test_windows_that_tell_no_scale_are_told_of_once_and_rests_do_not_count() -> None:
+    watch = ContradictionWatch(ContradictionConfig())
+    said: list[tuple[float, str]] = []
+
+    def fly(first_s: float, last_s: float) -> None:
+        for t_s in np.arange(first_s, last_s, 0.5):
+            said.extend((t_s, event) for event in watch.note(round(1e9 * t_s), contradicts=None))
+
+    fly(2.5, 6.0)
+    fly(100.0, 103.0)  # after a rest
+    watch.begin_again()  # a map began, and was lost
+    fly(200.0, 209.5)
+    assert not said
+    fly(209.5, 260.0)
+    assert [t_s for t_s, _ in said] == [210.0]
+    assert said[0][1].startswith("imu: no scale is known after 10 s in motion")
