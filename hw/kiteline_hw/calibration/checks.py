@@ -10,6 +10,7 @@ from kiteline_hw.ports import SourceError
 LONGEST_READOUT_S = 0.2  # no video camera is slower
 _FAR_FROM_MIDDLE = 0.25  # of a side: centres of lenses and of cropped images lie nearer to the middle
 
+_UNDISTORTED = ("", "none", "pinhole", "rectified", "undistorted")
 _EQUIDISTANT = ("equidistant", "fisheye", "kannalabrandt", "kannalabrandt4", "kannalabrandt8", "kb4")
 _RADTAN = ("radialtangential", "radtan", "plumbbob", "rationalpolynomial", "opencv", "browncornrady", "brown")
 
@@ -26,10 +27,20 @@ def checked_rigid(values: F64, where: str) -> F64:
     return se3.orthonormalise(values)
 
 
+def names_lens(model: str) -> bool:
+    """True for the name of a distortion model, which has coefficients."""
+    return _plain(model) not in _UNDISTORTED
+
+
 def parse_lens(model: str, coefficients: list[float], where: str) -> tuple[Lens, tuple[float, ...]]:
     """The lens behind a distortion model's name, as data sets and ROS write it."""
-    name = model.lower().replace("-", "").replace("_", "").replace(" ", "")
-    if name in ("", "none", "pinhole", "rectified", "undistorted") or not any(coefficients):
+    name = _plain(model)
+    if not name and any(coefficients):
+        raise SourceError(
+            f"{where}: {len(coefficients)} coefficients of a lens whose distortion model is not named: expected "
+            "radial-tangential or equidistant, or none with coefficients of 0; --calibration FILE takes another one"
+        )
+    if name in _UNDISTORTED or not any(coefficients):
         return (Lens.EQUIDISTANT, (0.0, 0.0, 0.0, 0.0)) if name in _EQUIDISTANT else (Lens.NONE, ())
     if name in _RADTAN:
         if len(coefficients) not in (4, 5, 8):
@@ -40,6 +51,10 @@ def parse_lens(model: str, coefficients: list[float], where: str) -> tuple[Lens,
             raise SourceError(f"{where}: {model} has {len(coefficients)} coefficients: expected 4")
         return Lens.EQUIDISTANT, tuple(coefficients)
     raise SourceError(f"{where}: lens model {model!r} is not known: expected radial-tangential or equidistant")
+
+
+def _plain(model: str) -> str:
+    return model.lower().replace("-", "").replace("_", "").replace(" ", "")
 
 
 def checked_camera(camera: CameraModel, where: str) -> CameraModel:

@@ -6,7 +6,7 @@ from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraModel, Lens
-from kiteline_hw.calibration.checks import checked_camera, checked_readout, checked_rigid, parse_lens
+from kiteline_hw.calibration.checks import checked_camera, checked_readout, checked_rigid, names_lens, parse_lens
 from kiteline_hw.calibration.file_calibration import FileCalibration, FilePart
 from kiteline_hw.calibration.kalibr import IMU_KEYS, imu_numbers
 from kiteline_hw.calibration.nodes import Node
@@ -21,7 +21,8 @@ def is_sensor(node: Node) -> bool:
 
 def read_sensor(node: Node) -> FilePart:
     """A camera, or an IMU. Raises SourceError."""
-    return read_imu(node) if "gyroscope_noise_density" in node.keys else read_camera(node)
+    is_imu = "sensor_type" in node.keys and node.get("sensor_type").text().lower() == "imu"
+    return read_imu(node) if is_imu or "gyroscope_noise_density" in node.keys else read_camera(node)
 
 
 def read_imu(node: Node) -> FilePart:
@@ -41,9 +42,9 @@ def read_camera(node: Node) -> FilePart:
     sides.numbers((2,), "width and height in px")
     assert isinstance(sides.value, list)
     width, height = (Node(node.path, sides.key, side).pixels() for side in sides.value)
+    name = node.get("distortion_model").text() if "distortion_model" in node.keys else ""
     d = node.get("distortion_coefficients")
-    values = d.numbers((), "a list of numbers") if d.value is not None else []
-    name = node.get("distortion_model").text() if "distortion_model" in node.keys else "none"
+    values = d.numbers((), "a list of numbers") if d.value is not None or names_lens(name) else []
     lens, coefficients = parse_lens(name, values, where)
     readout_s = 0.0
     if "readout_s" in node.keys:

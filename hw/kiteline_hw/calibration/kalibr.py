@@ -8,7 +8,7 @@ from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraModel, Lens
-from kiteline_hw.calibration.checks import checked_camera, checked_readout, checked_rigid, parse_lens
+from kiteline_hw.calibration.checks import checked_camera, checked_readout, checked_rigid, names_lens, parse_lens
 from kiteline_hw.calibration.file_calibration import FileCalibration, FilePart
 from kiteline_hw.calibration.nodes import Node
 from kiteline_hw.ports import SourceError
@@ -112,8 +112,9 @@ def _camera(table: Node) -> CameraModel:
     sides.numbers((2,), "width and height in px")
     assert isinstance(sides.value, list)
     width, height = (Node(table.path, sides.key, side).pixels() for side in sides.value)
-    d = table.get("distortion_coeffs").numbers((), "a list of numbers") if "distortion_coeffs" in table.keys else []
     name = table.get("distortion_model").text() if "distortion_model" in table.keys else "none"
+    told = "distortion_coeffs" in table.keys or names_lens(name)
+    d = table.get("distortion_coeffs").numbers((), "a list of numbers") if told else []
     if name == "none" and any(d):
         raise table.get("distortion_model").error("radtan or equidistant, as there are coefficients")
     lens, coefficients = parse_lens(name, d, where)

@@ -187,7 +187,30 @@ def test_an_euroc_imu_turns_the_body(tmp_path: Path) -> None:
     np.testing.assert_allclose(c.T_b_c[:3, :3], np.eye(3), atol=1e-12)
 
 
+def test_an_euroc_imu_without_noise_is_an_imu(tmp_path: Path) -> None:
+    given = told(tmp_path, imu0="".join(line + "\n" for line in SENSOR.splitlines() if "gyro" not in line))
+    assert not given.cameras and given.imu is not None and given.imu.gyro_noise == ImuCalibration().gyro_noise
+
+
+CAMERA = SENSOR.split("rate_hz")[0].replace("imu", "camera") + (
+    "resolution: [752, 480]\ncamera_model: pinhole\nintrinsics: [458.654, 457.296, 367.215, 248.375]\n"
+    "distortion_model: radial-tangential\ndistortion_coefficients: [-0.28, 0.07, 0.0002, 1.8e-05]\n"
+)
 CHANGES = [
+    (
+        CAMERA,
+        "distortion_model: radial-tangential\n",
+        "",
+        "4 coefficients of a lens whose distortion model is not named",
+    ),
+    (
+        CAMERA,
+        "distortion_coefficients",
+        "distortion_coeffs",
+        "distortion_coefficients to be a list of numbers.*nothing",
+    ),
+    (CHAIN, "distortion_coeffs", "distortion_coefficients", "cam0.distortion_coeffs to be a list of numbers.*nothing"),
+    (ROS, "distortion_model: plumb_bob", "distortion_model: ''", "5 coefficients of a lens whose distortion model"),
     (CHAIN, "intrinsics: [190.97", "intrinsics: [.nan, 190.97", "cam0.intrinsics.*4 numbers"),
     (CHAIN, "[190.97847715128717,", "[-190.97847715128717,", "cam0.*fx -190"),
     (CHAIN, "[190.97847715128717,", "[.inf,", "cam0.intrinsics.*finite"),
