@@ -8,7 +8,7 @@ from kiteline_agent.imaging.row_alignment import TERMS as ROW_TERMS
 from kiteline_agent.inertial.calibration.known_imu import KnownImuConfig
 from kiteline_core.arrays import F64
 from kiteline_core.geometry import disparity_offset
-from kiteline_core.geometry.cameras import RectifiedCamera
+from kiteline_core.geometry.cameras import VIRTUAL_BASELINE_M, RectifiedCamera
 
 _CAMERA_NUMBERS = 7
 _SAME = 1e-6  # relative; machines round differently
@@ -58,12 +58,13 @@ class KnownRigConfig:
         return replace(right, imu=imu or (self.imu if self.knows_imu_of(camera) else KnownImuConfig()))
 
     def rectified(self) -> RectifiedCamera | None:
-        """The rectified camera; None if nothing is known."""
+        """The rectified camera; None if nothing is known. One camera has no right one."""
         if not self.camera:
             return None
         width, height, fx, fy, cx, cy, baseline_m = self.camera
         T_b_c = np.array(self.T_b_c).reshape(4, 4) if self.T_b_c else np.eye(4)
-        return RectifiedCamera(round(width), round(height), fx, fy, cx, cy, baseline_m, True, T_b_c)
+        stereo = bool(self.rows_px) or baseline_m != VIRTUAL_BASELINE_M
+        return RectifiedCamera(round(width), round(height), fx, fy, cx, cy, baseline_m, stereo, T_b_c)
 
     @property
     def rows(self) -> F64:

@@ -30,6 +30,7 @@ from kiteline_lab.tools.export import load
 
 FORMATS = ("kalibr", "euroc", "kiteline")
 _LIKELY = np.array([1.0, 1.0, 0.5, 1e-3, 1e-3, 1e-3])  # px, px, px, rad: what mounts and lenses change by
+_NONE_KNOWN = "no camera is known: expected a store or a rig file that a flight has written"
 _FIT_PX = 0.005  # rms misfit that is accepted for a likelier rig
 
 
@@ -187,12 +188,18 @@ def exported(known: KnownCameras, agent: int | None, kind: str) -> dict[str, str
     kalibr: a camera chain; euroc: a sensor.yaml of each camera; kiteline: a rig file for `kiteline agent --rig`.
     """
     cameras = known.cameras
+    if not cameras:
+        raise RigError(_NONE_KNOWN)
     if agent is None and len(cameras) != 1:
         raise RigError(f"{len(cameras)} agents: choose one with --agent")
     chosen = AgentId(agent) if agent is not None else next(iter(cameras))
     camera = cameras.get(chosen)
     if camera is None:
         raise RigError(f"no agent {chosen}: expected one of {', '.join(str(int(a)) for a in sorted(cameras))}")
+    if kind == "kiteline" and not camera.stereo:
+        one_camera = KnownRigConfig().updated(camera, None, known.imu)
+        assert one_camera is not None
+        return {"rig.toml": rig_file.text_of(one_camera)}
     if kind == "kiteline":
         rows = known.rows_px.get(chosen, np.zeros(row_alignment.TERMS))
         read = chosen in known.rows_read
@@ -253,7 +260,7 @@ def main(argv: Sequence[str]) -> int:
     known = opened(args.known)
     if args.verb == "show":
         rigs = summary(known)
-        sys.stdout.write((json.dumps(rigs, indent=2) if args.json else table(rigs)) + "\n")
+        sys.stdout.write((json.dumps(rigs, indent=2) if args.json else table(rigs) or _NONE_KNOWN) + "\n")
         return 0
     for name, text in exported(known, args.agent, args.format).items():
         path = args.out / name

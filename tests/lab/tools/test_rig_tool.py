@@ -11,7 +11,7 @@ import yaml
 
 from kiteline_agent.imaging import row_alignment
 from kiteline_agent.inertial.calibration.known_imu import KnownImuConfig
-from kiteline_agent.known_rig import known_rig
+from kiteline_agent.known_rig import KnownRigConfig, known_rig
 from kiteline_agent.runtime import rig_file
 from kiteline_basestation.mapper import Mapper
 from kiteline_basestation.mapper_state import MapperState, MapState
@@ -20,7 +20,7 @@ from kiteline_basestation.store.state_texts import texts_of
 from kiteline_basestation.store.store import Store, batch_of
 from kiteline_codec.schema import CameraIntrinsics, messages
 from kiteline_core.geometry import se3
-from kiteline_core.geometry.cameras import RectifiedCamera
+from kiteline_core.geometry.cameras import VIRTUAL_BASELINE_M, RectifiedCamera
 from kiteline_core.geometry.disparity_offset import terms
 from kiteline_core.ids import AgentId
 from kiteline_lab.tools.rig import KnownCameras, RigError, exported, found_rig, main, summary
@@ -76,7 +76,7 @@ def test_both_forms_hold_the_same_rig() -> None:
 def test_unknown_agents_are_named() -> None:
     with pytest.raises(RigError, match="no agent 3: expected one of 0"):
         exported(KnownCameras.of_base(known()), 3, "euroc")
-    with pytest.raises(RigError, match="0 agents"):
+    with pytest.raises(RigError, match="no camera is known"):
         exported(KnownCameras(), None, "euroc")
 
 
@@ -151,6 +151,26 @@ def test_an_imu_of_a_rig_file_is_shown_and_exported(tmp_path: Path, capsys: pyte
     known_cameras = KnownCameras.of_file(rig_file.load(str(path)))
     assert "timeshift_cam_imu: -0.004" in exported(known_cameras, None, "kalibr")["camchain-imucam.yaml"]
     assert "[known_rig.imu]" in exported(known_cameras, None, "kiteline")["rig.toml"]
+
+
+def test_a_rig_file_of_one_camera_has_no_right_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    one = replace(CAMERA, baseline_m=VIRTUAL_BASELINE_M, stereo=False)
+    known = KnownRigConfig().updated(one, None, KnownImuConfig((-0.004, 0.0003)))
+    (tmp_path / "rig.toml").write_text(text := rig_file.text_of(known))
+    assert main(["show", str(tmp_path / "rig.toml")]) == 0
+    assert "no right camera\n  camera stamps + -4.00 ms" in (shown := capsys.readouterr().out) and "mm" not in shown
+    cameras = KnownCameras.of_file(rig_file.load(str(tmp_path / "rig.toml")))
+    assert set(yaml.safe_load(exported(cameras, None, "kalibr")["camchain-imucam.yaml"])) == {"cam0"}
+    assert set(exported(cameras, None, "euroc")) == {"cam0/sensor.yaml"}
+    assert exported(cameras, None, "kiteline")["rig.toml"] == text
+
+
+def test_what_knows_no_camera_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "rig.toml").write_text(rig_file.text_of(KnownRigConfig()))
+    assert main(["show", str(tmp_path / "rig.toml")]) == 0
+    assert "no camera is known" in capsys.readouterr().out
+    with pytest.raises(RigError, match="no camera is known"):
+        main(["export", str(tmp_path / "rig.toml"), "--format", "kalibr", "--out", str(tmp_path)])
 
 
 def test_a_store_s_rig_file_says_how_well_an_offset_is_known() -> None:
