@@ -366,6 +366,12 @@ class Agent:
         """`quality` of T_o_b, which no map corrects: for a flight controller."""
         return self._report.odometry_quality(estimate)
 
+    @property
+    def rig_is_of_another(self) -> bool:
+        """True if what earlier flights found of the rig was found with another calibration."""
+        known = self._full_config.known_rig
+        return bool(known.camera) and not known.is_of(self.map.camera)
+
     def known_rig(self) -> KnownRigConfig | None:
         """What is known of right camera and IMU, for the next flight; None before anything was measured."""
         right = None if self.right_camera is None else self.right_camera.known()

@@ -11,6 +11,7 @@ from typing import Any
 
 import cv2
 
+from kiteline_agent.agent import Agent
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_agent.governor.cost_model import cost_ns
@@ -106,6 +107,10 @@ class AgentRuntime:
             channel,
             shipped_vocabulary(),
         )
+        if self._rig_file is not None and isinstance(self.agent, Agent) and self.agent.rig_is_of_another:
+            line = self._rig_file.put_aside()
+            self._warnings.append(line)
+            self._notices.say("another rig", line)
         disorder = LinkModelConfig(
             loss=options.loss, duplicate=options.disorder, reorder=options.disorder,
             delay_ns=round(options.delay_s * 1e9)

@@ -1,5 +1,7 @@
 """The rig file: what flights found of a rig, as TOML. Read when an agent starts, written while and after it flies."""
 
+import contextlib
+import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -51,13 +53,30 @@ class RigFile:
     def __init__(self, path: str) -> None:
         self._path = Path(path)
         self._written = ""
+        self._is_of_another = False  # what the file says was found with another calibration
+
+    def put_aside(self) -> str:
+        """Keep what the file says, of another calibration, in a file beside it before it is replaced; a line on it."""
+        self._is_of_another = True
+        return (
+            f"rig: {self._path} was found with another calibration and is not used; what this flight finds replaces "
+            f"it, and it is kept as {self._old.name}"
+        )
 
     def save(self, known: KnownRigConfig | None) -> None:
         """Write what is known, if that changed, and wait for the disk. Raises ConfigError if it cannot be written."""
         if known is None or (text := text_of(known)) == self._written:
             return
         try:
+            if self._is_of_another:
+                with contextlib.suppress(FileNotFoundError):
+                    os.replace(self._path, self._old)
+                self._is_of_another = False
             write_atomically(self._path, text.encode())
         except OSError as error:
             raise ConfigError(f"{self._path}: cannot write the rig file ({error})") from error
         self._written = text
+
+    @property
+    def _old(self) -> Path:
+        return self._path.with_name(self._path.name + ".old")

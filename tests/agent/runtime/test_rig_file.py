@@ -132,6 +132,27 @@ def test_the_file_is_replaced_as_a_whole(tmp_path: Path) -> None:
         RigFile(str(tmp_path)).save(known)
 
 
+def test_what_was_found_with_another_calibration_is_kept_beside_the_file(tmp_path: Path) -> None:
+    """A flight with one of two cameras, or after a new calibration, must not lose what was found of the pair."""
+    path, old = tmp_path / "rig.toml", tmp_path / "rig.toml.old"
+    of_pair = known_rig(CAMERA, ROWS, DISPARITY, rows_read=True)
+    RigFile(str(path)).save(of_pair)
+    one = CameraRig(LEFT, None, np.eye(4), None)
+    agent, _ = flown(of_pair, one)
+    assert agent.rig_is_of_another
+    assert not flown(of_pair)[0].rig_is_of_another and not flown(KnownRigConfig(), one)[0].rig_is_of_another
+    keeper = RigFile(str(path))
+    line = keeper.put_aside()
+    assert line.startswith(f"rig: {path} was found with another calibration") and old.name in line
+    keeper.save(None)
+    assert not old.exists()  # until something else is known
+    of_one = of_pair.updated(Rectifier(one).camera, None, IMU)
+    keeper.save(of_one)
+    keeper.save(replace(of_one, imu=replace(IMU, offset_s=(0.0, 0.001))))
+    assert rig_file.load(str(old)) == of_pair
+    assert rig_file.load(str(path)).imu.offset_s == (0.0, 0.001)
+
+
 def test_an_imu_is_kept_with_the_cameras(tmp_path: Path) -> None:
     known = replace(known_rig(CAMERA, ROWS, DISPARITY, rows_read=True), imu=IMU)
     path = tmp_path / "rig.toml"

@@ -15,6 +15,7 @@ import pytest
 
 from kiteline_agent.__main__ import main
 from kiteline_agent.exchange.no_base import NoBaseChannel
+from kiteline_agent.known_rig import KnownRigConfig
 from kiteline_agent.local_map.held_corrections import HeldCorrections
 from kiteline_agent.runtime import agent_runtime, live
 from kiteline_agent.runtime.agent_runtime import AgentRuntime
@@ -239,6 +240,15 @@ def test_a_rig_file_that_cannot_be_written_is_told_once(
     options = AgentOptions(str(recording), str(tmp_path / "agent0"), rig=str(tmp_path / "rig.toml"))
     _, told = fly(options, 99, 99, monkeypatch)
     assert len(told) == 1 and "rig.toml: cannot write" in told[0]
+
+
+def test_a_rig_file_of_another_calibration_is_told(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "rig.toml"
+    RigFile(str(path)).save(KnownRigConfig(camera=(640.0, 400.0, 400.0, 400.0, 320.0, 200.0, 0.11)))
+    runtime, told = fly(AgentOptions(str(recording), str(tmp_path / "agent0"), rig=str(path)), 99, 99, monkeypatch)
+    assert len(told) == 1 and "was found with another calibration" in told[0] and told[0] in runtime.report()["notes"]
 
 
 def test_an_agent_flies_without_a_log_that_cannot_begin(
