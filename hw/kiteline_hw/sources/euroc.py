@@ -33,6 +33,7 @@ _CAMERA_KEYS = (
     "T_BS (data: 16 numbers), resolution [width, height], intrinsics [fu, fv, cu, cv], distortion_model and "
     "distortion_coefficients of a camera"
 )
+_SAMPLES = "IMU samples: t_ns, gyro x y z rad/s, accel x y z m/s^2"
 _IMU_KEYS = "T_BS (data: 16 numbers) and the noise of an IMU"
 
 
@@ -126,7 +127,8 @@ def _read_frames(images: list[Stamped], report: SourceReport) -> Iterator[Encode
 def _read_imu(path: Path, report: SourceReport) -> ImuSamples:
     times: list[int] = []
     values: list[list[float]] = []
-    for cells in read_rows(path, "IMU samples: t_ns, gyro x y z rad/s, accel x y z m/s^2", ","):
+    unreadable = ""  # the last such line
+    for cells in read_rows(path, _SAMPLES, ","):
         try:
             row = [float(cell) for cell in cells[1:7]]
             if len(row) != 6:
@@ -134,7 +136,13 @@ def _read_imu(path: Path, report: SourceReport) -> ImuSamples:
             times.append(nanoseconds(cells[0]))
             values.append(row)
         except ValueError:
-            report.skip("unreadable imu line", f"{path.name}: {','.join(cells)[:60]!r}")
+            unreadable = repr(",".join(cells)[:60])
+            report.skip("unreadable imu line", f"{path.name}: {unreadable}")
+    if unreadable and not times:
+        raise SourceError(
+            f"{path}: not one line can be read: expected {_SAMPLES} with commas between, t_ns a whole number, found "
+            f"{unreadable}; with --no-imu the images alone are used"
+        )
     table = np.array(values, np.float64).reshape(-1, 6)
     return ImuTable(np.array(times, np.int64), table[:, :3], table[:, 3:], report)
 

@@ -122,6 +122,16 @@ def test_euroc_body_becomes_the_imu_frame(tmp_path: Path) -> None:
     np.testing.assert_array_equal(without.rig.T_b_c, source.rig.T_b_c)
 
 
+def test_euroc_samples_of_another_form_are_refused(tmp_path: Path) -> None:
+    root = euroc(tmp_path)
+    add_imu(root, np.eye(4), [f"{0.001 + 0.005 * i:.6f},0,0,0,0,0,9.8" for i in range(40)])  # seconds
+    with pytest.raises(
+        SourceError, match=r"data\.csv: not one line can be read: expected .*t_ns a whole number.*0\.196"
+    ):
+        read(open_source(str(root)))
+    assert len(read(open_source(str(root), imu=False))[0])
+
+
 def test_euroc_bad_imu_samples_are_dropped_and_counted(tmp_path: Path) -> None:
     root = euroc(tmp_path)
     rows = [f"{1000 + i * 5_000_000},0,0,0,0,0,9.8" for i in range(10)]
