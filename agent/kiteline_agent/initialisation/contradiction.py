@@ -13,8 +13,8 @@ _WARNING = (
 )
 _NO_SCALE = (
     "imu: no scale is known after {:.0f} s in motion, and there is no pose before: speed up and slow down, in changing "
-    "directions; if that was flown, check the signs of the accelerations, and that samples come at 200 Hz, or fewer as "
-    "means over their steps"
+    "directions; if that was flown, check the signs of the accelerations, and that samples come at 200 Hz and without "
+    "gaps, or fewer as means over their steps"
 )
 _WAITS_S = 10.0  # s of windows in motion without a scale, after which it is said: most starts know it after 6 s
 _APART_S = 2.5  # s between two windows, at most: between those further apart the vehicle stood still
@@ -73,10 +73,10 @@ class ContradictionWatch:
 
     def note(self, t_ns: int, *, contradicts: bool | None, by_imu: bool = True) -> list[str]:
         """Process a window that ends at t_ns; returns the events for the log. contradicts: None if it tells neither."""
-        return self._note_contradiction(t_ns, contradicts, by_imu) or self._note_wait(t_ns)
+        return self._note_contradiction(t_ns, contradicts, by_imu) or self.note_wait(t_ns)
 
-    def _note_wait(self, t_ns: int) -> list[str]:
-        """Count the time in motion without a scale."""
+    def note_wait(self, t_ns: int) -> list[str]:
+        """Count the time in motion without a scale, also that of windows that miss samples; returns the event."""
         if self._window_ns is not None:
             self._moved_s += min(1e-9 * (t_ns - self._window_ns), _APART_S)
         self._window_ns = t_ns

@@ -224,14 +224,14 @@ class InertialStart:
         waited = self._tried_ns is None or (ctx.t_ns - self._tried_ns) * 1e-9 >= wait_s
         if span_s < _MIN_SPAN_S or not waited or self._tracks.flow_px() < config.min_flow * self._camera.fx:
             return None
-        self._tried_ns = ctx.t_ns
         times_ns = [self._time_ns(k.t_ns, imu) for k in keyframes]
         samples = WindowSamples(self._buffer, imu.correct, times_ns, imu.offset.offset_s)
         missing = samples.missing(imu.offset.offset_s)
         if missing is not None:  # the window begins after it
             self._tracks.drop_before(keyframes[missing + 1].t_ns)
-            self._tried_ns = None
+            self._warnings += self._contradiction.note_wait(ctx.t_ns)
             return None
+        self._tried_ns = ctx.t_ns
         prior = self._default_prior() if imu.bias is None else imu.bias
         return self._attempting(ctx, keyframes, _Imu(samples, prior, imu.offset, imu.clock))
 

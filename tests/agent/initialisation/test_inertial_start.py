@@ -220,6 +220,20 @@ def test_a_window_begins_after_the_samples_that_are_missing(monkeypatch: pytest.
     assert solved == [17]
 
 
+def test_samples_that_miss_in_every_window_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each window would begin after the last gap, and none is ever solved."""
+    start = InertialStart(CAMERA, CALIBRATION, AgentConfig(), Work())
+    monkeypatch.setattr(start, "_tracks", Tracks(window(1, keyframes=4, noise_px=0.2)[0]))
+    gap: Any = SimpleNamespace(missing=lambda _offset_s: 0)
+    monkeypatch.setattr(inertial_start, "WindowSamples", lambda *_: gap)
+    told = []
+    for k in range(100):
+        ctx: Any = SimpleNamespace(t_ns=250_000_000 * k, images=SimpleNamespace(left=None))
+        assert start.add(ctx, EXACT) is None
+        told += [k] * len(start.take_warnings())
+    assert told == [50]  # 10 s after the first window, which has 2.5
+
+
 @pytest.mark.parametrize(("flow_px", "kept"), [(0.2, 17), (8.0, 77)])
 def test_of_a_long_rest_a_window_holds_the_end(monkeypatch: pytest.MonkeyPatch, flow_px: float, kept: int) -> None:
     """A window of 20 s is solved every 2 s at most: the scale would be known seconds later than after a short rest."""
