@@ -61,7 +61,7 @@ class GravityAligner:
         self._inertial = inertial
         self._began_ns: int | None = None
         self._R_l_o: F64 | None = None if inertial is not None else np.eye(3)
-        self._renewed = False
+        self._renewed = self._known = False
         self.tilt_rad = 0.0  # of the first submap
 
     @property
@@ -76,7 +76,7 @@ class GravityAligner:
     def renew(self) -> None:
         """The IMU is mounted otherwise than the calibration says, and so was the vertical: it is measured again."""
         if self._inertial is not None:
-            self._R_l_o, self._renewed = None, True
+            self._R_l_o, self._renewed, self._known = None, True, False
 
     def ignore_imu(self) -> None:
         """Go on as without an IMU, for a camera that was level when the flight began."""
@@ -93,9 +93,10 @@ class GravityAligner:
     def update(self, t_ns: int, T_m_b: F64, R_o_m: F64, submap: SubmapId, *, first: bool) -> GravityAlignment | None:
         """Process a frame tracked at T_m_b (4,4), with R_o_m (3,3) from the submap to the odometry frame.
 
-        first: it is the first submap. Returns the record for the base, once, if that submap is tilted.
+        first: it is the first submap. Returns the record for the base, once, if that submap is tilted: also where the
+        samples began so late that a flight controller got poses before, whose frame stays as it was.
         """
-        if self._R_l_o is not None or self._inertial is None:
+        if self._known or self._inertial is None:
             return None
         if self._began_ns is None:
             self._began_ns = t_ns
@@ -104,7 +105,9 @@ class GravityAligner:
             if t_ns - self._began_ns > _PATIENCE_S * 1e9 and not self._renewed:
                 self._R_l_o = np.eye(3)
             return None
-        self._R_l_o = level_rotation(R_o_m @ R_l_m[2])
+        self._known = True
+        if self._R_l_o is None:
+            self._R_l_o = level_rotation(R_o_m @ R_l_m[2])
         self.tilt_rad = float(np.linalg.norm(se3.so3_log(R_l_m)))
         if not first or self._renewed or self.tilt_rad < _MIN_TILT_RAD:
             return None

@@ -83,6 +83,19 @@ def test_what_leans_hardly_is_left_and_patience_ends() -> None:
     np.testing.assert_array_equal(patient.R_l_o, np.eye(3))
 
 
+def test_samples_that_begin_late_set_the_map_upright_but_turn_no_controller() -> None:
+    knows = Knows()
+    aligner = GravityAligner(CAMERA, knows)
+    for t_s in (0.0, 2.1):
+        assert aligner.update(round(1e9 * t_s), np.eye(4), np.eye(3), SubmapId(0), first=True) is None
+    knows.up = se3.so3_exp(np.array([0.3, 0.0, 0.0]))
+    level = aligner.update(round(4e9), np.eye(4), np.eye(3), SubmapId(0), first=True)
+    assert level is not None and aligner.tilt_rad == pytest.approx(0.3)
+    np.testing.assert_allclose(level.T_l_m[:3, :3], knows.up, atol=1e-4)
+    np.testing.assert_array_equal(aligner.R_l_o, np.eye(3))  # what it was told is not taken back
+    assert aligner.update(round(5e9), np.eye(4), np.eye(3), SubmapId(0), first=True) is None
+
+
 def test_gravity_is_known_after_five_frames_in_motion() -> None:
     rng = np.random.default_rng(4)
     errors = []
