@@ -86,6 +86,10 @@ class SampleClock:
 
     def _taken_ns(self, stamps_ns: I64) -> I64:
         """Times (n,) of new samples; the stamps (n,) themselves where they are even or tell no rate."""
+        steps_ns = np.diff(stamps_ns)
+        silences = 1 + np.flatnonzero((steps_ns < 0) | (steps_ns >= 1e9 * _SILENT_S))
+        if len(silences):  # a recording that paused: frames did not come either
+            return np.concatenate([self._taken_ns(part) for part in np.split(stamps_ns, silences)])
         old = self._stamps_ns
         if len(old) and not 0 <= int(stamps_ns[0]) - int(old[-1]) < 1e9 * _SILENT_S:
             self._begin_again()

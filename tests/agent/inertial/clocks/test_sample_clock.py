@@ -85,6 +85,18 @@ def test_after_a_silence_or_a_clock_that_was_set_back_it_begins_again() -> None:
     assert clock.timed(None) is None
 
 
+@pytest.mark.parametrize("rate_hz", [400, 1000])
+@pytest.mark.parametrize("silence_ns", [3 * 10**9, 100 * 10**9])
+def test_a_silence_within_a_batch_is_no_scatter(rate_hz: int, silence_ns: int) -> None:
+    """A recording that paused: the samples before and after come with the same frame."""
+    stamps = 7_000_000_000 + 1_000_000_000 // rate_hz * np.arange(3000, dtype=np.int64)
+    stamps[1004:] += silence_ns
+    clock = SampleClock()
+    numbers, times = timed(clock, stamps)
+    assert np.array_equal(times, stamps) and len(numbers) == 3000
+    assert clock.jitter_s == 0.0 and clock.take_events() == []
+
+
 def test_a_batch_of_many_uneven_samples() -> None:
     clock, stamps = SampleClock(), in_bursts(16_000_000)
     values = np.zeros((len(stamps), 3))
