@@ -143,9 +143,10 @@ def encode_depth(depth_m: F32) -> EncodedImage:
 
 def _imdecode(image: EncodedImage, flags: int) -> NDArray[np.generic]:
     size = size_of(image.data)
-    if size is None or not 0 < size[0] * size[1] <= MOST_PIXELS:
-        found = "no size" if size is None else f"{size[0]}x{size[1]} px"
-        raise BadImage(f"an image with {found}: expected at most {MOST_PIXELS} pixels")
+    if size is None:
+        raise BadImage(f"{len(image.data)} bytes of {image.format} are cut or damaged")
+    if not 0 < size[0] * size[1] <= MOST_PIXELS:
+        raise BadImage(f"an image with {size[0]}x{size[1]} px: expected at most {MOST_PIXELS} pixels")
     try:
         pixels = cv2.imdecode(np.frombuffer(image.data, np.uint8), flags)
     except cv2.error as error:

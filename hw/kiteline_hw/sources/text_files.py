@@ -136,7 +136,7 @@ def yaml_number(table: Yaml, key: str, path: Path, default: float | None = None)
     except ValueError:
         number = float("nan")
     if not np.isfinite(number):
-        raise SourceError(f"{path}: expected {key}: a number, found {'nothing' if value is None else value!r}")
+        raise SourceError(f"{path}: expected {key}: a number, found {'nothing' if value is None else repr(value)}")
     return number
 
 
