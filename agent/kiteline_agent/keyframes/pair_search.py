@@ -28,6 +28,10 @@ class Fault(Enum):
         "images: the right one shows hardly anything of what the left one shows: check that they are not exchanged, of "
         "one instant and of one pair of cameras, the lenses, and the calibration"
     )
+    PARALLAX = (
+        "images: no two views of one camera tell depths, and there is no pose before: move it sideways, do not only "
+        "turn it; or there are too few corners: dark, blurred, or of something plain"
+    )
 
 
 class PairSearch:

@@ -13,11 +13,12 @@ from kiteline_agent.initialisation.two_view_start import TwoViewStart
 from kiteline_agent.initialisation.window import lens_correction
 from kiteline_agent.keyframes.depth_from_motion import DepthFromMotion
 from kiteline_agent.keyframes.keyframe_maker import KeyframeMaker
+from kiteline_agent.keyframes.pair_search import Fault
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.mapping.camera_state import CameraState
 from kiteline_agent.mapping.earlier_views import earlier_views
 from kiteline_agent.mapping.keyframe_stage import KeyframeStage
-from kiteline_agent.mapping.start_watch import StartWatch
+from kiteline_agent.mapping.start_watch import VIEWS_S, StartWatch
 from kiteline_agent.mapping.submaps import TRACKED_M, TRACKED_RAD
 from kiteline_agent.motion.loss_motion import LossMotion
 from kiteline_agent.relocalisation.relocaliser import Relocaliser
@@ -80,7 +81,7 @@ class SubmapStage:
         self._channel = channel
         self._loss: _Loss | None = None
         self._warnings: list[str] = []
-        self._start_watch = StartWatch()
+        self._start_watch, self._views_watch = StartWatch(), StartWatch(VIEWS_S)
 
     def may_open(self, failed_searches: int) -> bool:
         """True if there is no map yet, or the search for the old one failed and ids and CPU time are left."""
@@ -209,6 +210,8 @@ class SubmapStage:
             camera.set_first_pose(ctx.imu)  # the camera moves from here on
         two_views = start.add(ctx)
         if two_views is None:
+            if not camera.submaps.any:
+                self._warnings += self._views_watch.note(ctx.t_ns, Fault.PARALLAX)
             return None
         if camera.submaps.any:
             camera.leave_submap()

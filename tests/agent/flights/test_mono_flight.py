@@ -14,7 +14,8 @@ from kiteline_agent.governor.cost_model import Work
 from kiteline_agent.imaging.features import DetectorConfig, build_pyramid
 from kiteline_agent.initialisation.two_view_start import TwoViewStart
 from kiteline_agent.keyframes.depth_from_motion import triangulated_sigma
-from kiteline_agent.step import Estimate, Identity
+from kiteline_agent.keyframes.pair_search import Fault
+from kiteline_agent.step import Estimate, Identity, StepInput
 from kiteline_agent.tracking.frame_images import FrameImages
 from kiteline_agent.tracking.track import Track
 from kiteline_codec.channel import plain_pair
@@ -51,6 +52,15 @@ def test_a_room_is_followed_at_a_scale_of_its_own(flown: tuple[Agent, list[Estim
     # What flies must not jump when the map begins.
     moves = np.diff([e.T_o_b[:3, 3] for e in estimates], axis=0)
     assert np.linalg.norm(moves, axis=1).max() < 0.15 / scale
+
+
+def test_a_camera_that_stands_is_told_once_to_move() -> None:
+    one, still, told = agent(), frame(0), []
+    for k in range(30):
+        t_ns = still.t_ns + 500_000_000 * k
+        output = one.step(StepInput(frame=replace(still, t_ns=t_ns)), t_ns)
+        told += [(0.5 * k, event) for event in output.events if event.startswith("images:")]
+    assert told == [(10.0, Fault.PARALLAX.value)]
 
 
 def test_bearings_find_their_true_depth(flown: tuple[Agent, list[Estimate]]) -> None:
