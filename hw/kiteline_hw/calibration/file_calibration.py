@@ -19,7 +19,8 @@ class FileCalibration:
 
     cameras: none, the left one, or left and right. T_c_r: (4,4) right camera in the left one. T_b_c: (4,4) left camera
     in the body, which is the IMU; None: not given. topics: of the cameras in a bag, "" where not given. known: False
-    for a stand-in where nothing is calibrated yet, whose size is that of the images.
+    for a stand-in where nothing is calibrated yet, whose size is that of the images. without_imu: T_b_c is in the frame
+    that EuRoC's sensor.yaml share, and no file says where the IMU is in it.
     """
 
     where: str
@@ -29,6 +30,7 @@ class FileCalibration:
     imu: ImuCalibration | None = None
     topics: tuple[str, ...] = ()
     known: bool = True
+    without_imu: bool = False
 
     def rig_of_images(self, name: str, count: int, size: tuple[int, int]) -> CameraRig:
         """The rig of a source's images: one camera or two, (height, width). Raises SourceError if they are too many."""
@@ -79,7 +81,7 @@ def joined(parts: Sequence[FilePart]) -> FileCalibration:
     if len(parts) == 1:
         only = parts[0]
         given = only.calibration
-        return given if only.T_s_c is None else replace(given, T_b_c=only.T_s_c)
+        return given if only.T_s_c is None else replace(given, T_b_c=only.T_s_c, without_imu=True)
     where = ", ".join(p.where for p in parts)
     eyes = [p for p in parts if p.calibration.cameras]
     imus = [p for p in parts if p.calibration.imu is not None]
@@ -90,16 +92,17 @@ def joined(parts: Sequence[FilePart]) -> FileCalibration:
     if not eyes:
         return FileCalibration(where, imu=imu)
     first = eyes[0].calibration
-    T_b_c = first.T_b_c
+    T_b_c, without_imu = first.T_b_c, False
     T_s_i = next((p.T_s_i for p in imus if p.T_s_i is not None), None)
     if eyes[0].T_s_c is not None:
+        without_imu = T_s_i is None
         T_b_c = eyes[0].T_s_c if T_s_i is None else se3.inverse(T_s_i) @ eyes[0].T_s_c
     if len(eyes) == 1:
-        return replace(first, where=where, T_b_c=T_b_c, imu=imu)
+        return replace(first, where=where, T_b_c=T_b_c, imu=imu, without_imu=without_imu)
     left, right = eyes
     T_c_r = _between(left, right)
     cameras, topics = (left.calibration.cameras + right.calibration.cameras), (first.topics + right.calibration.topics)
-    return FileCalibration(where, cameras, T_c_r, T_b_c, imu, topics)
+    return FileCalibration(where, cameras, T_c_r, T_b_c, imu, topics, without_imu=without_imu)
 
 
 def _between(left: FilePart, right: FilePart) -> F64 | None:

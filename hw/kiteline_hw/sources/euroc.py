@@ -81,6 +81,7 @@ def _open_by_sensor_files(folder: Path, mav: Path, mono: bool, imu: bool) -> Rec
         f"euroc:{folder}", rig, len(images[0]), lambda report: _read_frames(images, report),
         noise if imu else None,
         _read_ground_truth(folder, mav, T_s_i), lambda report: _read_imu(mav / "imu0" / "data.csv", report),
+        T_s_b=T_s_i,
     )  # fmt: skip
 
 

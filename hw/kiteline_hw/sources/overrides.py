@@ -12,6 +12,7 @@ from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraModel
 from kiteline_hw.calibration.file_calibration import FileCalibration
 from kiteline_hw.ports import FrameSource, LiveSource, SourceError, is_live
+from kiteline_hw.sources.recording import Recording
 
 
 class SourceView:
@@ -109,6 +110,8 @@ class _CalibratedView(SourceView):
             for model, old, side in ((new.left, rig.left, "left"), (new.right, rig.right, "right")):
                 _check_size(model, old, f"{given.where}: {side} camera", source.name)
             T_b_c, has_body = (new.T_b_c, True) if new.has_body else (rig.T_b_c, rig.has_body)
+            if given.without_imu and isinstance(source, Recording) and source.T_s_b is not None:
+                T_b_c = se3.inverse(source.T_s_b) @ T_b_c
             self.rig = replace(rig, left=new.left, right=new.right, T_c_r=new.T_c_r, T_b_c=T_b_c, has_body=has_body)
             if not rig.has_body:
                 self._T_old_new = rig.T_b_c @ se3.inverse(T_b_c)

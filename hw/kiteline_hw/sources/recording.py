@@ -24,7 +24,10 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".bmp", ".tif", ".tif
 
 @dataclass(slots=True)
 class Recording:
-    """A FrameSource that starts anew with each iteration. frames: the images in order of time, still encoded."""
+    """A FrameSource that starts anew with each iteration. frames: the images in order of time, still encoded.
+
+    T_s_b: (4,4) body in the frame that EuRoC's sensor.yaml share; None without such files.
+    """
 
     name: str
     rig: CameraRig
@@ -34,6 +37,7 @@ class Recording:
     ground_truth: Trajectory | None = None
     samples: Callable[[SourceReport], ImuSamples] | None = None
     report: SourceReport = field(default_factory=SourceReport)
+    T_s_b: F64 | None = None
 
     def __iter__(self) -> Iterator[Frame | ImuBatch]:
         self.report.clear()

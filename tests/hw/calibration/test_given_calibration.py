@@ -16,6 +16,7 @@ from kiteline_hw.ports import SourceError
 from kiteline_hw.sources.open import open_source
 from tests.hw.calibration.test_calibration_files import CHAIN, IMU
 from tests.hw.sources.ros2_bags import stereo_bag
+from tests.hw.sources.test_folders import add_imu, euroc
 
 T_ns = 1520530308199447626
 
@@ -128,6 +129,18 @@ def test_own_calibration_of_a_recording_told_again_changes_nothing(data_dir: Pat
     np.testing.assert_array_equal(given.rig.T_c_r, plain.rig.T_c_r)
     np.testing.assert_allclose(given.rig.T_b_c, plain.rig.T_b_c, atol=1e-15)
     np.testing.assert_array_equal(given.ground_truth.T_w_b, plain.ground_truth.T_w_b)
+
+
+@pytest.mark.parametrize("names", [("cam0",), ("cam0", "cam1")])
+def test_cameras_of_an_euroc_folder_told_again_stay_where_its_imu_is(tmp_path: Path, names: tuple[str, ...]) -> None:
+    """Their T_BS are in a frame in which the IMU need not be at the origin."""
+    root = euroc(tmp_path)
+    T_s_i = se3.exp(np.array([0.1, 0.2, 0.3, 0.4, -0.5, 0.6]))
+    add_imu(root, T_s_i, [f"{1000 + i * 5_000_000},0,0,0,0,0,9.8" for i in range(40)])
+    source = open_source(str(root), mono=len(names) == 1)
+    told = ",".join(str(root / "mav0" / name / "sensor.yaml") for name in names)
+    again = open_source(str(root), mono=len(names) == 1, calibration=told)
+    np.testing.assert_allclose(again.rig.T_b_c, source.rig.T_b_c, atol=1e-12)
 
 
 def test_truth_of_camera_poses_becomes_that_of_the_told_body(data_dir: Path, tmp_path: Path) -> None:
