@@ -43,6 +43,7 @@ from kiteline_hw.sources.mcap_messages import (
     ChannelKind,
     MessageDecoder,
     Transform,
+    fits_log_clock,
     is_depth,
     read_calibration,
     read_child_frame,
@@ -360,20 +361,22 @@ class McapSource:
         wanted += inertial
         if self._odometer_channel is not None:
             wanted.append(self._odometer_channel)
+        log_clock = {c: fits_log_clock(self._each(c, lambda m, log_ns: (read_stamp(m, 0), log_ns))) for c in wanted}
         newest = dict.fromkeys(wanted, 0)
         heap: list[tuple[int, int, int, int, Any]] = []
         order = 0
         for raw in self._file.messages(wanted):
+            unstamped_ns = raw.log_ns if log_clock[raw.channel] else 0
             try:
                 message = self._decode(raw)
                 if raw.channel in inertial:
-                    items: list[tuple[int, Any]] = list(read_imu(message, raw.log_ns))
+                    items: list[tuple[int, Any]] = list(read_imu(message, unstamped_ns))
                 elif raw.channel == self._odometer_channel:
-                    batch = read_velocities(message, raw.log_ns)
+                    batch = read_velocities(message, unstamped_ns)
                     items = [(int(batch.t_ns[-1]), batch)] if len(batch.t_ns) else []
                 else:
                     metadata = self._file.channels[raw.channel].metadata
-                    items = [(read_stamp(message, raw.log_ns), read_image(message, metadata))]
+                    items = [(read_stamp(message, unstamped_ns), read_image(message, metadata))]
             except BadMessage as error:
                 self.report.skip("unreadable message", str(error))
                 continue

@@ -3,9 +3,10 @@
 import base64
 import json
 import struct
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from enum import Enum
+from itertools import islice
 from types import SimpleNamespace
 from typing import Any
 
@@ -25,6 +26,9 @@ from kiteline_hw.sensors.raw_pixels import BadImage, RawPixels
 from kiteline_hw.sources.bags.ros2_samples import fast_decoder
 
 F64 = NDArray[np.float64]
+
+_LOOKED_AT = 20  # messages of a channel, of which the first stamp that is not 0 is compared with its log time
+_OTHER_CLOCK_NS = 3_600_000_000_000  # ns between stamp and log time, from which they are of two clocks
 
 
 class ChannelKind(Enum):
@@ -133,6 +137,15 @@ def read_stamp(message: Any, otherwise_ns: int) -> int:
     except (AttributeError, TypeError, ValueError):
         return otherwise_ns
     return t or otherwise_ns
+
+
+def fits_log_clock(messages: Iterable[tuple[int, int]]) -> bool:
+    """True if the log time may stand in for a stamp of 0. messages: stamp and log time in ns of a channel.
+
+    In simulated time, which begins at 0, the recorder's clock is another one, and 0 is a time.
+    """
+    stamped = next(((t, log_ns) for t, log_ns in islice(messages, _LOOKED_AT) if t), None)
+    return stamped is None or abs(stamped[1] - stamped[0]) < _OTHER_CLOCK_NS
 
 
 def read_frame_id(message: Any) -> str:

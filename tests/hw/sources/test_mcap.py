@@ -130,6 +130,21 @@ def test_messages_written_out_of_order_come_in_order(tmp_path: Path) -> None:
     check_stereo(open_source(str(bag.write(tmp_path / "a.mcap"))), 20)
 
 
+@pytest.mark.parametrize("simulated", [True, False])
+def test_a_stamp_of_0_is_a_time_where_the_recorder_has_another_clock(tmp_path: Path, simulated: bool) -> None:
+    """Simulated time begins at 0; in a bag of one clock a message without a stamp counts from its recording."""
+    bag = stereo_bag()
+    for k, (t_ns, topic, kind, value) in enumerate(bag.messages):
+        if "header" in value and (simulated or t_ns == START_NS):
+            since_ns = t_ns - START_NS
+            stamp = {"sec": since_ns // 10**9, "nanosec": since_ns % 10**9}
+            bag.messages[k] = (t_ns, topic, kind, {**value, "header": {**value["header"], "stamp": stamp}})
+    frames, batches = read(open_source(str(bag.write(tmp_path / "bag.mcap"))))
+    begin_ns = 0 if simulated else START_NS
+    assert [f.t_ns for f in frames] == [begin_ns + i * STEP_NS for i in range(6)]
+    assert batches[0].t_ns[0] == begin_ns and all(f.right is not None for f in frames)
+
+
 def test_late_recorded_samples_come_in_order_of_their_stamps(tmp_path: Path) -> None:
     bag = Bag()
     bag.tf(START_NS, "imu", "left_optical", T_B_L)
