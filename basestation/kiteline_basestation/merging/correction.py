@@ -16,7 +16,7 @@ from kiteline_basestation.merging.loop_edges import LoopEdge, depth_of, graph_ed
 from kiteline_basestation.refinement.bundle_window import BundleWindow, bundle_window
 from kiteline_basestation.refinement.full_bundle_schedule import Part
 from kiteline_codec.schema import KeyframePose, RefinedLandmarks
-from kiteline_core.arrays import F64, I32, Bool
+from kiteline_core.arrays import F64, I32, I64, Bool
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import KeyframeId, SubmapId, submap_of_keyframe
 
@@ -44,7 +44,11 @@ def _posed_rows(sparse_map: SparseMap, map_id: SubmapId) -> I32:
 def essential_graph_of(
     sparse_map: SparseMap, map_id: SubmapId, loops: Sequence[LoopEdge], config: GraphConfig
 ) -> GraphInputs | None:  # fmt: skip
-    """The essential graph of a map, fixed at the first keyframe of its root submap; None with fewer than two."""
+    """The essential graph of a map, fixed at the first keyframe of its root submap; None with fewer than two.
+
+    Parts that no edge ties to that keyframe are fixed at their own first ones: a user merged them without matches, or
+    what they matched was split off.
+    """
     rows = _posed_rows(sparse_map, map_id)
     if len(rows) < 2:
         return None
@@ -64,8 +68,9 @@ def essential_graph_of(
     loop_sigma = np.array(
         [[_SIGMA_M + _LOOP_SIGMA_DEPTH * depth_of(sparse_map, e), _LOOP_SIGMA_RAD] for e in inside]
     ).reshape(-1, 2)  # fmt: skip
-    held = np.zeros(len(keyframes), np.bool_)
-    held[number[KeyframeId(sparse_map.submaps[sparse_map.map_id(map_id)][0])]] = True
+    root = sparse_map.map_id(map_id)
+    first = next((i for i, k in enumerate(keyframes) if submap_of_keyframe(k) == root), 0)
+    held = _first_of_parts(len(keyframes), np.concatenate([edges, loop_pairs]), first)
     own = {s for s in sparse_map.submaps_of_map(map_id) if sparse_map.is_up_to_scale(s)}
     scaled = None
     if own:
@@ -80,6 +85,21 @@ def essential_graph_of(
         np.concatenate([np.zeros(len(edges), np.bool_), np.ones(len(loop_pairs), np.bool_)]), config, scaled,
         level_of(sparse_map, keyframes),
     )  # fmt: skip
+
+
+def _first_of_parts(count: int, edges: I64, first: int) -> Bool:
+    """Whether each of the nodes 0..count is the lowest one of its connected part; `first` counts as the lowest of all.
+
+    edges: (m,2).
+    """
+    part = np.arange(count)
+    part[first] = -1
+    while True:
+        low = part.copy()
+        np.minimum.at(low, edges, part[edges[:, ::-1]])
+        if np.array_equal(low, part):
+            return np.asarray((part == np.arange(count)) | (np.arange(count) == first))
+        part = np.where(low < 0, -1, low[low])
 
 
 def move_keyframes(

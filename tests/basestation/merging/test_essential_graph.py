@@ -1,14 +1,21 @@
 """Pose graphs with and without scales."""
 
 import time
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
+import pytest
 
 from kiteline_basestation.config import GraphConfig
+from kiteline_basestation.mapper import Mapper, MapperInput
+from kiteline_basestation.merging.correction import essential_graph_of
 from kiteline_basestation.merging.essential_graph import GraphInputs, Scaled, optimise, residuals
 from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3, sim3
+from kiteline_core.ids import submap_of_keyframe
+from tests.basestation.feeding import WITHOUT_GRID, feed
 from tests.yardstick import slowness
 
 
@@ -185,3 +192,34 @@ def test_a_thousand_keyframes_with_scales_take_milliseconds() -> None:
     begin = time.process_time()
     optimise(inputs)
     assert time.process_time() - begin < 0.3 * slowness()  # 0.05 s on an idle core
+
+
+@pytest.mark.parametrize("stereo", [True, False])
+def test_parts_that_no_edge_ties_stay_where_they_are(make_flight: Callable[..., Any], stereo: bool) -> None:
+    """As where a user merged maps by a transform: their graph could not be solved, and loops were not corrected."""
+    a = make_flight(keyframes=10, turns=0.2)
+    b = make_flight(keyframes=10, turns=0.2, seed=9, agent=1, stereo=stereo)
+    mapper = Mapper(WITHOUT_GRID)
+    feed(mapper, [b, a])
+    older, newer = (submap_of_keyframe(flight.keyframes[0]) for flight in (b, a))
+    mapper.map.root_submaps[newer] = older  # the map is named after the higher id
+    graph = essential_graph_of(mapper.map, older, [], GraphConfig())
+    assert graph is not None
+    assert set(graph.keyframes[graph.held].tolist()) == {a.keyframes[0], b.keyframes[0]}
+    assert np.allclose(optimise(graph).T_w_k, graph.T_w_k, atol=1e-6)
+
+
+def test_a_first_keyframe_without_a_pose_is_left_out(make_flight: Callable[..., Any]) -> None:
+    """Its parent never came, and it came after the submap was begun without it: the next loop ended the base."""
+    flight = make_flight(keyframes=12, turns=0.3)
+    mapper = Mapper(WITHOUT_GRID)
+    feed(mapper, [replace(flight, records=flight.records[4:])])
+    for _ in range(3):
+        mapper.step(MapperInput(()), 100_000_000_000)
+    mapper.step(MapperInput(((flight.agent, tuple(flight.records[2])),)), 101_000_000_000)
+    first, second = flight.keyframes[2], flight.keyframes[4]
+    assert mapper.map.submaps[submap_of_keyframe(first)][:2] == [first, second] and mapper.map.pose(first) is None
+    graph = essential_graph_of(mapper.map, submap_of_keyframe(first), [], GraphConfig())
+    assert graph is not None
+    assert graph.keyframes[graph.held].tolist() == [second]
+    optimise(graph)
