@@ -14,7 +14,7 @@ from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.exchange.publisher import Publisher
 from kiteline_basestation.inertial.ties import InertialTie
 from kiteline_basestation.jobs import Job, JobDone
-from kiteline_basestation.map.map_tables import LANDMARK
+from kiteline_basestation.map.map_tables import REFINED
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.merging import loop_consistency as consistency
 from kiteline_basestation.merging.correction import apply_scales, keyframes_of, move_keyframes, scale_map
@@ -29,13 +29,13 @@ from kiteline_basestation.merging.loop_detector import (
 )
 from kiteline_basestation.merging.loop_edges import LoopEdge, LoopMatch, rescaled, slot_pairs
 from kiteline_basestation.merging.loop_verification import MAX_NEIGHBOURS
-from kiteline_basestation.merging.merges import NOTHING, MapMerge, MergeResult, is_contradicted
+from kiteline_basestation.merging.merges import NOTHING, MapMerge, MergeResult, fused_across, is_contradicted
 from kiteline_basestation.refinement import disparity_calibration as disparity
 from kiteline_basestation.refinement import landmark_matching
 from kiteline_basestation.refinement.apply_bundle import apply_bundle, keep_scales
 from kiteline_basestation.refinement.bundle_window import MIN_SHARED
 from kiteline_basestation.refinement.odometry_factors import without_odometry_factors
-from kiteline_codec.schema import FusedLandmarks
+from kiteline_codec.schema import FusedLandmarks, RefinedLandmarks
 from kiteline_core.arrays import F64
 from kiteline_core.geometry import sim3
 from kiteline_core.ids import SEQUENCE_BITS, KeyframeId, SubmapId, submap_of_keyframe
@@ -235,7 +235,7 @@ class MapMerger:
 
     def undo(self, merge: MapMerge) -> MergeResult:
         """Separate a merged map again: move it back, and unfuse its landmarks from those of the other map."""
-        sparse_map, table = self._map, self._map.keypoints
+        sparse_map = self._map
         at, split = self.merges.index(merge), frozenset(merge.moved)
         rest = sparse_map.map_id(merge.into)  # it may have been merged into another map since
         self.merges.remove(merge)
@@ -248,11 +248,11 @@ class MapMerger:
         ]
         self._unfused.pop(rest, None)
         self._requery = [k for k in self._requery if submap_of_keyframe(k) not in split]
-        inside = np.isin(sparse_map.keyframes.id[table.row[: sparse_map.slots]] >> SEQUENCE_BITS, sorted(split))
-        roots = table.root[: sparse_map.slots]
-        across = np.flatnonzero((roots >= 0) & (inside != inside[np.maximum(roots, 0)])).astype(np.int32)
-        sparse_map.unfuse(across[table.kind[across] == LANDMARK])
-        self._publisher.mark_changed_slots(FusedLandmarks.KIND, across[table.kind[across] == LANDMARK])
+        fused = fused_across(sparse_map, split)
+        sparse_map.unfuse(fused)
+        self._publisher.mark_changed_slots(FusedLandmarks.KIND, fused)
+        refined = fused[sparse_map.keypoints.flags[fused] & REFINED != 0]  # not sent while they had another root
+        self._publisher.mark_changed_slots(RefinedLandmarks.KIND, refined)
         for submap, S_w_m in merge.moved.items():
             sparse_map.root_submaps.pop(submap, None)
             if submap != merge.map_id:

@@ -6,9 +6,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from kiteline_basestation.config import BaseConfig
+from kiteline_basestation.map.map_tables import LANDMARK
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.refinement.bundle_window import BundleWindow
-from kiteline_core.arrays import F64, I64
+from kiteline_core.arrays import F64, I32, I64
 from kiteline_core.ids import SEQUENCE_BITS, KeyframeId, SubmapId
 from kiteline_core.optimisation.bundle import BundleResult
 
@@ -50,6 +51,15 @@ def is_contradicted(
     if int(np.count_nonzero(moved)) < config.loops.min_inliers:
         return False
     return float(np.mean(result.inlier[moved])) < _MIN_KEPT
+
+
+def fused_across(sparse_map: SparseMap, submaps: Collection[SubmapId]) -> I32:
+    """Slots (n,) of landmarks that are fused with others, one of the two in some submaps and the other not."""
+    table, n = sparse_map.keypoints, sparse_map.slots
+    inside = np.isin(sparse_map.keyframes.id[table.row[:n]] >> SEQUENCE_BITS, sorted(submaps))
+    root = table.root[:n]
+    across = (table.kind[:n] == LANDMARK) & (root >= 0) & (inside != inside[np.maximum(root, 0)])
+    return np.flatnonzero(across).astype(np.int32)
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,6 +14,7 @@ from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.job_kinds import run_job
 from kiteline_basestation.jobs import Job, JobDone
 from kiteline_basestation.management import Command
+from kiteline_basestation.map.map_tables import REFINED
 from kiteline_basestation.mapper import Mapper, MapperInput
 from kiteline_basestation.merging import map_merger
 from kiteline_basestation.merging.loop_detector import Contradiction
@@ -27,11 +28,12 @@ from kiteline_codec.schema import (
     KeyframePose,
     NewLandmarks,
     Record,
+    RefinedLandmarks,
     SubmapPlacement,
 )
 from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
-from kiteline_core.ids import SEQUENCE_BITS, SubmapId, submap_of_keyframe
+from kiteline_core.ids import SEQUENCE_BITS, KeyframeId, SubmapId, submap_of_keyframe
 from tests.basestation.feeding import STEP_NS, WITHOUT_GRID, feed
 
 MakeFlight = Callable[..., Any]
@@ -187,6 +189,28 @@ def test_submap_after_a_loss_is_merged_and_split_again(make_flight: MakeFlight, 
     assert output.withdrawn == ((a.agent, Key(SubmapPlacement.KIND, young, 0)),)  # its place was the merge's
     assert young not in mapper.placements and submap_of_keyframe(a.keyframes[0]) in mapper.placements
     assert mapper.step(MapperInput(((a.agent, ()),)), 10**12 + STEP_NS).withdrawn == ()
+
+
+def test_refined_landmarks_are_sent_when_they_are_split_off(make_flight: MakeFlight, words: Any) -> None:
+    """While they were fused with others, a record that replaced an earlier one left them out."""
+    a = make_flight(keyframes=20, turns=0.6)
+    b = make_flight(keyframes=20, turns=0.6, start=0.3, variant=1, agent=1, T_w_m=ELSEWHERE)
+    mapper = Mapper(WITHOUT_GRID, words)
+    published = feed(mapper, [a, b])
+    table = mapper.map.keypoints
+    slots = np.flatnonzero(table.flags[: mapper.map.slots] & REFINED != 0)
+    fused = slots[table.root[slots] != slots]
+    mapper._publisher.mark_changed_slots(RefinedLandmarks.KIND, fused.astype(np.int32))  # as by the next bundle
+    split = Command(1, "split", '{"map": "1.1.0"}')
+    for n in range(-5, 5):  # in which no bundle ends, that would refine them anew
+        output = mapper.step(MapperInput((), (), () if n else (split,)), 10**12 + n * STEP_NS)
+        published += [record for _, records in output.publish for record in records]
+    told = {record.keyframe: set(record.index) for record in published if isinstance(record, RefinedLandmarks)}
+    live = mapper.map.live_landmarks()
+    assert mapper.map.is_live(fused).any()
+    for slot in live[table.flags[live] & REFINED != 0].tolist():
+        keyframe = int(mapper.map.keyframes.id[table.row[slot]])
+        assert mapper.map.keypoint_of(np.array([slot]))[0] in told[KeyframeId(keyframe)]
 
 
 def test_undoing_an_inner_merge_cancels_the_jobs_of_the_outer_map(make_flight: MakeFlight, words: Any) -> None:
