@@ -210,6 +210,7 @@ class CodedChannel:
         if self._is_of_another_start(key):
             self._aside[key] = code
         else:
+            self._aside.pop(key, None)  # of an earlier start whose session has the same few bits
             self.endpoint.put(key, code)
         if isinstance(record, KeyframeHeader):
             self._pacer.keyframe(record.t_ns)

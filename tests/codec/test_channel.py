@@ -199,3 +199,17 @@ def test_a_new_start_of_an_agent_gets_nothing_of_keyframes_that_earlier_ones_mad
     assert base.endpoint.quiet
     base.remove(key)
     assert base.own_value(key) is None and base.endpoint.quiet
+
+
+def test_what_a_base_says_last_counts_when_boots_look_alike() -> None:
+    """A session tells six bits of the boot: after 64 starts keyframes of an early one look as of the present one, and
+    the store of the base kept what it had said of them in between.
+    """
+    base = coded_channel(1, peer=AgentId(3))
+    pose = KeyframePose(keyframe_id(submap_id(3, 1, 0), 5), POSE.T_m_k)
+    cross(coded_channel(agent_session(2, 2)), base)
+    base.put(pose)
+    cross(coded_channel(agent_session(65, 65)), base)
+    newer = base.put(replace(pose, T_m_k=np.eye(4)))
+    key = messages.key(pose)
+    assert base.own_value(key) == base.own_values()[key] == messages.encode(newer)
