@@ -25,11 +25,18 @@ from kiteline_basestation.merging.loop_verification import (
 )
 from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3, sim3
-from kiteline_core.ids import AgentId, KeyframeId, SubmapId, agent_of_keyframe, submap_of_keyframe
+from kiteline_core.ids import (
+    SEQUENCE_BITS,
+    SUBMAP_BITS,
+    KeyframeId,
+    SubmapId,
+    agent_of_keyframe,
+    submap_of_keyframe,
+)
 from kiteline_core.places.place_index import PlaceIndex, Vocabulary
 
 SubmapPair = tuple[SubmapId, SubmapId]  # the smaller id first
-_Frame = tuple[AgentId, int]  # an agent, and a time stamp
+_Frame = tuple[int, int]  # a start of an agent, whose clock compares with no other one, and a time stamp
 
 _QUERIED = 12  # places queried for each candidate that is verified: most are of neighbouring keyframes
 _SAME_VIEW_COSINE = 0.5  # of the angle between optical axes: views of one place from nearby
@@ -84,7 +91,7 @@ class LoopDetector:
         self._sharing = SharingPolicy(config.share)
         self._matches: dict[SubmapPair, list[LoopMatch]] = {}
         self._contradicted: dict[SubmapPair, int] = {}  # how often matches contradicted a merge of two submaps
-        self._frames: dict[KeyframeId, _Frame] = {}  # agent and time of each keyframe of the index
+        self._frames: dict[KeyframeId, _Frame] = {}  # of each keyframe of the index
         self._of_frame: dict[_Frame, list[KeyframeId]] = {}
         self._first_seen: dict[SubmapId, int] = {}  # order in which submaps were first seen
         self.kept_apart: list[tuple[frozenset[SubmapId], frozenset[SubmapId]]] = []  # maps that a user has split
@@ -115,7 +122,7 @@ class LoopDetector:
                 del self._of_frame[frame]
 
     def _frame_of(self, keyframe: KeyframeId) -> _Frame:
-        return agent_of_keyframe(keyframe), int(self._map.keyframes.t_ns[self._map.rows[keyframe]])
+        return keyframe >> SEQUENCE_BITS + SUBMAP_BITS, int(self._map.keyframes.t_ns[self._map.rows[keyframe]])
 
     def forget(self, submaps: Collection[SubmapId]) -> None:
         """Drop the matches of deleted submaps."""

@@ -157,6 +157,15 @@ def test_two_keyframes_suffice_where_two_of_the_other_map_match(
         assert np.sqrt(np.mean(joint_error_m(mapper, [first, second]) ** 2)) < 0.03
 
 
+def test_equal_stamps_of_two_starts_are_not_one_frame(make_flight: MakeFlight, words: Any) -> None:
+    """The clock begins anew with the agent, as in a simulator: two rooms lay in each other, merged again and again."""
+    flights = [make_flight(keyframes=10, turns=0.2), make_flight(keyframes=10, turns=0.2, seed=9, boot=2)]
+    mapper = Mapper(WITHOUT_GRID, words)
+    feed(mapper, flights)
+    assert mapper.summary()["maps"] == 2
+    assert mapper.summary()["merges"] == mapper.summary()["merges_undone"] == 0
+
+
 def test_agents_share_maps_within_groups(make_flight: MakeFlight, words: Any) -> None:
     flights = [
         make_flight(keyframes=16, turns=0.45, start=0.3 * n, variant=n, agent=n, T_w_m=se3.exp(np.full(6, 0.2 * n)))
