@@ -134,6 +134,7 @@ class Mapper:
             changes += changed
         # 3. Refine the map with each new keyframe, and search for loop closures and merges.
         ready = self._intake.ready(now_ns)
+        self._placements.tell_rooted()
         for keyframe in ready:
             changes += self._add_keyframe(keyframe)
         if self._placements.follow_ties():

@@ -77,6 +77,7 @@ class Intake:
         self.fresh_ties: set[SubmapId] = set()  # of those, the ones that no placement follows yet
         self.last_contact_ns: dict[AgentId, int] = {}
         self.deleted: set[SubmapId] = set()  # records of these submaps are ignored
+        self._rooted: list[KeyframeId] = []  # at which submaps begin without their first keyframe, not taken yet
         self._scans: list[KeyframeScan] = []  # that arrived and were not taken yet
         self._images: list[ScanImages] = []  # the same
         self.inertial_ties = InertialTies(sparse_map)
@@ -122,6 +123,11 @@ class Intake:
         """The images of scans that arrived since the last call."""
         images, self._images = self._images, []
         return images
+
+    def take_rooted(self) -> list[KeyframeId]:
+        """Keyframes that were given a pose since the last call: their submaps begin there, without their first ones."""
+        rooted, self._rooted = self._rooted, []
+        return rooted
 
     def ready(self, now_ns: int) -> list[KeyframeId]:
         """Keyframes to use now, in order of id: complete ones, those past the patience, and late completions."""
@@ -265,6 +271,7 @@ class Intake:
                 table, row = self._map.keyframes, self._map.rows[keyframes[0]]
                 if table.parent[row] != NO_KEYFRAME:
                     self._map.set_pose(keyframes[0], _LEVEL_T_M_C)
+                    self._rooted.append(keyframes[0])
 
 
 def _start(live: LivePose) -> int:

@@ -15,7 +15,7 @@ from kiteline_basestation.intake.intake import Intake
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.map.world_poses import is_near
 from kiteline_codec.coding.quantise import MAX_SCALE, MIN_SCALE
-from kiteline_codec.schema import SubmapPlacement
+from kiteline_codec.schema import KeyframePose, SubmapPlacement
 from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import KeyframeId, SubmapId, agent_of_submap, submap_of_keyframe
@@ -96,6 +96,11 @@ class SubmapPlacements:
             scale = sim3.scale_of(S_w_before) if self._map.is_up_to_scale(submap) else 1.0
             S_w_m = sim3.normalise(sim3.of(scale, T_w_c) @ se3.inverse(T_m_first))
         self._place(submap, S_w_m)
+
+    def tell_rooted(self) -> None:
+        """Publish the poses that were chosen for keyframes at which submaps begin without their first ones."""
+        for keyframe in self._intake.take_rooted():
+            self._publisher.mark_changed(KeyframePose.KIND, keyframe)
 
     def follow_ties(self) -> bool:
         """Place submaps that are not recognised by their agents' motion over a loss. True if one moved.

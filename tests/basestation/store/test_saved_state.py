@@ -1,6 +1,7 @@
 """A saved map is restored bit for bit; flights go on in it, maps of several stores are combined."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -54,6 +55,17 @@ def test_restored_map_is_equal_to_the_last_bit(joined: tuple[Agents, Station], w
     for channel, before in zip(second.channels.values(), first.channels.values(), strict=True):
         assert isinstance(channel, CodedChannel) and isinstance(before, CodedChannel)
         assert channel.endpoint.own_values() == before.endpoint.own_values()
+
+
+def test_a_submap_without_its_first_keyframe_is_restored_with_its_oldest(make_flight: MakeFlight, words: Any) -> None:
+    """The base chose its pose, and had not told anyone: the next one had none, and left out what was seen there."""
+    flight = make_flight(keyframes=12, turns=0.3)
+    agents, station = Agents([replace(flight, records=flight.records[4:])]), new_station(words)
+    agents.fly(station, 0, 130)
+    assert station.mapper.counts.keyframes == 8 and station.mapper.idle
+    other = new_station(words, 2)
+    restore(other, snapshot(station, SavedMap()), agents.now_ns)
+    assert whole(other) == whole(station)
 
 
 def test_a_deleted_map_does_not_come_back(make_flight: MakeFlight, words: Any) -> None:
