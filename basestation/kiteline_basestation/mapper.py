@@ -222,7 +222,7 @@ class Mapper:
         for record in own:
             self.adopt(record)
             if isinstance(record, SubmapPlacement):
-                self._placements.restore_scale_sigma(record)
+                self._placements.restore_told(record)
 
     def restore_state(self, state: MapperState) -> None:
         """Continue from a saved state, after `restore` for all agents."""

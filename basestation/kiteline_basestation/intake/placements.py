@@ -6,7 +6,7 @@ first submap, or an agent reports how long that unit is.
 """
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from kiteline_basestation.intake.intake import Intake
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.map.world_poses import is_near
 from kiteline_codec.coding.quantise import MAX_SCALE, MIN_SCALE
-from kiteline_codec.schema import KeyframePose, SubmapPlacement
+from kiteline_codec.schema import KeyframePose, SubmapPlacement, messages
 from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import KeyframeId, SubmapId, agent_of_submap, submap_of_keyframe
@@ -45,6 +45,7 @@ class SubmapPlacements:
         self.unmerged: dict[SubmapId, F64] = {}  # S_w_m of submaps that have a placement without a merge
         self._recognised: set[SubmapId] = set()  # submaps whose placement rests on a merge with another submap
         self.far = 0  # placements that were left out: they have no code
+        self._told: dict[SubmapId, SubmapPlacement] = {}  # by an earlier process, until its state is restored
         self._scale_sigma: dict[SubmapId, float] = {}  # relative deviation of lengths, where accelerations told it
 
     @property
@@ -213,13 +214,20 @@ class SubmapPlacements:
         return PlacementState(dict(self.S_w_m), dict(self.unmerged), frozenset(self._recognised))
 
     def restore(self, state: PlacementState) -> None:
-        """Continue from a saved state; nothing is published."""
+        """Continue from a saved state, after `restore_told`. What had not been told as it is there is published."""
         self.S_w_m.update(state.S_w_m)
         self.unmerged = dict(state.unmerged)
         self._recognised = set(state.recognised)
+        told, self._told = self._told, {}
+        for submap, S_w_m in self.S_w_m.items():
+            record = SubmapPlacement(submap, S_w_m, submap in self._recognised)
+            before = replace(told[submap], batch=0, scale_sigma=0.0) if submap in told else None
+            if before is None or not _has_code(S_w_m) or messages.encode(record) != messages.encode(before):
+                self._set(submap, S_w_m)
 
-    def restore_scale_sigma(self, record: SubmapPlacement) -> None:
-        """Continue with the deviation of lengths that an earlier process published."""
+    def restore_told(self, record: SubmapPlacement) -> None:
+        """Take in a placement that an earlier process published, and its deviation of lengths."""
+        self._told[record.submap] = record
         if record.scale_sigma > 0.0:
             self._scale_sigma[record.submap] = record.scale_sigma
             self._map.scaled_submaps.add(record.submap)

@@ -25,7 +25,9 @@ from kiteline_basestation.store.state_texts import state_of, texts_of
 from kiteline_basestation.store.store import read
 from kiteline_codec.channel import CodedChannel
 from kiteline_codec.schema import (
+    Key,
     KeyframeHeader,
+    SubmapPlacement,
     WireError,
     messages,
 )
@@ -66,6 +68,22 @@ def test_a_submap_without_its_first_keyframe_is_restored_with_its_oldest(make_fl
     other = new_station(words, 2)
     restore(other, snapshot(station, SavedMap()), agents.now_ns)
     assert whole(other) == whole(station)
+
+
+def test_a_placement_that_was_not_sent_yet_is_sent_by_the_next_base(make_flight: MakeFlight, words: Any) -> None:
+    """It waited for a batch that was under way. The next base had it, and sent it no more: nothing had changed."""
+    flight = make_flight(keyframes=6, turns=0.1)
+    submap, moved = submap_of_keyframe(flight.keyframes[0]), se3.from_rt(np.eye(3), np.array([2.0, 0.0, 0.0]))
+    agents, station, other = Agents([flight]), new_station(words), new_station(words, 2)
+    agents.fly(station, 0, 12)
+    station.mapper._placements._set(submap, moved)
+    restore(other, snapshot(station, SavedMap()), agents.now_ns)
+    agents.base_died()
+    agents.fly(other, 12, 24)
+    assert np.array_equal(other.mapper.placements[submap], moved)
+    key = Key(SubmapPlacement.KIND, int(submap), 0)
+    record = messages.decode(key, agents.ends[flight.agent].endpoint.peer_values()[key])
+    assert isinstance(record, SubmapPlacement) and np.allclose(record.S_w_m, moved, atol=1e-4)
 
 
 def test_a_deleted_map_does_not_come_back(make_flight: MakeFlight, words: Any) -> None:
