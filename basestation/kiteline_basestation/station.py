@@ -60,10 +60,11 @@ class Station:
         """The channel to an agent; opened on first use."""
         if agent not in self.channels:
             self.channels[agent] = channel = self._open_channel(agent)
+            self._batches[agent] = CorrectionBatches(agent, self._publish)
             if isinstance(channel, CodedChannel):
+                self._batches[agent].shares = channel.shares
                 channel.endpoint.received.earlier.is_gone = lambda key: submap_of(key) in self.mapper.deleted
                 channel.endpoint.received.claims.is_of_use = self._is_of_use
-            self._batches[agent] = CorrectionBatches(agent, self._publish)
             self._deleted_values[agent] = DeletedValues()
         return self.channels[agent]
 
@@ -101,8 +102,11 @@ class Station:
             (agent, tuple(channel.receive(packets.get(agent, ()), now_ns)))
             for agent, channel in sorted(self.channels.items())
         ]
-        for channel in self.channels.values():
+        for agent, channel in sorted(self.channels.items()):
             channel.take_removed()  # the map keeps what it was given; else the keys would pile up
+            if isinstance(channel, CodedChannel):
+                released = self._batches[agent].follow_session(channel.endpoint.peer_session)
+                self._put(agent, [] if released is None else [released])
         self.received = sum(len(records) for _, records in arrivals)
         for agent, records in arrivals:
             self._track(agent, False, records)

@@ -180,6 +180,10 @@ class CodedChannel:
         """True if the other side is known to hold the newest record of a key."""
         return self.endpoint.arrived(key)
 
+    def shares(self, key: Key) -> bool:
+        """True if a record of a key would be sent: not what a base says of keyframes of an agent's earlier starts."""
+        return not self._is_of_another_start(key)
+
     @property
     def stats(self) -> SyncStats:
         """The endpoint's numbers."""

@@ -5,8 +5,9 @@ agent can wait for all of it. On a thin link a batch is as large as the link car
 coded over several steps.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import TypeGuard
 
 from kiteline_basestation.config import PublishConfig
 from kiteline_codec.channel import RecordChannel
@@ -33,6 +34,9 @@ class CorrectionBatches:
     def __init__(self, agent: AgentId, config: PublishConfig) -> None:
         self._agent = agent
         self._config = config
+        # Whether a value is sent to the agent. Others, as of keyframes of its earlier starts, are of no batch.
+        self.shares: Callable[[Key], bool] = lambda key: True
+        self._session: int | None = None  # of the agent
         self._number = 0
         self._members: dict[Key, None] = {}  # of the newest batch
         self._missing: Key | None = None  # a member that had not arrived at the last check: it is checked first
@@ -73,7 +77,7 @@ class CorrectionBatches:
 
         unfinished: more values of this batch come with a later step; its record comes with the last ones.
         """
-        keys = [messages.key(record) for record in records if isinstance(record, MEMBERS)]
+        keys = [messages.key(record) for record in records if self._is_member(record)]
         if not keys and (unfinished or not self._open):
             return list(records)
         if self._overdue and self._number:
@@ -90,13 +94,29 @@ class CorrectionBatches:
             batch = [] if unfinished else [CorrectionBatch.of(self._agent, self._number, list(self._members))]
         if batch:
             self._closed = self._number
-        return [replace(r, batch=self._number) if isinstance(r, MEMBERS) else r for r in records] + batch
+        return [replace(r, batch=self._number) if self._is_member(r) else r for r in records] + batch
+
+    def _is_member(self, record: Record) -> TypeGuard[KeyframePose]:  # or another one of MEMBERS
+        return isinstance(record, MEMBERS) and self.shares(messages.key(record))
 
     def without(self, key: Key) -> CorrectionBatch | None:
         """The record that replaces that of the newest batch if a value of it is removed; None if none was."""
         if key not in self._members:
             return None
         del self._members[key]
+        return CorrectionBatch.of(self._agent, self._number, [])
+
+    def follow_session(self, session: int | None) -> CorrectionBatch | None:
+        """The record that replaces that of the newest batch if the agent has started anew, and values of the batch are
+        sent no more; None otherwise. session: of the agent.
+        """
+        if session == self._session:
+            return None
+        self._session = session
+        left = {key: None for key in self._members if self.shares(key)}
+        if len(left) == len(self._members):
+            return None
+        self._members = left
         return CorrectionBatch.of(self._agent, self._number, [])
 
     def restore(self, record: Record) -> None:

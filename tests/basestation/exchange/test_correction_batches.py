@@ -11,8 +11,9 @@ from kiteline_agent.exchange.correction_batches import ReceivedBatches as Holder
 from kiteline_basestation.config import BaseConfig, PublishConfig
 from kiteline_basestation.exchange.correction_batches import MEMBERS, CorrectionBatches
 from kiteline_basestation.job_kinds import run_job
+from kiteline_basestation.jobs import JobDone
 from kiteline_basestation.station import Station
-from kiteline_codec.channel import CodedChannel, PlainChannel
+from kiteline_codec.channel import CodedChannel, PlainChannel, coded_channel
 from kiteline_codec.schema import (
     CameraIntrinsics,
     CorrectionBatch,
@@ -24,6 +25,7 @@ from kiteline_codec.schema import (
     messages,
 )
 from kiteline_codec.sync.config import SyncConfig
+from kiteline_codec.sync.resumption import agent_session
 from kiteline_core.ids import AgentId, KeyframeId
 from kiteline_hw.sim.links.link_model import LinkModel, LinkModelConfig
 from tests.basestation.feeding import WITHOUT_GRID, keyframes_in
@@ -124,6 +126,43 @@ def test_a_withdrawn_value_is_not_waited_for_by_the_agent() -> None:
     first = batches.numbered([pose(1), pose(2)], 0)
     assert batches.without(Key(KeyframePose.KIND, 9)) is None
     assert batches.without(messages.key(first[0])) == CorrectionBatch.of(AGENT, 1, [])
+
+
+def test_an_agent_that_starts_anew_waits_for_nothing_of_its_earlier_starts(
+    make_flight: Callable[..., Any], words: Any
+) -> None:
+    """The base keeps that to itself, but counted it: no batch that moved old keyframes, too, was ever whole."""
+    flights = [
+        make_flight(keyframes=14, turns=0.4, boot=1),
+        make_flight(keyframes=14, turns=0.4, start=0.1, variant=1, boot=2),
+    ]
+    station = Station(WITHOUT_GRID, lambda agent: coded_channel(1, peer=agent), words)
+    done: tuple[JobDone, ...] = ()
+    now_ns, applied = 0, set[KeyframeId]()
+    for boot, flight in enumerate(flights, 1):
+        agent, holder, down = coded_channel(agent_session(boot, boot)), Holder(), ()
+        agent.put(CameraIntrinsics(AGENT, flight.camera))
+        for n in range(len(flight.records) + 40):
+            now_ns += STEP_NS
+            records = holder.take(agent.receive(down, now_ns), agent.take_removed())
+            applied |= {record.keyframe for record in records if isinstance(record, KeyframePose)}
+            for record in flight.records[n] if n < len(flight.records) else ():
+                agent.put(record)
+            output = station.step({AGENT: agent.poll(now_ns)}, done, now_ns)
+            done, down = tuple(run_job(job) for job in output.jobs), dict(output.packets)[AGENT]
+    assert station.mapper.summary()["merges"] == 1
+    assert len(holder) == 0 and set(flights[1].keyframes[1:]) <= applied
+
+
+def test_a_batch_is_let_go_whose_values_are_sent_no_more_to_a_new_start() -> None:
+    batches = CorrectionBatches(AGENT, PublishConfig())
+    assert batches.follow_session(5) is None
+    batches.numbered([pose(1), pose(2)], 0)
+    batches.shares = lambda key: key.id != 1
+    assert batches.follow_session(5) is None
+    assert batches.follow_session(6) == CorrectionBatch.of(AGENT, 1, [])
+    assert batches.follow_session(7) is None
+    assert numbers(batches.numbered([pose(1), pose(2)], 0)) == [0, 2, 2]
 
 
 def test_numbers_go_on_after_a_restart() -> None:
