@@ -330,7 +330,7 @@ def coded_channel(
     """One end of a channel over a link. budget_bytes: on the wire in any second; 0: unlimited. profile: wifi, radio, or
     "" to choose by the link. seal_bytes: what sealing adds to a packet. bounded: whether values of keyframes may take
     only so much memory, and then go to `spill`. peer: the agent at the other end of a base's channel. Raises
-    ValueError.
+    ValueError, BudgetError.
     """
     if link is not None:
         profile = profile or link.profile

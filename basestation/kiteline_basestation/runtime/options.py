@@ -115,10 +115,11 @@ def options_of(a: argparse.Namespace, session: int) -> BaseOptions:
 
 
 def coded_channels(spec: BaseOptions, link: LinkTraits) -> Callable[[AgentId], RecordChannel]:
-    """A function that opens the base's end of the channel to an agent."""
+    """A function that opens the base's end of the channel to an agent. Raises BudgetError."""
 
     def opened(agent: AgentId) -> RecordChannel:
         sealed = seal_bytes(suite_for(link), agent) if spec.key else 0
         return coded_channel(spec.session, spec.down_bytes_s, spec.profile, sealed, link, peer=agent)
 
+    opened(AgentId(0))  # so that a budget that is too small is told now, not when the first agent connects
     return opened

@@ -7,12 +7,17 @@ from kiteline_codec.schema import RECORD_TYPES, Key, Priority
 from kiteline_codec.sync.resumption import SUMMARY_KIND
 from kiteline_codec.sync.send_queue import Order
 from kiteline_codec.transport.packet import MAX_HEADER_BYTES, MAX_ITEM_BYTES
+from kiteline_core.errors import KitelineError
 
 _ORDERS = {kind: (int(t.PRIORITY), t.FIRST_PARTS) for kind, t in RECORD_TYPES.items()}
 _UNKNOWN_KIND = int(Priority.GRID), 1
 _REST = int(Priority.REST)
 _MOST_REASONS = 64  # texts of refusals that are counted apart: they name numbers that the peer chose
 MIN_PACKET_BYTES = MAX_HEADER_BYTES + MAX_ITEM_BYTES + 24
+
+
+class BudgetError(KitelineError, ValueError):
+    """A budget in which not even the smallest packets fit."""
 
 
 def default_order(key: Key) -> Order:
@@ -61,7 +66,9 @@ class SyncConfig:
             raise ValueError(f"packet_bytes is {self.packet_bytes}, expected {MIN_PACKET_BYTES}..65536")
         least = 2 * (MIN_PACKET_BYTES + self.overhead_bytes)
         if self.budget_bytes is not None and self.budget_bytes < least:
-            raise ValueError(f"budget_bytes is {self.budget_bytes}, expected none or at least {least}")
+            raise BudgetError(
+                f"{self.budget_bytes} B/s are too few for this link: expected 0 (no limit) or at least {least}"
+            )
 
     @property
     def filled_bytes(self) -> int:

@@ -12,6 +12,7 @@ from kiteline_codec.pacing.pacer import Pacer
 from kiteline_codec.pacing.profiles import EXACT, RADIO, WIFI, Profile
 from kiteline_codec.pacing.throughput import Throughput
 from kiteline_codec.schema import KeyframeHeader, LivePose, NewLandmarks, Observations, messages
+from kiteline_core.errors import KitelineError
 from kiteline_core.ids import NO_KEYFRAME, AgentId, keyframe_id, submap_id
 from kiteline_core.imaging import descriptors
 from kiteline_hw.links.kinds import link_traits
@@ -109,6 +110,8 @@ def test_a_budget_chooses_the_profile() -> None:
     assert coded_channel(1).profile is WIFI
     with pytest.raises(ValueError, match="wifi or radio"):
         coded_channel(1, profile="pigeon")
+    with pytest.raises(KitelineError, match=r"10 B/s .* at least 270"):  # which command lines print without a traceback
+        coded_channel(1, 10)
 
 
 def test_measured_throughput_chooses_the_profile_with_patience() -> None:
