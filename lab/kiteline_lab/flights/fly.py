@@ -2,6 +2,7 @@
 
 import argparse
 import contextlib
+import math
 import sys
 from pathlib import Path
 
@@ -13,15 +14,17 @@ from kiteline_hw.ports import LinkError, SourceError
 from kiteline_hw.sources.kinds import source_forms
 from kiteline_lab.flights.flight_report import Report, table
 from kiteline_lab.flights.in_process import fly_in_process
+from kiteline_lab.flights.out_file import sole_writer
 from kiteline_lab.flights.outcome import FlightOutcome
 from kiteline_lab.flights.plan import Options, plan
-from kiteline_lab.flights.processes import fly_processes
+from kiteline_lab.flights.processes import fly_processes, link_ends
 from kiteline_lab.flights.results import write_results
 from kiteline_lab.plots.plot import can_plot
 
 MODES = ("tracker", "local", "monolith", "distributed")
 PROFILES = {"wifi": (0, 0), "radio": (1000, 500)}  # B/s up and down on the wire; 0: what the link takes
 _FILES = ("live.tum", "odometry.tum", "stderr.log", "map.ply", "grid.pgm", "grid.yaml")
+_PATTERNS = ("agent[0-9]*.tum", "log*.mcap", "grid_*.pgm", "grid_*.yaml")
 
 
 def parser() -> argparse.ArgumentParser:
@@ -87,6 +90,8 @@ def options(argv: list[str]) -> Options:
             p.error(str(error))
     if not 0.0 <= a.link_loss < 1.0:
         p.error(f"--link-loss {a.link_loss}: expected a probability from 0 to below 1")
+    if not 0.0 <= a.link_delay < math.inf:
+        p.error(f"--link-delay {a.link_delay}: expected seconds, 0 or more")
     if a.rig and len(a.sources) > 1:
         p.error("--rig is the file of one rig: it goes with one SOURCE")
     if a.out.exists() and not a.out.is_dir():
@@ -108,9 +113,10 @@ def link_bytes(text: str) -> tuple[int, int]:
 
 
 def clear(out: Path) -> None:
-    """Remove what an earlier flight left in the folder, and nothing else."""
+    """Remove what an earlier flight left in the folder, and nothing else; make the folder if need be."""
     for folder in [out / "base", *out.glob("agent[0-9]*")]:
-        for path in [*(folder / name for name in _FILES), *folder.glob("agent[0-9]*.tum"), *folder.glob("log*.mcap")]:
+        named = (path for pattern in _PATTERNS for path in folder.glob(pattern))
+        for path in [*(folder / name for name in _FILES), *named]:
             path.unlink(missing_ok=True)
     for name in ("report.json", "trajectory.png"):
         (out / name).unlink(missing_ok=True)
@@ -119,12 +125,14 @@ def clear(out: Path) -> None:
 
 def fly(o: Options, quiet: bool = False) -> tuple[Report, FlightOutcome]:
     """Fly and evaluate; the report as written, and the outcome. Raises SourceError, LinkError, ConfigError."""
-    if o.realtime and o.mode != "distributed":
+    distributed = o.mode == "distributed"
+    if o.realtime and not distributed:
         raise LinkError(f"--realtime flies processes over a link: it does not go with --mode {o.mode}")
+    if distributed:
+        link_ends(o.link, realtime=o.realtime)  # a wrong one is told before an earlier flight is removed
     made = plan(o, quiet)
-    with contextlib.closing(made):
+    with contextlib.closing(made), sole_writer(o.out):
         clear(o.out)
-        distributed = o.mode == "distributed"
         outcome = fly_processes(made, o.link, realtime=o.realtime) if distributed else fly_in_process(made, o.mode)
         repair_logs(o.out)
         report = write_results(o.out, made, outcome)
@@ -134,7 +142,7 @@ def fly(o: Options, quiet: bool = False) -> tuple[Report, FlightOutcome]:
 def repair_logs(out: Path) -> None:
     """Finish the logs of processes that were ended in mid-flight, so that every tool opens them."""
     for log in [*out.glob("agent[0-9]*/*.mcap"), *out.glob("base/*.mcap")]:
-        with contextlib.suppress(SourceError):  # not one byte was written
+        with contextlib.suppress(SourceError, OSError):  # not one byte was written, or the disk takes no second copy
             repair(log)
 
 

@@ -1,8 +1,9 @@
 """Files that are either complete or absent: written under another name and renamed at the end."""
 
+import fcntl
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from kiteline_hw.durable_files import write_atomically
@@ -31,6 +32,22 @@ def write_whole(path: Path, content: bytes) -> None:
         path.write_bytes(content)
     else:
         write_atomically(path.resolve(), content)  # of a link, what it leads to
+
+
+@contextmanager
+def sole_writer(folder: Path) -> Iterator[None]:
+    """Lock a folder, made if need be, against other flights. Raises SourceError if one leaves its results there."""
+    folder.mkdir(parents=True, exist_ok=True)
+    lock = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        with suppress(OSError):  # of a disk that has no locks
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise SourceError(f"{folder}: another flight writes there: name another folder, or wait") from None
+        yield
+    finally:
+        os.close(lock)
 
 
 @contextmanager

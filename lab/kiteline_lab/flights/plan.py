@@ -4,8 +4,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from kiteline_agent.runtime.options import AgentOptions, is_filter
-from kiteline_basestation.runtime.options import BaseOptions
+from kiteline_agent.runtime.options import AgentOptions, agent_config, is_filter
+from kiteline_basestation.runtime.options import BaseOptions, base_config
+from kiteline_codec.channel import coded_channel
 from kiteline_core.frame import Frame
 from kiteline_core.ids import MAX_BOOTS
 from kiteline_hw.durable_files import next_number
@@ -66,7 +67,11 @@ class FlightPlan:
 
 
 def plan(o: Options, quiet: bool = False) -> FlightPlan:
-    """Open the sources, so that a bad one is reported before anything starts, and make the options of each process."""
+    """Open the sources, so that a bad one is reported before anything starts, and make the options of each process.
+
+    Raises SourceError; ConfigError and BudgetError for options with which a process would not begin.
+    """
+    _check(o)
     made = FlightPlan(quiet=quiet, base_kills=o.base_kills)
     mono = o.mono or is_filter(o.config, o.tracker)
     try:
@@ -103,6 +108,15 @@ def plan(o: Options, quiet: bool = False) -> FlightPlan:
             cpu_percent=_BASE_PERCENT if o.cpu_percent > 0.0 else 0.0,
         )  # fmt: skip
     return made
+
+
+def _check(o: Options) -> None:
+    """Raise ConfigError or BudgetError for options with which an agent or the base would not begin."""
+    agent_config(o.config, o.cpu_percent, o.rig, o.grid, o.tracker)
+    if o.mode != "tracker":
+        base_config(o.config)
+    for budget_bytes in (o.up_bytes_s, o.down_bytes_s):
+        coded_channel(1, budget_bytes, o.profile)
 
 
 def flight_starts(sources: list[FrameSource]) -> list[int]:

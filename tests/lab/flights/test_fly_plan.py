@@ -1,15 +1,20 @@
 """What a command line becomes: options, flight time 0 of several sources, a cleared folder."""
 
+import errno
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from kiteline_core.errors import KitelineError
 from kiteline_core.frame import Frame
 from kiteline_core.geometry.cameras import CameraModel, CameraRig
+from kiteline_hw.logs.mcap_log import LogWriter
 from kiteline_hw.ports import LinkError, SourceError, SourceReport
-from kiteline_lab.flights.fly import clear, fly, link_bytes, options
+from kiteline_lab.flights.fly import clear, fly, link_bytes, options, repair_logs
+from kiteline_lab.flights.out_file import sole_writer
 from kiteline_lab.flights.plan import Options, flight_starts
 
 
@@ -69,7 +74,15 @@ def test_profiles_and_overrides() -> None:
 
 @pytest.mark.parametrize(
     "words",
-    [["--link-loss", "1.0"], ["--cpu", "-1"], ["--mode", "none"], ["--link-bytes", "x"], ["b.mcap", "--rig", "r.toml"]],
+    [
+        ["--link-loss", "1.0"],
+        ["--link-delay", "-1"],
+        ["--link-delay", "nan"],
+        ["--cpu", "-1"],
+        ["--mode", "none"],
+        ["--link-bytes", "x"],
+        ["b.mcap", "--rig", "r.toml"],
+    ],
 )
 def test_a_wrong_word_ends_with_usage(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as end:
@@ -88,7 +101,7 @@ def test_a_file_is_no_folder_for_a_flight(tmp_path: Path, capsys: pytest.Capture
 
 def test_clearing_takes_only_what_a_flight_leaves(tmp_path: Path) -> None:
     for name in ("agent0/live.tum", "agent1/log.mcap", "base/agent0.tum", "base/map.ply", "report.json", "notes.txt",
-                 "agent0/mine.txt", "base/mine.ply"):  # fmt: skip
+                 "base/grid_storey+1.pgm", "base/grid_0.1-0.5.yaml", "agent0/mine.txt", "base/mine.ply"):  # fmt: skip
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text("x")
     clear(tmp_path)
@@ -99,3 +112,42 @@ def test_clearing_takes_only_what_a_flight_leaves(tmp_path: Path) -> None:
 def test_realtime_needs_processes(tmp_path: Path) -> None:
     with pytest.raises(LinkError, match="mode"):
         fly(Options(("x",), tmp_path, "local", realtime=True), quiet=True)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"up_bytes_s": 10}, {"down_bytes_s": 10}, {"config": "none.toml"}, {"rig": "bad.toml"}, {"link": "pigeon:"}],
+)
+def test_what_cannot_be_flown_leaves_the_earlier_flight(
+    wrong: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "bad.toml").write_text("no rig")
+    (tmp_path / "report.json").write_text("{}")
+    with pytest.raises((KitelineError, OSError)):
+        fly(Options(("sim:room?seconds=0.1&width=64&height=64",), tmp_path, **wrong), quiet=True)
+    assert (tmp_path / "report.json").read_text() == "{}"
+
+
+def test_two_flights_do_not_share_a_folder(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    with sole_writer(out), pytest.raises(SourceError, match="another flight"), sole_writer(out):
+        pass
+    with sole_writer(out):
+        pass
+
+
+def test_a_cut_log_that_cannot_be_mended_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    log = tmp_path / "agent0" / "log.mcap"
+    log.parent.mkdir()
+    with LogWriter(log, {"role": "agent"}) as writer:
+        writer.json("/step", 1, {})
+    log.write_bytes(content := log.read_bytes()[:-20])
+    monkeypatch.setattr("kiteline_hw.logs.mcap_repair.Writer.finish", full_disk)
+    repair_logs(tmp_path)
+    assert [path.name for path in log.parent.iterdir()] == ["log.mcap"]
+    assert log.read_bytes() == content
+
+
+def full_disk(*_: object) -> None:
+    raise OSError(errno.ENOSPC, "No space left on device")
