@@ -207,6 +207,8 @@ def run() -> None:
     """The command line of this process."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, _on_signal)
+    if sys.stderr is None:  # closed by the caller: notes and progress are for nobody
+        sys.stderr = os.fdopen(os.open(os.devnull, os.O_WRONLY), "w")
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # a terminal in ASCII, a file name in another encoding
             with contextlib.suppress(OSError):  # of a stream that has its place in a file no more

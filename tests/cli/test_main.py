@@ -217,3 +217,11 @@ def test_output_that_is_closed_is_no_fault() -> None:
         ["sh", "-c", '"$0" -c "$1" >&-', sys.executable, code], capture_output=True, check=False, timeout=60
     )
     assert (done.returncode, done.stderr) == (0, b"")
+
+
+def test_errors_that_are_closed_are_no_fault() -> None:
+    code = STAND_IN.format(text="    sys.stderr.write('into the void')")
+    done = subprocess.run(
+        ["sh", "-c", '"$0" -c "$1" 2>&-', sys.executable, code], capture_output=True, check=False, timeout=60
+    )
+    assert (done.returncode, done.stdout) == (0, b"")
