@@ -1,5 +1,6 @@
 """The options of a simulated flight, and their parser."""
 
+import math
 from dataclasses import dataclass, fields
 
 from kiteline_core.geometry.cameras import Lens
@@ -95,6 +96,9 @@ def read_config(scene: str, **options: object) -> SimConfig:
         _default(key)
         values[key] = value
     config = SimConfig(**values)  # type: ignore[arg-type]
+    for field in fields(SimConfig):
+        if isinstance(value := getattr(config, field.name), float) and not math.isfinite(value):
+            raise SourceError(f"{field.name} of a simulated scene is {value}: expected a finite number")
     if config.scene not in SCENES:
         raise SourceError(f"unknown scene {config.scene!r}: expected one of {', '.join(SCENES)}")
     if config.floor not in FLOORS:
@@ -105,6 +109,8 @@ def read_config(scene: str, **options: object) -> SimConfig:
         raise SourceError(f"unknown lens {config.lens!r}: expected radtan, equidistant or none")
     if config.rig not in RIGS:
         raise SourceError(f"unknown rig {config.rig!r}: expected {' or '.join(RIGS)}")
+    if config.rig != "worn" and (config.rig_seed >= 0 or config.wear != KINDS):
+        raise SourceError("wear and rig_seed are options of a worn rig: add --rig worn (rig=worn in the scene)")
     if unknown := [kind for kind in config.wear if kind not in KINDS]:
         raise SourceError(f"unknown wear {', '.join(unknown)}: expected some of {', '.join(KINDS)}")
     if not 0 <= config.agent <= len(config.also):

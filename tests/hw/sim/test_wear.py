@@ -142,3 +142,15 @@ def test_a_worn_rig_tells_the_calibration_of_a_true_one() -> None:
 def test_unknown_wear_is_named(text: str) -> None:
     with pytest.raises(SourceError, match=r"unknown (rig|wear)"):
         open_sim(text, texture_bits=6)
+
+
+@pytest.mark.parametrize("text", ["room?wear=lens", "room?rig_seed=3"])
+def test_wear_of_a_true_rig_is_refused(text: str) -> None:
+    with pytest.raises(SourceError, match="worn rig"):
+        open_sim(text, texture_bits=6)
+
+
+@pytest.mark.parametrize("text", ["room?start=nan", "room?seconds=inf", "room?read_noise=nan"])
+def test_numbers_that_are_not_finite_are_refused(text: str) -> None:
+    with pytest.raises(SourceError, match="finite"):
+        open_sim(text, texture_bits=6)
