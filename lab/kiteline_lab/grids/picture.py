@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 
 from kiteline_core.arrays import F64, I8, U8
+from kiteline_lab.flights.out_file import write_whole
 from kiteline_lab.grids.files import FREE, OCCUPIED, UNKNOWN, GridFile, GridFileError
 from kiteline_lab.grids.prm import GridEvalConfig, Roads, draw_roads
 
@@ -122,13 +123,15 @@ def _titled(panel: U8, name: str) -> U8:
 
 def _legend(image: U8) -> U8:
     """The image with the colours of the difference named below."""
-    out = cv2.copyMakeBorder(image, 0, _BAR_PX, 0, 0, cv2.BORDER_CONSTANT, value=(255, 255, 255))
+    steps = [40 + 8 * len(name) for name, *_ in _DIFFERENCES]
+    wider = max(0, 6 + sum(steps) - image.shape[1])  # than narrow panels, so that no name is cut off
+    out = cv2.copyMakeBorder(image, 0, _BAR_PX, 0, wider, cv2.BORDER_CONSTANT, value=(255, 255, 255))
     x, y = 6, out.shape[0] - 8
-    for name, colour, _, _ in _DIFFERENCES:
+    for (name, colour, _, _), step in zip(_DIFFERENCES, steps, strict=True):
         cv2.rectangle(out, (x, y - 12), (x + 14, y + 2), colour, -1)
         cv2.rectangle(out, (x, y - 12), (x + 14, y + 2), (60, 60, 60), 1)
         cv2.putText(out, name, (x + 20, y), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (60, 60, 60), 1, cv2.LINE_AA)
-        x += 40 + 8 * len(name)
+        x += step
     return np.asarray(out, np.uint8)
 
 
@@ -136,6 +139,6 @@ def _write(path: Path, image: U8) -> None:
     ok, data = cv2.imencode(".png", image)
     assert ok
     try:
-        path.write_bytes(data.tobytes())
+        write_whole(path, data.tobytes())
     except OSError as e:
         raise GridFileError(f"{path}: {e.strerror or e}") from None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import io
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,6 +14,7 @@ import numpy as np
 from kiteline_core.arrays import F64
 from kiteline_core.frame import Trajectory
 from kiteline_lab.evaluation.metrics import TrajectoryAlignment, match, position_errors, truth_at
+from kiteline_lab.flights.out_file import write_whole
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -40,7 +42,7 @@ def can_plot() -> bool:
 def plot_trajectories(
     path: str | Path, lines: Sequence[Line], truth: Trajectory | None = None, title: str = "", *, align: bool = False
 ) -> None:
-    """Write a PNG. truth: drawn in grey, and adds a panel of errors.
+    """Write a PNG, whatever the name ends in. truth: drawn in grey, and adds a panel of errors.
 
     align: first align each line with the truth by rotation and translation (as ATE does), if enough poses match.
     """
@@ -80,8 +82,9 @@ def plot_trajectories(
         figure.suptitle(_as_text(title), x=0.01, ha="left", color=INK, fontsize=12, fontweight="bold")
     if top.get_legend_handles_labels()[0]:
         top.legend(frameon=False, fontsize=9, labelcolor=INK)
-    Path(path).parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, metadata={"Software": None})  # no version inside: equal runs give equal files
+    png = io.BytesIO()
+    figure.savefig(png, format="png", metadata={"Software": None})  # no version inside: equal runs give equal files
+    write_whole(Path(path), png.getvalue())
 
 
 def _as_text(name: str) -> str:

@@ -9,6 +9,8 @@ from kiteline_lab.evaluation import metrics
 from kiteline_lab.evaluation.metrics import Evaluation, Relative, TrajectoryAlignment
 from kiteline_lab.evaluation.trajectories import TrajectoryError, read_pair
 
+_MOST_DIFFERENCE_S = 1e6  # which nanoseconds hold by far
+
 
 def evaluate_files(
     estimate: str,
@@ -96,7 +98,10 @@ def parser() -> argparse.ArgumentParser:
 
 def main(argv: list[str]) -> int:
     """Run `kiteline eval`; the exit status."""
-    a = parser().parse_args(argv)
+    p = parser()
+    a = p.parse_args(argv)
+    if not 0.0 <= a.max_difference <= _MOST_DIFFERENCE_S:
+        p.error(f"--max-difference {a.max_difference:g}: expected seconds from 0 to {_MOST_DIFFERENCE_S:g}")
     if a.plot:
         importlib.import_module("matplotlib")  # an extra that is missing is told at once
     alignment = (

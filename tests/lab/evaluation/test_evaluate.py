@@ -1,3 +1,4 @@
+import errno
 import json
 from pathlib import Path
 
@@ -163,3 +164,27 @@ def test_errors_at_the_ends_of_a_line_are_against_the_truth_beyond_it(
     plot.plot_trajectories(tmp_path / "a.png", [plot.Line("live", between)], Trajectory(t_ns, poses))
     assert len(drawn[0]) == 10
     assert drawn[0].max() < 1e-9
+
+
+@pytest.mark.parametrize("seconds", ["-1", "nan", "inf", "1e9"])
+def test_a_difference_in_time_that_is_none(seconds: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        evaluate.main(["a.tum", "b.tum", "--max-difference", seconds])
+    assert "--max-difference" in capsys.readouterr().err
+
+
+def test_a_plot_is_a_png_whatever_its_name_and_the_old_one_stays_on_a_full_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    line = [plot.Line("live", Trajectory(np.arange(3), np.tile(np.eye(4), (3, 1, 1))))]
+    plot.plot_trajectories(tmp_path / "a.plot", line)
+    content = (tmp_path / "a.plot").read_bytes()
+    assert content.startswith(b"\x89PNG")
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", full)
+    with pytest.raises(OSError, match="No space"):
+        plot.plot_trajectories(tmp_path / "a.plot", line, title="new")
+    assert [path.read_bytes() for path in tmp_path.iterdir()] == [content]

@@ -36,6 +36,15 @@ def test_differences_have_colours_of_their_own(tmp_path: Path) -> None:
         assert share(other[:-26], colour) > 0.001
 
 
+def test_the_legend_of_a_narrow_picture_is_whole(tmp_path: Path) -> None:
+    narrow = room()
+    narrow.state[:, 20:] = UNKNOWN
+    draw_comparison(tmp_path / "narrow.png", narrow, narrow, np.eye(3))
+    picture = cv2.imread(str(tmp_path / "narrow.png"))
+    assert (picture[-26:, -8:] == 255).all()  # nothing reaches beyond the edge
+    assert share(picture[-26:], (235, 190, 130)) > 0.0  # the last colour is there
+
+
 def test_an_estimate_is_drawn_where_it_is_said_to_be() -> None:
     true, T = room(), planar(0.5, -0.25, 90.0)
     x, y, _ = np.linalg.inv(T)[:, 2]

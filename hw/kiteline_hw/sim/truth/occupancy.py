@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 
 from kiteline_core.arrays import F64, U8, Bool
+from kiteline_hw.durable_files import write_atomically
 from kiteline_hw.sim.world.world import World
 
 OCCUPIED, FREE, UNKNOWN = 0, 254, 205  # grey values of map_server images
@@ -82,10 +83,11 @@ def write_grid(grid: TrueGrid, file: Path) -> Path:
     picture = file.with_name(file.name.removesuffix(".yaml") + ".pgm")
     ok, data = cv2.imencode(".pgm", grid.image[::-1])
     assert ok
-    picture.write_bytes(data.tobytes())
-    file.write_text(
+    write_atomically(picture, data.tobytes())
+    text = (
         f"image: {picture.name}\nmode: trinary\nresolution: {grid.cell_m:g}\n"
         f"origin: [{grid.corner[0]:.6f}, {grid.corner[1]:.6f}, 0.0]\n"
         "negate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"
     )
+    write_atomically(file, text.encode())
     return file
