@@ -19,7 +19,7 @@ from kiteline_core.frame import EncodedImage
 from kiteline_core.ids import AgentId
 from kiteline_hw.links.kinds import link_traits
 from kiteline_hw.logs.mcap_log import DEPTH, LEFT, RIG, RIGHT, LogMessage, LogReader, read_frame
-from kiteline_hw.logs.mcap_repair import REPAIRED
+from kiteline_hw.logs.mcap_repair import BEGINS, REPAIRED
 from kiteline_hw.logs.rig_json import rig_from_json
 from kiteline_hw.logs.spill_file import SpillFile
 from kiteline_hw.ports import SourceError
@@ -72,6 +72,11 @@ def check_replayable(log: LogReader, role: str) -> None:
         raise SourceError("no log of an agent or a base: a recording is flown with `kiteline fly`, not replayed")
     if log.metadata.get("channel") == "PlainChannel":
         raise SourceError("this is a monolith's log: its agent and base exchanged no packets, so they are not in it")
+    if begins := log.metadata.get(BEGINS):
+        raise SourceError(
+            f"this log was cut at its beginning (it begins {begins}): a replay needs all steps before; `kiteline fly` "
+            "flies its frames anew"
+        )
     if part := log.metadata.get("part"):
         raise SourceError(
             f"part {part} of a log: a replay begins with its first part, the name without _{part}, if that "

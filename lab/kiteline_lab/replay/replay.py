@@ -25,6 +25,7 @@ from kiteline_core.ids import AgentId
 from kiteline_hw.links.kinds import link_traits
 from kiteline_hw.logs.log_parts import WholeLog
 from kiteline_hw.logs.mcap_log import LogReader
+from kiteline_hw.ports import SourceError
 from kiteline_hw.system import process
 from kiteline_lab.flights.out_file import write_whole
 from kiteline_lab.flights.progress import Progress
@@ -166,6 +167,8 @@ def main(argv: list[str]) -> int:
     a = p.parse_args(argv)
     if a.cpu and a.verify:
         p.error("--cpu goes without --verify: its flight is a new one")
+    if a.virtual and not a.cpu:
+        p.error("--virtual is the kind of the limit that --cpu sets: it goes with --cpu")
     if a.cpu:
         from kiteline_lab.replay.replay_cpu import refly
 
@@ -175,6 +178,8 @@ def main(argv: list[str]) -> int:
     base_warm()
     with WholeLog(a.log) as log, Progress("replaying", log.topics.get(agent_log.STEP), "steps") as progress:
         is_agent = log.metadata.get("role") == "agent"
+        if a.out is not None and not is_agent:
+            raise SourceError(f"{a.log}: --out leaves an agent's trajectories, and this is a base's log")
         if not is_agent:
             process.print_lines(missing_extras())
         done = (replay_agent if is_agent else replay_base)(log, progress, stop_at_first=a.verify)

@@ -10,6 +10,7 @@ from kiteline_agent.runtime.options import AgentOptions
 from kiteline_hw.logs.mcap_log import LogReader
 from kiteline_hw.ports import SourceError
 from kiteline_hw.sources.open import open_source
+from kiteline_hw.system import process
 from kiteline_hw.system.cpu import CpuQuota
 from kiteline_lab.flights.children import ChildProcesses, ended_by
 from kiteline_lab.flights.flight_report import statistic
@@ -33,6 +34,7 @@ def refly(log: Path, percent: float, out: Path | None, virtual: bool) -> int:
         f"{percent:g} % of a core, {how}: {report['frames']} frames, {report['tracked']} tracked, "
         f"{report['lost']} lost, {report['dropped']} dropped, {cpu['mean']:.1f} ms a frame on this machine"
     )
+    process.print_lines([f"note: {note}" for note in report["notes"]])
     return 0
 
 

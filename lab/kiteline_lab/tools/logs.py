@@ -13,7 +13,7 @@ from pathlib import Path
 from mcap.writer import CompressionType, Writer
 
 from kiteline_hw.logs.mcap_file import McapFile, RawMessage
-from kiteline_hw.logs.mcap_repair import REPAIRED
+from kiteline_hw.logs.mcap_repair import BEGINS, REPAIRED
 from kiteline_hw.ports import SourceError
 from kiteline_lab.flights.out_file import whole_file
 
@@ -129,7 +129,9 @@ def _cut(path: Path, out: Path, begin_s: float, end_s: float, force: bool) -> in
             f"{path} ends after {(file.last_ns - file.first_ns) * 1e-9:.1f} s: nothing from {begin_s:g} s"
         )
     with whole_file(out, force=force) as part:
-        written = _write(part, [file], ((0, m) for m in _interval(file, begin_ns, end_ns)), [""])
+        stretch = ((0, m) for m in _interval(file, begin_ns, end_ns))
+        begins = f"{begin_s:g} s after the start" if begin_ns > file.first_ns else ""
+        written = _write(part, [file], stretch, [""], begins)
     print(f"{out}: {written} messages")
     return 0
 
@@ -182,12 +184,16 @@ def _prefixes(files: list[McapFile]) -> list[str]:
     return [f"/{name}" if names.count(name) == 1 else f"/{name}_{i}" for i, name in enumerate(names)]
 
 
-def _write(path: Path, files: list[McapFile], messages: Iterable[tuple[int, RawMessage]], prefixes: list[str]) -> int:
+def _write(
+    path: Path, files: list[McapFile], messages: Iterable[tuple[int, RawMessage]], prefixes: list[str], begins: str = ""
+) -> int:
     """Write messages (number of file, message); returns the count. Equal channels of several files become one.
 
-    What is taken from a cut file says so in its metadata, as a repaired log does: its last step may be incomplete.
+    What is taken from a cut file says so in its metadata, as a repaired log does: its last step may be incomplete. So
+    does what `begins` later than its file (in words; "" if it does not): it cannot be replayed.
     """
     written = 0
+    first_ns = min(file.first_ns for file in files)
     schemas: dict[tuple[str, str, bytes], int] = {}
     channels: dict[tuple[str, str, int, str], int] = {}
     known: dict[tuple[int, int], int] = {}
@@ -197,8 +203,13 @@ def _write(path: Path, files: list[McapFile], messages: Iterable[tuple[int, RawM
             writer.start("", "kiteline")
             for file in files:
                 damage = {} if file.cut is None else {REPAIRED: file.cut}
+                if begins:
+                    damage[BEGINS] = begins
                 for record in file.metadata:
-                    writer.add_metadata(record.name, {**record.metadata, **damage})
+                    facts = {**record.metadata, **damage}
+                    if file.first_ns > first_ns:
+                        facts.pop(BEGINS, None)  # it goes on where another part ends
+                    writer.add_metadata(record.name, facts)
             for number, m in messages:
                 target = known.get((number, m.channel))
                 if target is None:

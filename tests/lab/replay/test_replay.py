@@ -1,5 +1,6 @@
 """Logs fly again bit for bit, and a log that was tampered with is found out."""
 
+import errno
 import shutil
 import struct
 from pathlib import Path
@@ -13,11 +14,14 @@ from kiteline_hw.logs.log_budget import LogBudget
 from kiteline_hw.logs.mcap_file import McapFile
 from kiteline_hw.logs.mcap_log import ODOMETER, LogMessage, LogReader, LogWriter
 from kiteline_hw.logs.mcap_repair import repair
+from kiteline_hw.logs.whole_file import WholeFile
 from kiteline_hw.ports import SourceError
 from kiteline_hw.sources.open import open_source
 from kiteline_lab.flights.fly import fly
 from kiteline_lab.flights.plan import Options
+from kiteline_lab.replay.logged_steps import check_replayable
 from kiteline_lab.replay.replay import main, replay_agent
+from kiteline_lab.tools import logs
 from tests.wall import PERIOD_S, STEP_M
 
 
@@ -239,3 +243,35 @@ def test_a_recording_is_no_log_of_ours(recording: Path, tmp_path: Path) -> None:
     cut.write_bytes(cut.read_bytes()[:100])
     with pytest.raises(SourceError):
         main([str(cut), "--verify"])
+
+
+def test_a_log_without_its_beginning_is_no_log_that_differs(flown: Path, tmp_path: Path) -> None:
+    log, out = flown / "agent0" / "log.mcap", tmp_path / "cut.mcap"
+    assert logs.main(["cut", str(log), str(out), "--from", "0.5"]) == 0
+    with pytest.raises(SourceError, match=r"begins 0\.5 s after the start"):
+        main([str(out), "--verify"])
+    first, whole = tmp_path / "first.mcap", tmp_path / "whole.mcap"
+    assert logs.main(["cut", str(log), str(first), "--to", "0.499"]) == 0
+    assert main([str(first), "--verify"]) == 0
+    assert logs.main(["merge", str(whole), str(out), str(first)]) == 0
+    with LogReader(whole) as reader:
+        check_replayable(reader, "agent")
+
+
+@pytest.mark.parametrize("words", [["base/log.mcap", "--out", "again"], ["agent0/log.mcap", "--virtual"]])
+def test_options_without_effect_are_refused(flown: Path, words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(flown)
+    with pytest.raises((SourceError, SystemExit), match=r"base's log|2"):
+        main(words)
+
+
+def test_a_flight_under_a_limit_says_what_was_not_written(
+    flown: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(WholeFile, "write", full_disk)
+    assert main([str(flown / "agent0" / "log.mcap"), "--cpu", "50", "--virtual", "--out", str(tmp_path)]) == 0
+    assert "poses were not written: " in capsys.readouterr().err
+
+
+def full_disk(*_: object) -> None:
+    raise OSError(errno.ENOSPC, "No space left on device")
