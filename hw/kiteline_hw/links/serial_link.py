@@ -1,9 +1,14 @@
 """Packets over a serial port or a transparent radio; the framing is handed in (ports.Framer)."""
 
+import time
+from collections.abc import Callable
+
 from kiteline_hw.links.ends import LinkOptions, OneLinkHub
 from kiteline_hw.links.queued_link import LinkCounters, QueuedLink
 from kiteline_hw.ports import Framer, LinkError, LinkHub
 from kiteline_hw.system.serial_port import SerialPort, parse_serial
+
+_ALIVE_NS = 10_000_000_000  # ns after the last packet in which an agent counts as reachable: it sends one a second
 
 
 class SerialLink(QueuedLink):
@@ -13,9 +18,14 @@ class SerialLink(QueuedLink):
     port cannot be opened now.
     """
 
-    def __init__(self, device: str, baud: int, framer: Framer, *, required: bool = True) -> None:
+    def __init__(
+        self, device: str, baud: int, framer: Framer, *, required: bool = True,
+        clock: Callable[[], int] = time.monotonic_ns,
+    ) -> None:  # fmt: skip
         super().__init__()
         self._framer = framer
+        self._clock = clock
+        self._heard_ns: int | None = None  # when the last packet came
         self._port = SerialPort(device, baud, self._on_data, self._next_frame, required=required)
 
     @property
@@ -30,12 +40,18 @@ class SerialLink(QueuedLink):
         """True if the port is open; a radio without a peer looks the same."""
         return self._port.connected
 
+    @property
+    def alive(self) -> bool:
+        """True if anything came from the other end lately."""
+        return self._heard_ns is not None and self._clock() - self._heard_ns <= _ALIVE_NS
+
     def take_messages(self) -> list[str]:
         """See SerialPort."""
         return self._port.take_messages()
 
     def _on_data(self, data: bytes) -> None:
         for packet in self._framer.feed(data):
+            self._heard_ns = self._clock()
             self.deliver(packet)
 
     def _next_frame(self) -> bytes:
@@ -57,6 +73,18 @@ class SerialLink(QueuedLink):
         self._port.close()
 
 
+class SerialHub(OneLinkHub):
+    """A LinkHub whose agent is reachable while packets of it come."""
+
+    def __init__(self, link: SerialLink, agent: int) -> None:
+        super().__init__(link, agent)
+        self._link = link
+
+    def alive(self) -> frozenset[int]:
+        """The agent, if anything of it came in the last ten seconds."""
+        return super().alive() if self._link.alive else frozenset()
+
+
 def open_agent_end(address: str, options: LinkOptions) -> SerialLink:
     """Open DEVICE:BAUD. Raises LinkError."""
     if options.framer is None:
@@ -66,4 +94,4 @@ def open_agent_end(address: str, options: LinkOptions) -> SerialLink:
 
 def open_base_end(address: str, options: LinkOptions) -> LinkHub:
     """Open DEVICE:BAUD, at whose other end is one agent. Raises LinkError."""
-    return OneLinkHub(open_agent_end(address, options), options.agent)
+    return SerialHub(open_agent_end(address, options), options.agent)

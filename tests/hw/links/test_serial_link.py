@@ -11,7 +11,7 @@ from cobs import cobs
 
 from kiteline_hw.links.ends import OneLinkHub
 from kiteline_hw.links.queued_link import OUTBOX_PACKETS
-from kiteline_hw.links.serial_link import SerialLink
+from kiteline_hw.links.serial_link import SerialHub, SerialLink
 from kiteline_hw.ports import LinkError
 from kiteline_hw.sim.links.serial_pair import SerialPair
 from kiteline_hw.system.serial_port import parse_serial
@@ -175,3 +175,21 @@ def test_specs() -> None:
     for bad in ("", "/dev/ttyUSB0", "/dev/ttyUSB0:", ":57600", "/dev/ttyUSB0:fast", "/dev/ttyUSB0:0"):
         with pytest.raises(LinkError, match="expected DEVICE:BAUD"):
             parse_serial(bad)
+
+
+def test_an_agent_is_reachable_while_packets_of_it_come(tmp_path: Path) -> None:
+    now_ns = 0
+    with SerialLink(str(tmp_path / "none"), 57600, CobsFramer(), required=False) as missing:
+        assert SerialHub(missing, 3).alive() == frozenset()
+    with (
+        SerialPair() as pair,
+        SerialLink(pair.a, 57600, CobsFramer()) as a,
+        SerialLink(pair.b, 57600, CobsFramer(), clock=lambda: now_ns) as b,
+    ):
+        hub = SerialHub(b, 3)
+        assert hub.alive() == frozenset()
+        assert a.send(b"here")
+        wait_for(gather(b, [], 1))
+        assert hub.alive() == frozenset([3])
+        now_ns = 11_000_000_000
+        assert hub.alive() == frozenset()
