@@ -1,6 +1,7 @@
 """`kiteline status`: a base's answer as lines of text, and its exit status."""
 
 import json
+import threading
 from copy import deepcopy
 from pathlib import Path
 from typing import Any
@@ -90,3 +91,24 @@ def test_the_help_names_the_exit_status_of_a_base_that_does_not_answer(monkeypat
     monkeypatch.setattr(maps, "ask", silent)
     monkeypatch.setattr(maps, "default_path", lambda: Path("no keys"))
     assert kiteline(["status"]) == 2 and "2 no base answers" in status.parser().format_help().replace("\n", " ")
+
+
+def test_a_base_that_does_not_answer_is_waited_for_with_a_word(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    told = threading.Event()
+
+    def slow(*_: object, **__: object) -> tuple[bool, str]:
+        assert told.wait(10.0)
+        return True, json.dumps({"maps": []})
+
+    def tell(lines: list[str]) -> None:
+        print(*lines)
+        told.set()
+
+    monkeypatch.setattr(maps, "_PATIENCE_S", 0.01)
+    monkeypatch.setattr("kiteline_lab.tools.maps.process.print_lines", tell)
+    monkeypatch.setattr(maps, "ask", slow)
+    monkeypatch.setattr(maps, "default_path", lambda: Path("no keys"))
+    assert maps.main(["list", "--base", "tcp/10.0.0.1:7447"]) == 0
+    assert "waiting for a base at tcp/10.0.0.1:7447" in capsys.readouterr().out
