@@ -164,6 +164,14 @@ def check(p: argparse.ArgumentParser, a: argparse.Namespace) -> None:
         p.error(f"--tracker ekf uses no {' and no '.join(unused)}: leave them out, or fly --tracker map")
     if a.obstacles and not a.mavlink:
         p.error("--obstacles tells a flight controller: expected --mavlink URL beside it")
+    if not a.mavlink and (unused := _unused_without_controller(p, a)):
+        p.error(f"{' and '.join(unused)}: of the poses for a flight controller: expected --mavlink URL beside it")
+
+
+def _unused_without_controller(p: argparse.ArgumentParser, a: argparse.Namespace) -> list[str]:
+    """Arguments that have no effect without a flight controller."""
+    names = ("axes", "offset", "heading", "pose_messages", "origin", "mavlink_key")
+    return [f"--{name.replace('_', '-')}" for name in names if getattr(a, name) != p.get_default(name)]
 
 
 def _unused_by_filter(a: argparse.Namespace) -> list[str]:

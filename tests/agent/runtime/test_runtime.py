@@ -66,6 +66,7 @@ def test_what_the_filter_has_no_use_for_is_refused(given: list[str], capsys: pyt
         (["--up-bytes", "-1"], "--up-bytes: -1: expected 0"),
         (["--up-bytes", "1.5"], "--up-bytes: 1.5: expected a whole number, 0 (no limit) or more"),
         (["--obstacles"], "expected --mavlink URL"),
+        (["--axes", "rdf", "--pose-messages", "vision"], "--axes and --pose-messages: of the poses"),
     ],
 )
 def test_what_has_no_meaning_is_refused(given: list[str], words: str, capsys: pytest.CaptureFixture[str]) -> None:
