@@ -126,7 +126,7 @@ class EkfAgent:
             self._measured_ns, self._told = t_ns, False
         elif not self._told and t_ns - self._measured_ns >= _SILENT_NS:
             self._told = True
-            return ["odometer: no samples arrive; the Kalman filter flies by them"]
+            return ["odometer: no samples arrive; the Kalman filter flies by them (--tracker map needs none)"]
         return []
 
     def _estimate(self, t_ns: int, inliers: int) -> Estimate:

@@ -49,7 +49,8 @@ from kiteline_hw.system.vocabulary import shipped_vocabulary
 
 SAVE_FRAMES = 200  # frames between two looks at whether the rig file is up to date
 PROGRESS_FRAMES = 10  # frames between two reports of progress, and between two readings of the memory in use
-_WARNING, _MOST_WARNINGS = ("imu:", "images:"), 10  # events that begin so are noted in the report, as many at most
+# events that begin so are noted in the report, as many at most
+_WARNING, _MOST_WARNINGS = ("imu:", "images:", "odometer: no samples"), 10
 _IMAGES_WAITING = 12  # images that wait to be encoded, 9 MB; then live flights store images, others wait
 
 

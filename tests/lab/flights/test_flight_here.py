@@ -110,3 +110,8 @@ def test_a_limit_covers_the_base_in_the_same_computer(recording: Path, tmp_path:
         tracking_ms[mode] = report["agents"][0]["timing"]["tracking_ms"]["mean"]
     assert dropped["local"] > dropped["tracker"]
     assert tracking_ms["local"] > 1.5 * tracking_ms["tracker"]
+
+
+def test_a_filter_without_odometry_says_what_is_missing(recording: Path, tmp_path: Path) -> None:
+    report, _ = fly(Options((str(recording),), tmp_path, "tracker", tracker="ekf"), quiet=True)
+    assert [note for note in report["agents"][0]["notes"] if note.startswith("odometer: no samples arrive")]
