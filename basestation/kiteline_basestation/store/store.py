@@ -192,7 +192,9 @@ def _take(folder: Path) -> IO[bytes]:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:
         lock.close()
-        raise StoreError(f"{folder}: another base uses this store; give each its own --store") from None
+        raise StoreError(
+            f"{folder}: a base uses this store: stop it first, or give each base its own --store"
+        ) from None
     return lock
 
 

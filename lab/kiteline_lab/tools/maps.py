@@ -10,7 +10,7 @@ import secrets
 import sys
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -85,15 +85,20 @@ def table(answer: Mapping[str, Any]) -> str:
     """A reply as a table of text."""
     if "maps" not in answer and "id" not in answer:
         return json.dumps(answer)
-    lines = [f"{'map':10} {'name':16} {'agents':8} {'keyframes':>9} {'points':>8}  placed  unit   submaps"]
+    rows = [("map", "name", "agents", "keyframes", "points", "placed", "unit", "submaps")]
     for m in answer.get("maps", [answer]):
         agents, submaps = ",".join(map(str, m["agents"])), " ".join(map(_submap, m["submaps"]))
         placed = "yes" if m["placed"] else "no"
-        lines.append(
-            f"{m['id']:10} {m['name'][:16]:16} {agents:8} {m['keyframes']:9} {m['points']:8}  {placed:6}  "
-            f"{m['unit']:5}  {submaps}"
-        )
-    return "\n".join(lines)
+        rows.append(
+            (m["id"], m["name"], agents, str(m["keyframes"]), str(m["points"]), placed, m["unit"], submaps)
+        )  # fmt: skip
+    return "\n".join(columns(rows))
+
+
+def columns(rows: Sequence[tuple[str, ...]]) -> list[str]:
+    """Rows of text as lines, in columns as wide as their widest text."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return ["  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in rows]
 
 
 def _submap(submap: Mapping[str, Any]) -> str:

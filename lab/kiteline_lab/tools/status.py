@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from kiteline_hw.ports import LinkError
-from kiteline_lab.tools.maps import DEFAULT_BASE, add_options, ask_base
+from kiteline_lab.tools.maps import DEFAULT_BASE, add_options, ask_base, columns
 
 _WATCH_S, _MOST_WATCH_S = 2.0, 86400.0  # s between two reports
 
@@ -41,7 +41,7 @@ def lines(report: Mapping[str, Any], before: Mapping[str, Any] | None = None) ->
     ]  # fmt: skip
     if report["agents"]:
         rows = [_agent(agent, _rates(agent, report, before)) for agent in report["agents"]]
-        out += _columns([_HEAD, *rows])
+        out += columns([_HEAD, *rows])
     else:
         out.append("no agent yet")
     return [*out, *(f"wrong: {trouble}" for trouble in report["troubles"])]
@@ -82,12 +82,6 @@ def _rates(
             up, down = (agent[way] - old[way] for way in ("bytes_up", "bytes_down"))
             return up / 1000 / span_s, down / 1000 / span_s
     return None
-
-
-def _columns(rows: list[tuple[str, ...]]) -> list[str]:
-    """Rows with columns of equal width."""
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return ["  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip() for row in rows]
 
 
 def _span(seconds: float) -> str:

@@ -112,3 +112,13 @@ def test_a_base_that_does_not_answer_is_waited_for_with_a_word(
     monkeypatch.setattr(maps, "default_path", lambda: Path("no keys"))
     assert maps.main(["list", "--base", "tcp/10.0.0.1:7447"]) == 0
     assert "waiting for a base at tcp/10.0.0.1:7447" in capsys.readouterr().out
+
+
+def test_maps_are_listed_in_columns() -> None:
+    made = {"agents": [0], "keyframes": 26, "points": 1246, "placed": True, "unit": "metre", "submaps": []}
+    names = ["hangar", "a name of more than sixteen letters"]
+    listed = [{"id": f"0.100140.{428 + i}", "name": name, **made} for i, name in enumerate(names)]
+    head, *rows = maps.table({"maps": listed}).splitlines()
+    for title, value in (("name", "hangar"), ("keyframes", "26"), ("unit", "metre")):
+        assert head.index(title) == rows[0].index(value)
+    assert names[1] in rows[1]
