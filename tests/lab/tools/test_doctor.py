@@ -177,6 +177,15 @@ def test_a_controller_that_signs_needs_the_key(
     assert "9 are as kiteline needs them" in capsys.readouterr().out
 
 
+def test_a_port_that_is_missing_is_not_said_to_be_tried_again(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    monkeypatch.setattr(doctor, "CHECKS", ())
+    assert doctor.main(["--mavlink", f"serial:{tmp_path / 'none'}:921600"]) == 1
+    told = capsys.readouterr().out
+    assert "the device is missing" in told and "group dialout" in told and "tried" not in told
+
+
 def test_power_of_a_raspberry_pi(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     file = tmp_path / "get_throttled"
     monkeypatch.setattr(vehicle, "THROTTLED", (file,))

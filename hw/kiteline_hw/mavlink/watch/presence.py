@@ -9,6 +9,7 @@ from kiteline_hw.mavlink.watch.findings import FindingLevel, FindingLog
 from kiteline_hw.mavlink.watch.messages import AUTOPILOT_VERSION, REQUEST_MESSAGE, AutopilotVersion, Command
 
 TOPIC, DEVICE_TOPIC, SIGNING_TOPIC, ANSWER_TOPIC = "controller", "device", "signing", "answers"
+RETRIED = "It is tried again"  # the end of the remedy for a port that cannot be opened
 _AUTOPILOTS = {3: "ArduPilot", 12: "PX4"}
 
 
@@ -171,7 +172,7 @@ class PresenceWatch:
             self._log.say(
                 DEVICE_TOPIC, link.device_fault, FindingLevel.ERROR,
                 f"flight controller: {self._url}: {link.device_fault}", "kiteline: serial port is missing",
-                "Plug it in, or end the program that uses it; this user must be in group dialout. It is tried again",
+                f"Plug it in, or end the program that uses it; this user must be in group dialout. {RETRIED}",
             )  # fmt: skip
         elif self._log.state(DEVICE_TOPIC) not in (None, ""):
             self._log.say(

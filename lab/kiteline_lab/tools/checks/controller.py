@@ -10,6 +10,7 @@ def check_controller(url: str, key: str = "") -> list[DoctorCheck]:
     """
     from kiteline_hw.mavlink.surveyor import survey_controller
     from kiteline_hw.mavlink.watch.findings import FindingLevel
+    from kiteline_hw.mavlink.watch.presence import RETRIED  # an agent tries again, this check does not
     from kiteline_hw.system.clock import MonotonicClock
 
     severities = {
@@ -18,4 +19,4 @@ def check_controller(url: str, key: str = "") -> list[DoctorCheck]:
         FindingLevel.INFO: Severity.OK,
     }
     found = survey_controller(url, MonotonicClock(), key)
-    return [DoctorCheck(severities[f.level], f.topic, f.text, f.remedy) for f in found]
+    return [DoctorCheck(severities[f.level], f.topic, f.text, f.remedy.removesuffix(f". {RETRIED}")) for f in found]
