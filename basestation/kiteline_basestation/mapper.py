@@ -338,6 +338,7 @@ class Mapper:
         for record in self._intake.take_scans():
             self.grid_updates.add_scan(record)
         for images in self._intake.take_images():
+            self.grid_updates.expect_scans(agent_of_keyframe(images.keyframe))
             self.image_scans.add(images)
         before = self.grid_updates.grid.revision
         self.grid_updates.update(busy=busy)

@@ -17,6 +17,7 @@ class ScanQueue:
         self._channel = channel
         self._under_way: list[Key] = []
         self._waiting: dict[Key, bytes] = {}  # codes, the newest at the end
+        self.any_put = False  # so far
 
     def __len__(self) -> int:
         """Number of waiting scans."""
@@ -24,6 +25,7 @@ class ScanQueue:
 
     def put(self, record: KeyframeScan) -> None:
         """Share a scan, in place of one that waits under the same key."""
+        self.any_put = True
         if record.part < KeyframeScan.FIRST_PARTS:
             self._channel.put(record)
             return

@@ -35,6 +35,7 @@ from kiteline_core.ids import NO_KEYFRAME, KeyframeId
 
 _MOST_PARTS = 2  # of a scan in one frame, after a gap too
 _AGAIN_S = 0.5  # s after which a camera that stays where it is scans again for the local grid: people walk in
+_TELLS_OF = 4  # scans of which none is believed, after which the base is told that there are some
 _PART_S = 0.05  # s between frames in which a stripe is matched: two at 10 Hz, so that every keyframe can be scanned
 
 
@@ -108,6 +109,7 @@ class ScanStage:
         self._keyframe = NO_KEYFRAME  # the newest one, whose scans are numbered
         self._part = 0  # of its newest scan
         self._queue = ScanQueue(channel)
+        self._unbelieved = 0  # scans, before the base has got any
         self._images = SentImages(channel)
         self._stretch = 0  # of the flight: counts losses after which the odometry frame lies elsewhere
         bf, at_scan = local_map.camera.bf, self._segmenter.camera.bf
@@ -265,7 +267,10 @@ class ScanStage:
             labels = segmenter.label_of(self._view.at(begun.uv))
             labels = labels[:0] if self._channel.profile.thin else labels
             record = KeyframeScan(begun.keyframe, seen.scan, labels, begun.part, begun.T_k_s)
-            self._take(self._ground.note(record, Seen(begun.T_o_c, *seen)))
+            verdict = self._ground.note(record, Seen(begun.T_o_c, *seen))
+            self._take(verdict)
+            if not verdict.believed:
+                self._tell_of(record)
         ground = self._ground.expected(begun.T_o_c, begun.up_c)
         height_m = None if ground is None else ground.height_m
         return Scanned(seen.scan, begun.T_o_c, height_m, self._map.disparity_offset, begun.repeats)
@@ -273,7 +278,23 @@ class ScanStage:
     def _take(self, verdict: Verdict[KeyframeScan]) -> None:
         """Share scans that are believed, and take back those that are not any more."""
         for wrong in verdict.withdrawn:
-            blank = without_ground(wrong.scan)
-            self._queue.put(KeyframeScan(wrong.keyframe, blank, wrong.labels[:0], wrong.part, wrong.T_k_s))
+            self._queue.put(_blank(wrong))
         for record in verdict.believed:
             self._queue.put(record)
+
+    def _tell_of(self, record: KeyframeScan) -> None:
+        """Share what a scan shows without a ground, once, while none is believed.
+
+        The base takes an agent without scans for one that makes none, and draws its landmarks: their lowest ones are the
+        top of a box where no floor was seen.
+        """
+        if self._queue.any_put:
+            return
+        self._unbelieved += 1
+        if self._unbelieved == _TELLS_OF:
+            self._queue.put(_blank(record))
+
+
+def _blank(record: KeyframeScan) -> KeyframeScan:
+    """A scan whose ground is not believed, as the base gets it."""
+    return KeyframeScan(record.keyframe, without_ground(record.scan), record.labels[:0], record.part, record.T_k_s)

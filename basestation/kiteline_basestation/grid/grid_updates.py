@@ -50,14 +50,19 @@ class GridUpdates:
         self._unmade: dict[KeyframeId, None] = {}  # their scan is to be made from landmarks
         self._waited = 0  # busy steps since something could be drawn
 
+    def expect_scans(self, agent: AgentId) -> None:
+        """Draw an agent's scans alone from now on, not its landmarks: it makes some, though none may be believed yet."""
+        if agent in self._scanning:
+            return
+        self._scanning.add(agent)
+        for keyframe in [k for k in self._scans if agent_of_keyframe(k) == agent]:
+            self._drop(keyframe)
+        self._unmade = {k: None for k in self._unmade if agent_of_keyframe(k) != agent}
+
     def add_scan(self, record: KeyframeScan) -> None:
         """Take an agent's scan. From the first one on, only its scans are drawn."""
         agent = agent_of_keyframe(record.keyframe)
-        if agent not in self._scanning:
-            self._scanning.add(agent)
-            for keyframe in [k for k in self._scans if agent_of_keyframe(k) == agent]:
-                self._drop(keyframe)
-            self._unmade = {k: None for k in self._unmade if agent_of_keyframe(k) != agent}
+        self.expect_scans(agent)
         if record.part == 0:
             self._labels[record.keyframe] = record.labels
         camera = self._map.cameras.get(agent)

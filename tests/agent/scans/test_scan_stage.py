@@ -130,8 +130,11 @@ def test_the_log_tells_the_nearest_obstacle(recording: Path) -> None:
 
 def test_scans_are_not_shared_while_the_height_of_the_ground_is_unknown(recording: Path) -> None:
     agent, channel, matched, _ = flown(recording, eager(), known=False)
-    assert any(matched) and not channel.scans
+    assert any(matched)
     assert agent._local_grid._ground_m is None  # all height bands of tiles count
+    # The base is told that there are scans: else it draws landmarks, the lowest of which are taken for the floor.
+    (told,) = channel.scans
+    assert np.isnan(told.scan.camera_height_m) and not told.scan.free_m.any() and not told.scan.bands.any()
 
 
 def test_scans_above_a_table_are_taken_back_once_the_floor_is_seen(recording: Path) -> None:

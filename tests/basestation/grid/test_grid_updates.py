@@ -13,10 +13,11 @@ from kiteline_basestation.grid.scan_grid import ScanGrid
 from kiteline_basestation.job_kinds import run_job
 from kiteline_basestation.jobs import JobDone
 from kiteline_basestation.mapper import Mapper, MapperInput
-from kiteline_codec.schema import CameraIntrinsics, KeyframeScan, Record, messages
+from kiteline_codec.schema import CameraIntrinsics, KeyframeScan, Record, ScanImages, messages
 from kiteline_core.arrays import F64, I8, Bool
 from kiteline_core.geometry import se3
 from kiteline_core.ground.column_scan import level_rotation
+from kiteline_core.ground.ground_height import without_ground
 from kiteline_core.ids import KEYPOINT_BITS, KeyframeId, submap_of_keyframe
 from tests.basestation.flat_rooms import box, scan_of
 
@@ -261,6 +262,14 @@ def test_landmarks_wait_until_a_stereo_agent_would_have_sent_a_scan(make_flight:
     mapper = Mapper()
     feed(mapper, flight, flight.records)
     assert len(mapper.grid) > few
+    unbelieved = KeyframeScan(flight.keyframes[2], without_ground(scans(flight)[0].scan), np.zeros(0, np.uint8))
+    mapper = Mapper()
+    feed(mapper, flight, [*flight.records, [unbelieved]])
+    assert len(mapper.grid) == 0  # it makes scans, and believes none
+    images = ScanImages(flight.keyframes[2], np.eye(4), 0, np.array([0.0, -1.0, 0.0]), b"unreadable")
+    mapper = Mapper()
+    feed(mapper, flight, [*flight.records, [images]])
+    assert len(mapper.grid) == 0
     mapper = Mapper()
     one_eye = replace(flight.camera, stereo=False)
     mapper.step(MapperInput(((flight.agent, (CameraIntrinsics(flight.agent, one_eye),)),), ()), 0)
