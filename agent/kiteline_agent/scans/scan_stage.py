@@ -285,8 +285,8 @@ class ScanStage:
     def _tell_of(self, record: KeyframeScan) -> None:
         """Share what a scan shows without a ground, once, while none is believed.
 
-        The base takes an agent without scans for one that makes none, and draws its landmarks: their lowest ones are the
-        top of a box where no floor was seen.
+        The base takes an agent without scans for one that makes none, and draws its landmarks: the lowest ones may be
+        the top of a box where no floor was seen.
         """
         if self._queue.any_put:
             return

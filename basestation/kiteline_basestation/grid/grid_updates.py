@@ -51,7 +51,7 @@ class GridUpdates:
         self._waited = 0  # busy steps since something could be drawn
 
     def expect_scans(self, agent: AgentId) -> None:
-        """Draw an agent's scans alone from now on, not its landmarks: it makes some, though none may be believed yet."""
+        """Draw an agent's scans alone from now on, not its landmarks: it makes some, though it may believe none yet."""
         if agent in self._scanning:
             return
         self._scanning.add(agent)
