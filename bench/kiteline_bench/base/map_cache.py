@@ -14,8 +14,8 @@ from kiteline_bench.harness.run import TICK_NS, Part, Scenario, fly_with_base
 from kiteline_core.ids import AgentId, agent_of_keyframe
 from kiteline_hw.sim.config import SimConfig
 from kiteline_hw.sim.source import SimSource
-from kiteline_lab.flights.out_file import whole_file
 from kiteline_lab.flights.simulate import record
+from kiteline_lab.outputs.out_file import whole_file
 
 TITLE = "The map cache"
 

@@ -25,8 +25,8 @@ from kiteline_lab.calibration.picture import residual_picture
 from kiteline_lab.calibration.solve import Calibrated
 from kiteline_lab.calibration.verdict import CalibrationFinding, judge, overall
 from kiteline_lab.calibration.views import ViewCollector
-from kiteline_lab.flights.out_file import whole_file, write_whole
 from kiteline_lab.flights.progress import Progress
+from kiteline_lab.outputs.out_file import whole_file, write_whole
 
 _DPI = 300  # of a printed board
 _M_AN_INCH = 0.0254

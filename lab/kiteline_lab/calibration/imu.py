@@ -27,7 +27,7 @@ from kiteline_hw.system import process
 from kiteline_hw.system.clock import MonotonicClock
 from kiteline_lab.calibration.imu_guide import ImuProgress
 from kiteline_lab.calibration.verdict import overall
-from kiteline_lab.flights.out_file import expect_writable, whole_file
+from kiteline_lab.outputs.out_file import expect_writable, whole_file
 
 _IDLE_NS = 50_000_000  # ns that a live camera is awaited at most
 _EVERY = 10  # frames between two looks

@@ -14,11 +14,11 @@ from kiteline_hw.ports import LinkError, SourceError
 from kiteline_hw.sources.kinds import source_forms
 from kiteline_lab.flights.flight_report import Report, table
 from kiteline_lab.flights.in_process import fly_in_process
-from kiteline_lab.flights.out_file import sole_writer
 from kiteline_lab.flights.outcome import FlightOutcome
 from kiteline_lab.flights.plan import Options, plan
 from kiteline_lab.flights.processes import fly_processes, link_ends
 from kiteline_lab.flights.results import write_results
+from kiteline_lab.outputs.out_file import sole_writer
 from kiteline_lab.plots.plot import can_plot
 
 MODES = ("tracker", "local", "monolith", "distributed")

@@ -17,9 +17,9 @@ from kiteline_hw.sim.sensors.wear import KINDS
 from kiteline_hw.sim.source import SimSource
 from kiteline_hw.sim.truth.sight import CELL_M, look
 from kiteline_hw.sim.world.world import World
-from kiteline_lab.flights.out_file import expect_nothing_lost, whole_file
 from kiteline_lab.flights.progress import Progress
 from kiteline_lab.grids.truth import write_truth
+from kiteline_lab.outputs.out_file import expect_nothing_lost, whole_file
 
 JPEG_QUALITY = 92
 COURSE = "course"  # in place of a trajectory: the scene's own course

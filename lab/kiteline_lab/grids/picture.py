@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 
 from kiteline_core.arrays import F64, I8, U8
-from kiteline_lab.flights.out_file import write_whole
 from kiteline_lab.grids.files import FREE, OCCUPIED, UNKNOWN, GridFile, GridFileError
 from kiteline_lab.grids.prm import GridEvalConfig, Roads, draw_roads
+from kiteline_lab.outputs.out_file import write_whole
 
 _SHADES = {FREE: (255, 255, 255), OCCUPIED: (0, 0, 0), UNKNOWN: (190, 190, 190)}  # BGR, as all colours here
 _RED, _ORANGE, _BLUE, _LIGHT_BLUE, _GREEN = (40, 40, 215), (60, 165, 245), (190, 90, 20), (235, 190, 130), (60, 140, 30)

@@ -14,7 +14,7 @@ import numpy as np
 from kiteline_core.arrays import F64
 from kiteline_core.frame import Trajectory
 from kiteline_lab.evaluation.metrics import TrajectoryAlignment, match, position_errors, truth_at
-from kiteline_lab.flights.out_file import write_whole
+from kiteline_lab.outputs.out_file import write_whole
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

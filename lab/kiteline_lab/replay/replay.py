@@ -27,8 +27,8 @@ from kiteline_hw.logs.log_parts import WholeLog
 from kiteline_hw.logs.mcap_log import LogReader
 from kiteline_hw.ports import SourceError
 from kiteline_hw.system import process
-from kiteline_lab.flights.out_file import write_whole
 from kiteline_lab.flights.progress import Progress
+from kiteline_lab.outputs.out_file import write_whole
 from kiteline_lab.replay.logged_steps import Step, agent_input, agent_of_log, check_replayable, steps
 
 

@@ -8,8 +8,8 @@ from kiteline_hw.logs.mcap_log import GROUND_TRUTH, IMU, ODOMETER, LogWriter
 from kiteline_hw.ports import FrameSource
 from kiteline_hw.sources.kinds import source_forms
 from kiteline_hw.sources.open import open_source
-from kiteline_lab.flights.out_file import expect_nothing_lost, whole_file
 from kiteline_lab.flights.progress import Progress
+from kiteline_lab.outputs.out_file import expect_nothing_lost, whole_file
 
 
 def main(argv: list[str]) -> int:

@@ -23,7 +23,7 @@ from kiteline_core.arrays import I64
 from kiteline_core.errors import KitelineError
 from kiteline_core.geometry import sim3
 from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, agent_of_keyframe
-from kiteline_lab.flights.out_file import write_whole
+from kiteline_lab.outputs.out_file import write_whole
 
 FORMATS = ("tum", "ply", "pgm", "g2o")
 _PLAIN_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.+-]*")  # of a picture, as it stands in YAML

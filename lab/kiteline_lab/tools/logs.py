@@ -15,7 +15,7 @@ from mcap.writer import CompressionType, Writer
 from kiteline_hw.logs.mcap_file import McapFile, RawMessage
 from kiteline_hw.logs.mcap_repair import BEGINS, REPAIRED
 from kiteline_hw.ports import SourceError
-from kiteline_lab.flights.out_file import whole_file
+from kiteline_lab.outputs.out_file import whole_file
 
 _LATEST_S = 1e9  # s from the start of a log: 30 years are later than any end
 _LASTING = ("kiteline.Rig", "sensor_msgs/msg/CameraInfo", "foxglove.CameraCalibration")

@@ -25,7 +25,7 @@ from kiteline_core.errors import KitelineError
 from kiteline_core.geometry import disparity_offset, se3
 from kiteline_core.geometry.cameras import CameraModel, CameraRig, RectifiedCamera
 from kiteline_core.ids import AgentId
-from kiteline_lab.flights.out_file import write_whole
+from kiteline_lab.outputs.out_file import write_whole
 from kiteline_lab.tools.export import load
 
 FORMATS = ("kalibr", "euroc", "kiteline")

@@ -84,7 +84,7 @@ def test_a_store_serves_one_base_and_any_number_of_readers(tmp_path: Path) -> No
     store = Store(tmp_path)
     store.write(Batch(rows=[(1, 0, 3, 7, 0, b"x")]))
     assert read(tmp_path).agents[AgentId(1)].received == {Key(3, 7): b"x"}
-    with pytest.raises(StoreError, match="another base"):
+    with pytest.raises(StoreError, match="a base uses this store"):
         Store(tmp_path)
     store.close()
     Store(tmp_path).close()

@@ -67,7 +67,7 @@ def test_damaged_packets_with_a_good_checksum_are_harmless(seed: int, data: st.D
     [
         ({"packet_bytes": 100}, "packet_bytes"),
         ({"packet_bytes": 1 << 17}, "packet_bytes"),
-        ({"budget_bytes": 100}, "budget"),
+        ({"budget_bytes": 100}, "too few"),
     ],
 )
 def test_impossible_configurations_are_refused(changes: dict[str, int], text: str) -> None:

@@ -14,8 +14,8 @@ from kiteline_core.geometry.cameras import CameraModel, CameraRig
 from kiteline_hw.logs.mcap_log import LogWriter
 from kiteline_hw.ports import LinkError, SourceError, SourceReport
 from kiteline_lab.flights.fly import clear, fly, link_bytes, options, repair_logs
-from kiteline_lab.flights.out_file import sole_writer
 from kiteline_lab.flights.plan import Options, flight_starts
+from kiteline_lab.outputs.out_file import sole_writer
 
 
 class Stamps:

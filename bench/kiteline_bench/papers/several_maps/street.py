@@ -12,9 +12,9 @@ from kiteline_core.frame import Frame
 from kiteline_hw.logs.mcap_log import GROUND_TRUTH, LogWriter
 from kiteline_hw.sim.sensors.camera import SimCamera
 from kiteline_hw.sim.source import SimSource, open_sim
-from kiteline_lab.flights.out_file import whole_file
 from kiteline_lab.flights.progress import Progress
 from kiteline_lab.flights.simulate import encode
+from kiteline_lab.outputs.out_file import whole_file
 
 _BASELINE_M = 0.54  # of KITTI's cameras
 _EVERY = 2  # frames of the simulator at 20 Hz

@@ -1,0 +1,1 @@
+"""Output files: complete or absent, and folders with one writer."""
