@@ -23,8 +23,7 @@ _MIN_POINTS = 40  # points of a keyframe with a measured offset; five numbers ar
 _PRIOR_PX = 1.5  # px; standard deviation of each number before anything was measured: a worn rig's
 _MAX_PX = 3.5  # px of the level; offset beyond which the patch is another one
 _MIN_NCC = 0.9  # correlation of the two patches; lower at occlusions
-_MIN_CHANGE_PX = 0.5  # px; rms over points of a first change that is applied: good calibrations are off by 0.3 px
-_LEAST_CHANGE_PX = 0.1  # px; of a later one: where lines converge, disparities are off by more than their rows
+_MIN_CHANGE_PX = 0.5  # px; rms over points of a change that is applied: good calibrations are off by 0.3 px
 _MIN_SIGNIFICANCE = 4.0  # standard deviations of a change that is applied
 _KNOWN_PX = 0.1  # px; standard deviation of each number where an earlier flight measured it
 _SHARE_PX = 0.1  # px; rms over points of a change that the base is told: a tenth of what a worn rig has
@@ -129,21 +128,18 @@ class RowAlignment:
     def apply(self) -> float:
         """Read the right image at its rows if the last points are significantly off. Returns their rms px, or 0.
 
-        One keyframe knows worn rows to some tenths of a pixel, later ones better: changes are smaller then. After
-        `read_lower` any measured change is applied.
+        After `read_lower` any measured change is applied.
         """
         estimate = self.estimate_px
         change = estimate - self.applied_px
         at = self._at
         rms = float(np.sqrt(np.mean((at @ change) ** 2)))
         sigma = float(np.sqrt(np.mean(np.einsum("ni,in->n", at, np.linalg.solve(self._information, at.T)))))
-        least_px, sigma = (_LEAST_CHANGE_PX, _SIGMA_SHARE * sigma) if self.read else (_MIN_CHANGE_PX, sigma)
-        if not self._rough and (rms < least_px or rms < _MIN_SIGNIFICANCE * sigma):
+        if not self._rough and (rms < _MIN_CHANGE_PX or rms < _MIN_SIGNIFICANCE * sigma):
             return 0.0
-        if self._rough or rms >= _MIN_CHANGE_PX:
-            said = f"rows of the right image are {estimate[0]:+.2f} px off in the middle"
-            self._events.append(f"images: {said}: {_BENT}" if self._rough else said)
         self._read_at(estimate)
+        said = f"rows of the right image are {estimate[0]:+.2f} px off in the middle"
+        self._events.append(f"images: {said}: {_BENT}" if self._rough else said)
         self._rough = False
         return rms
 
