@@ -32,6 +32,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         process.exit_now(
             process.run_child(options.link, partial(fly_lockstep, options), partial(fly_live, options), expected)
         )
+    if not a.quiet:
+        process.print_lines(["loading the base, for some seconds"])
     sealing = sealing_of(a.link, "base", 0, a.key, insecure=a.insecure)
     a.key, a.told = sealing.key, sealing.lines
     if a.paired_only and not (a.key and a.link.startswith("zenoh:")):

@@ -142,6 +142,7 @@ def heads(store: Path) -> int:
 def test_a_base_without_agents_stops_on_a_signal(tmp_path: Path, start: Start, how: signal.Signals) -> None:
     base = start("base", "--link", f"zenoh:{free_endpoint()}", "--web", "127.0.0.1:0")
     assert base.stderr is not None
+    assert base.stderr.readline().startswith("loading the base")
     assert "http://127.0.0.1" in base.stderr.readline()
     stop(base, how)
 
