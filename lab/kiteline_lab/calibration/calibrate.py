@@ -10,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from kiteline_core.arguments import period
 from kiteline_core.arrays import U8
 from kiteline_core.errors import KitelineError
 from kiteline_core.frame import Frame, ImuBatch, OdometryBatch
@@ -88,7 +89,7 @@ def _parser() -> argparse.ArgumentParser:
                         help="auto: the one that fits better; equidistant: for fisheyes")  # fmt: skip
     camera.add_argument("--coefficients", type=int, choices=(4, 5, 8), default=4, help="of a radtan lens (default: 4)")
     camera.add_argument("--mono", action="store_true", help="the left camera alone")
-    camera.add_argument("--every", type=float, default=0.2, metavar="S",
+    camera.add_argument("--every", type=period, default=0.2, metavar="S",
                         help="s between two images that are looked at (default: 0.2; 0: all)")  # fmt: skip
     camera.add_argument("--until-complete", action="store_true", help="end as soon as nothing is missing")
     camera.add_argument("--calibration", default="", metavar="FILE[,FILE]",

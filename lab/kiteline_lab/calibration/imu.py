@@ -20,6 +20,7 @@ from kiteline_agent.runtime.agent_runtime import AgentRuntime, opened
 from kiteline_agent.runtime.controller import controller_link, with_controller_imu
 from kiteline_agent.runtime.options import AgentOptions, agent_config
 from kiteline_agent.step import StepInput
+from kiteline_core.arguments import duration
 from kiteline_core.errors import KitelineError
 from kiteline_core.geometry import se3
 from kiteline_hw.sources.kinds import source_forms
@@ -48,7 +49,7 @@ def add_parser(verbs: Any) -> None:
     p.add_argument("--rig", type=Path, required=True, metavar="FILE",
                    help="the rig file to write, for `agent --rig`; what it says of the cameras is kept")  # fmt: skip
     p.add_argument("--calibration", default="", metavar="FILE[,FILE]", help="cameras, place and noise of the IMU")
-    p.add_argument("--seconds", type=float, default=120.0, metavar="S", help="at most (default: 120)")
+    p.add_argument("--seconds", type=duration, default=120.0, metavar="S", help="at most (default: 120)")
     p.add_argument("--mavlink", default="", metavar="URL", help="take the IMU of this flight controller")
     p.add_argument("--axes", default="", metavar="XYZ", help="as of the agent, with --mavlink")
     p.add_argument("--config", default="", metavar="F.toml", help="as of the agent, with T_f_c for --mavlink")

@@ -301,3 +301,16 @@ def test_pictures_without_the_board_leave_no_file(tmp_path: Path) -> None:
     with pytest.raises(NoBoard, match=r"none of 2 images: expected a ChArUco board \(DICT_4X4_50\).*--board"):
         main(["camera", source, "--board", "charuco:9x7:0.03:0.02:DICT_4X4_50", "--out", str(out)])
     assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        *(["imu", "--rig", "rig.toml", "--seconds", text] for text in ("nan", "-1", "0", "inf", "a")),
+        *(["camera", "--board", "charuco:9x7:0.03", "--every", text] for text in ("nan", "-1", "1e300")),
+    ],
+)
+def test_numbers_that_are_no_time_are_refused(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main([words[0], "images:nowhere", *words[1:]])
+    assert f"{words[-2]}: {words[-1]}: expected " in capsys.readouterr().err
