@@ -118,7 +118,7 @@ class McapSource:
         self.report.clear()
         self.report.notes.extend(self._notes)
         if self._file.cut:
-            self.report.skip("file cut", self._file.cut)
+            self.report.skip("file cut", self._file.cut.removeprefix("cut: "))
         stream = ImuStream(self.report) if self.imu is not None else None
         odometer = OdometerStream(self.report)
         frames = self._encoded_frames(stream, odometer)
@@ -142,7 +142,7 @@ class McapSource:
         topics = {c.topic: i for i, c in self._file.channels.items()}
         if LEFT not in topics:
             several = sorted(topic for topic in topics if topic.endswith(LEFT))
-            why = f"it merges several recordings ({', '.join(several)})" if several else "a base station's log has none"
+            why = f"it merges several recordings ({', '.join(several)})" if several else "[agent.log] every was 0"
             raise SourceError(f"{self.name}: no images on {LEFT}: {why}")
         self._left = topics[LEFT]
         self._right = topics.get(RIGHT) if rig.right is not None else None

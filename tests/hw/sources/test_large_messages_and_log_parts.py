@@ -121,11 +121,18 @@ def test_the_first_part_of_a_log_is_read_with_the_later_ones(tmp_path: Path) -> 
     (tmp_path / "a" / "boot00003_2.mcap").unlink()
     source = open_source(str(first))
     assert frames_of(source) == list(range(later[-1] + 1))
-    assert source.report.notes == ["file cut: cut: its part 2 is missing"]
+    assert source.report.notes == ["file cut: its part 2 is missing"]
     (tmp_path / "a" / "boot00003_1.mcap").unlink()
     source = open_source(str(first))
     assert frames_of(source) == list(range(later[0]))
-    assert source.report.notes == ["file cut: cut: its part 1 is missing"]
+    assert source.report.notes == ["file cut: its part 1 is missing"]
+
+
+def test_a_log_without_images_says_why(tmp_path: Path) -> None:
+    with LogWriter(tmp_path / "a.mcap", {"role": "agent"}) as log:
+        log.rig(0, CameraRig(CameraModel(64, 48, 60.0, 60.0, 31.5, 23.5), None, np.eye(4), None, has_body=False), None)
+    with pytest.raises(SourceError, match=r"no images on .*: \[agent.log\] every was 0"):
+        open_source(str(tmp_path / "a.mcap"))
 
 
 def test_logs_of_two_flights_are_not_joined(tmp_path: Path) -> None:
