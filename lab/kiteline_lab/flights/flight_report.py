@@ -71,11 +71,12 @@ def table(report: Report) -> str:
 
 
 def _agent_notes(agents: Sequence[Report]) -> Iterator[str]:
-    """What each agent's source skipped, by reason, and its other notes."""
+    """What each agent's source skipped, by reason, and its other notes. What was skipped once is told in full."""
     for k, agent in enumerate(agents):
-        skipped = agent.get("skipped", {})
-        notes = [f"{count} skipped: {reason}" for reason, count in skipped.items()]
-        notes += [note for note in agent.get("notes", ()) if note.partition(": ")[0] not in skipped]  # no examples
+        skipped, told = agent.get("skipped", {}), agent.get("notes", ())
+        examples = {note.partition(": ")[0]: note for note in told}
+        notes = [f"{n} skipped: {examples.get(reason, reason) if n == 1 else reason}" for reason, n in skipped.items()]
+        notes += [note for note in told if note.partition(": ")[0] not in skipped]  # no examples
         yield from (f"agent {k}: {note}" if len(agents) > 1 else note for note in notes)
 
 

@@ -186,8 +186,13 @@ def test_the_table_tells_what_was_skipped_and_what_to_check() -> None:
     timing = {"cpu_ms_per_frame": statistic([]), "rss_mib": 1.0}
     agent = {
         "frames": 3, "tracked": 0, "lost": 3, "dropped": 0, "keyframes": 0, "bytes_per_keyframe": 0.0, "timing": timing,
-        "skipped": {"imu stamp not increasing": 12}, "notes": ["imu stamp not increasing: at 5 ns", "imu: no gravity"],
+        "skipped": {"imu stamp not increasing": 12, "file cut": 1, "damaged chunk": 1},
+        "notes": ["imu stamp not increasing: at 5 ns", "imu: no gravity", "file cut: its part 2 is missing"],
     }  # fmt: skip
     lines = table({"agents": [agent], "base": None, "notes": ["ended"]}).splitlines()
-    assert lines[-3:] == ["note: ended", "note: 12 skipped: imu stamp not increasing", "note: imu: no gravity"]
+    assert lines[-5:] == [
+        "note: ended", "note: 12 skipped: imu stamp not increasing",
+        "note: 1 skipped: file cut: its part 2 is missing",  # which part is told
+        "note: 1 skipped: damaged chunk", "note: imu: no gravity",
+    ]  # fmt: skip
     assert table({"agents": [agent, agent], "base": None}).splitlines()[-1] == "note: agent 1: imu: no gravity"
