@@ -27,7 +27,7 @@ from kiteline_lab.calibration.solve import Calibrated
 from kiteline_lab.calibration.verdict import CalibrationFinding, judge, overall
 from kiteline_lab.calibration.views import ViewCollector
 from kiteline_lab.flights.progress import Progress
-from kiteline_lab.outputs.out_file import whole_file, write_whole
+from kiteline_lab.outputs.out_file import whole_file, write_files, write_whole
 
 _DPI = 300  # of a printed board
 _M_AN_INCH = 0.0254
@@ -104,6 +104,7 @@ def _parser() -> argparse.ArgumentParser:
     export.add_argument("calibration", metavar="FILE[,FILE]", help="of any form that is read")
     export.add_argument("--format", choices=tuple(FORMS), required=True)
     export.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder to write to")
+    export.add_argument("--force", action="store_true", help="overwrite files in DIR")
     return p
 
 
@@ -199,8 +200,7 @@ def _export(args: argparse.Namespace) -> int:
     given = read_calibration(args.calibration)
     if not given.cameras and args.format != "kalibr":
         given.rig()  # says that no camera is there
-    for name, text in FORMS[args.format](given).items():
-        path = args.out / name
-        write_whole(path, text.encode())
+    texts = FORMS[args.format](given)
+    for path in write_files(args.out, {name: text.encode() for name, text in texts.items()}, force=args.force):
         sys.stdout.write(f"{path}\n")
     return 0

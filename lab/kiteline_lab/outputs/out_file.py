@@ -2,8 +2,8 @@
 
 import fcntl
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from kiteline_hw.durable_files import write_atomically
@@ -32,6 +32,26 @@ def write_whole(path: Path, content: bytes) -> None:
         path.write_bytes(content)
     else:
         write_atomically(path.resolve(), content)  # of a link, what it leads to
+
+
+def write_files(folder: Path, contents: Mapping[str, bytes], *, force: bool) -> list[Path]:
+    """Write files by their names in a folder, all of them or none; returns where they are.
+
+    Raises SourceError when one is there already (unless force) or its folder may not be written, OSError.
+    """
+    paths = {folder / name: content for name, content in contents.items()}
+    there = [str(path) for path in paths if path.is_file()]
+    if there and not force:
+        exist = "exists" if len(there) == 1 else "exist"
+        raise SourceError(f"{', '.join(there)} {exist} already: name another place, or overwrite with --force")
+    with ExitStack() as stack:
+        for path, content in paths.items():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            if path.exists() and not path.is_file():  # a pipe or a device
+                path.write_bytes(content)
+            else:
+                write_atomically(stack.enter_context(whole_file(path.resolve(), force=True)), content)
+    return list(paths)
 
 
 @contextmanager

@@ -23,7 +23,7 @@ from kiteline_core.arrays import I64
 from kiteline_core.errors import KitelineError
 from kiteline_core.geometry import sim3
 from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, agent_of_keyframe
-from kiteline_lab.outputs.out_file import write_whole
+from kiteline_lab.outputs.out_file import write_files
 
 FORMATS = ("tum", "ply", "pgm", "g2o")
 _PLAIN_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.+-]*")  # of a picture, as it stands in YAML
@@ -100,9 +100,9 @@ def main(argv: Sequence[str]) -> int:
         "--out", type=Path, required=True, metavar="F", help="file to write; pgm: a YAML file beside it"
     )
     parser.add_argument("--agent", type=int, help="tum: whose trajectory; needed if there are several")
+    parser.add_argument("--force", action="store_true", help="overwrite F, and the file beside it")
     args = parser.parse_args(argv)
     made = files(load(args.store), args.format, args.out.name, args.agent)
-    for name, content in made.items():
-        write_whole(args.out.parent / name, content)
-        print(args.out.parent / name)
+    for path in write_files(args.out.parent, made, force=args.force):
+        print(path)
     return 0

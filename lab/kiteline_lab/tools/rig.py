@@ -25,7 +25,7 @@ from kiteline_core.errors import KitelineError
 from kiteline_core.geometry import disparity_offset, se3
 from kiteline_core.geometry.cameras import CameraModel, CameraRig, RectifiedCamera
 from kiteline_core.ids import AgentId
-from kiteline_lab.outputs.out_file import write_whole
+from kiteline_lab.outputs.out_file import write_files
 from kiteline_lab.tools.export import load
 
 FORMATS = ("kalibr", "euroc", "kiteline")
@@ -251,6 +251,7 @@ def main(argv: Sequence[str]) -> int:
     export.add_argument("--format", choices=FORMATS, required=True)
     export.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder to write to")
     export.add_argument("--agent", type=int, help="whose rig; needed if there are several")
+    export.add_argument("--force", action="store_true", help="overwrite files in DIR")
     for verb in (show, export):
         verb.add_argument(
             "known", type=Path, metavar="STORE|FILE",
@@ -262,8 +263,7 @@ def main(argv: Sequence[str]) -> int:
         rigs = summary(known)
         sys.stdout.write((json.dumps(rigs, indent=2) if args.json else table(rigs) or _NONE_KNOWN) + "\n")
         return 0
-    for name, text in exported(known, args.agent, args.format).items():
-        path = args.out / name
-        write_whole(path, text.encode())
+    made = exported(known, args.agent, args.format)
+    for path in write_files(args.out, {name: text.encode() for name, text in made.items()}, force=args.force):
         print(path)
     return 0

@@ -280,6 +280,8 @@ def test_rendered_pictures_of_a_pair_by_the_command(tmp_path: Path, capsys: pyte
         main(command)
     for form in ("kalibr", "opencv", "ros", "euroc"):
         assert main(["export", str(out), "--format", form, "--out", str(tmp_path / form)]) == 0
+    with pytest.raises(SourceError, match="exist already"):
+        main(["export", str(out), "--format", "euroc", "--out", str(tmp_path / "euroc")])
     names = capsys.readouterr().out.split()
     back = read_calibration(next(n for n in names if n.endswith("camchain.yaml")))
     assert back.cameras == told.cameras and back.T_c_r is not None

@@ -19,6 +19,7 @@ from kiteline_codec.schema import CameraIntrinsics, KeyframeHeader, NewLandmarks
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import NO_KEYFRAME, AgentId, keyframe_id, submap_id
+from kiteline_hw.ports import SourceError
 from kiteline_lab.evaluation import trajectories
 from kiteline_lab.grids.files import read_grid
 from kiteline_lab.tools.export import ExportError, files, main
@@ -125,6 +126,8 @@ def test_what_no_disk_takes_leaves_the_file_as_it_was(
     out = tmp_path / "out" / "map.ply"
     assert main([str(tmp_path), "--format", "ply", "--out", str(out)]) == 0
     before = out.read_bytes()
+    with pytest.raises(SourceError, match=r"map\.ply exists already.*--force"):
+        main([str(tmp_path), "--format", "ply", "--out", str(out)])
     out.write_bytes(b"older")
 
     def full(_: int) -> None:
@@ -133,7 +136,7 @@ def test_what_no_disk_takes_leaves_the_file_as_it_was(
     with monkeypatch.context() as patched:
         patched.setattr(os, "fsync", full)
         with pytest.raises(OSError, match="No space"):
-            main([str(tmp_path), "--format", "ply", "--out", str(out)])
+            main([str(tmp_path), "--format", "ply", "--out", str(out), "--force"])
     assert [(path.name, path.read_bytes()) for path in out.parent.iterdir()] == [("map.ply", b"older")]
     os.mkfifo(pipe := tmp_path / "pipe")
     with ThreadPoolExecutor(1) as pool:

@@ -23,6 +23,7 @@ from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import VIRTUAL_BASELINE_M, RectifiedCamera
 from kiteline_core.geometry.disparity_offset import terms
 from kiteline_core.ids import AgentId
+from kiteline_hw.ports import SourceError
 from kiteline_lab.tools.rig import KnownCameras, RigError, exported, found_rig, main, summary
 
 T_b_c = se3.from_rt(se3.so3_exp(np.array([0.1, -0.2, 0.3])), np.array([0.05, 0.01, -0.02]))
@@ -124,9 +125,17 @@ def test_a_rig_file_is_shown_and_exported_and_made_of_a_store(
         assert np.allclose(shown[name], wanted[name], atol=1e-3)
     assert main(["show", str(tmp_path / "rig.toml")]) == 0
     assert "rows of the right image too low by +0.700" in capsys.readouterr().out
-    assert main(["export", str(tmp_path / "rig.toml"), "--format", "euroc", "--out", str(tmp_path / "new")]) == 0
+    to_euroc = ["export", str(tmp_path / "rig.toml"), "--format", "euroc", "--out", str(tmp_path / "new")]
+    assert main(to_euroc) == 0
     sensor = yaml.safe_load((tmp_path / "new" / "cam0" / "sensor.yaml").read_text())
     assert np.allclose(np.array(sensor["T_BS"]["data"]).reshape(4, 4), T_b_c, atol=1e-8)
+    (tmp_path / "new" / "cam0" / "sensor.yaml").unlink()
+    (mine := tmp_path / "new" / "cam1" / "sensor.yaml").write_text("mine")
+    with pytest.raises(SourceError, match=r"cam1/sensor\.yaml exists already: .*--force"):
+        main(to_euroc)
+    assert mine.read_text() == "mine" and not (tmp_path / "new" / "cam0" / "sensor.yaml").exists()  # none is written
+    assert main([*to_euroc, "--force"]) == 0
+    assert mine.read_text() != "mine" and (tmp_path / "new" / "cam0" / "sensor.yaml").exists()
 
 
 def known_mapper() -> Mapper:
