@@ -7,6 +7,7 @@ import sys
 
 import numpy as np
 
+from kiteline_core.errors import KitelineError
 from kiteline_core.frame import Frame, ImuBatch
 from kiteline_hw.logs.mcap_log import LogReader
 from kiteline_hw.sources.open import open_source
@@ -31,4 +32,9 @@ def main(path: str) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    if len(sys.argv) != 2:
+        sys.exit(__doc__)
+    try:
+        main(sys.argv[1])
+    except KitelineError as error:
+        sys.exit(str(error))

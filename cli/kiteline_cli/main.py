@@ -112,15 +112,35 @@ def main(argv: Sequence[str]) -> int:
         try:
             return _run(list(argv))
         finally:
-            if sys.stdout is not None:  # as it is where the caller has closed it
-                sys.stdout.flush()  # here, where a closed pipe can be caught
+            _flush_output()  # here, where a closed pipe and a full disk can be caught
     except KeyboardInterrupt:
         return EXIT_SIGNAL + signal.SIGINT
     except _Terminated:
         return _TERMINATED
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python complains again at exit
         return EXIT_ERROR
+    except OSError as error:
+        text = explanation(error)
+        if argv[:1] == ["--debug"] or text is None:
+            raise
+        return _tell(text)
+
+
+def _flush_output() -> None:
+    """Write out what was printed. Raises OSError; what could not be written is then forgotten."""
+    if sys.stdout is None:  # as it is where the caller has closed it
+        return
+    try:
+        sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python complains again at exit
+        raise
+
+
+def _tell(text: str) -> int:
+    """Print an error; the exit status."""
+    print(f"kiteline: error: {text}", file=sys.stderr)
+    return EXIT_ERROR
 
 
 class _Terminated(BaseException):
@@ -164,10 +184,9 @@ def _run(rest: list[str]) -> int:
         return command.run(rest[1:]) or 0
     except Exception as error:
         text = explanation(error)
-        if debug or text is None:
+        if debug or text is None or isinstance(error, OSError):  # which `main` explains, with those of its own output
             raise
-        print(f"kiteline: error: {text}", file=sys.stderr)
-        return EXIT_ERROR
+        return _tell(text)
     finally:
         if rest[1:2] in (["-h"], ["--help"]):
             print("\nexamples:", *command.EXAMPLES, sep="\n  ")
@@ -191,15 +210,17 @@ def _without_command(rest: list[str], names: list[str]) -> int:
     if rest and not rest[0].startswith("-"):
         near = difflib.get_close_matches(rest[0], names, 1)
         hint = f"did you mean {near[0]!r}?" if near else f"there are: {', '.join(names)}"
-        print(f"kiteline: error: no command {rest[0]!r}; {hint}", file=sys.stderr)
-        return EXIT_ERROR
+        return _tell(f"no command {rest[0]!r}; {hint}")
     p = parser()
+    if rest[:1] in (["-h"], ["--help"]):  # here, for argparse passes over a disk that does not take it
+        sys.stdout.write(p.format_help())
+        return 0
     if rest and p.parse_args(rest).version:
         from importlib.metadata import version
 
         print(f"kiteline {version('kiteline')}")
         return 0
-    p.print_help()
+    sys.stdout.write(p.format_help())
     return EXIT_ERROR
 
 

@@ -119,6 +119,16 @@ def test_a_reader_that_goes_away_ends_a_command_quietly(words: tuple[str, ...]) 
     assert done.returncode in (0, 2)  # argparse swallows the error where its text is longer than a buffer
 
 
+@pytest.mark.parametrize("words", [("keys", "--help"), ("--help",), ("config",), ("--version",)])
+def test_output_that_no_disk_takes_is_one_line_of_error(words: tuple[str, ...]) -> None:
+    with open("/dev/full", "wb") as full:
+        done = subprocess.run(
+            [sys.executable, "-m", "kiteline_cli", *words], stdout=full, stderr=subprocess.PIPE, text=True, check=False
+        )
+    assert done.stderr.count("\n") == 1 and "No space left on device" in done.stderr
+    assert done.returncode == 2
+
+
 def test_ctrl_c_while_a_command_loads_exits_130(monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupt(self: object) -> None:
         raise KeyboardInterrupt

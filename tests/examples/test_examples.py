@@ -49,3 +49,10 @@ def test_a_flown_log_becomes_arrays(recording: Path, tmp_path: Path) -> None:
     assert lines[1] == "gyro, accel    (0, 3), (0, 3)"
     found = re.match(r"odometry       \(30, 4, 4\), path (\d\.\d+) m", lines[2])
     assert float(found[1]) == pytest.approx(29 * STEP_M, abs=0.01)
+
+
+@pytest.mark.parametrize(("arguments", "words"), [([], "out/agent0/log.mcap"), (["none.mcap"], "no such file")])
+def test_a_log_that_is_not_there_is_one_line_of_error(arguments: list[str], words: str) -> None:
+    command = [sys.executable, str(EXAMPLES / "read_log.py"), *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 1 and words in done.stderr and "Traceback" not in done.stderr
