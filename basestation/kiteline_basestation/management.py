@@ -20,7 +20,7 @@ from kiteline_codec.coding.quantise import MAX_SCALE, MIN_SCALE
 from kiteline_core.arrays import F64
 from kiteline_core.errors import INPUT_FAULTS
 from kiteline_core.geometry import sim3
-from kiteline_core.ids import BOOT_BITS, SUBMAP_BITS, SubmapId, agent_of_submap, submap_id, submap_of_keyframe
+from kiteline_core.ids import SUBMAP_BITS, SubmapId, agent_of_submap, boot_of_submap, submap_id, submap_of_keyframe
 
 _NAME_CHARS = 64
 _TEXT_CHARS = 1 << 14  # of a command
@@ -54,8 +54,7 @@ class _Refused(Exception):
 
 def submap_name(submap: SubmapId) -> str:
     """AGENT.BOOT.NUMBER of a submap."""
-    boot, number = submap >> SUBMAP_BITS & (1 << BOOT_BITS) - 1, submap & (1 << SUBMAP_BITS) - 1
-    return f"{agent_of_submap(submap)}.{boot}.{number}"
+    return f"{agent_of_submap(submap)}.{boot_of_submap(submap)}.{submap & (1 << SUBMAP_BITS) - 1}"
 
 
 class MapManager:

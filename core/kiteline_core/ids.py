@@ -59,6 +59,11 @@ def agent_of_submap(submap: SubmapId) -> AgentId:
     return AgentId(submap >> (SUBMAP_BITS + BOOT_BITS))
 
 
+def boot_of_submap(submap: SubmapId) -> int:
+    """Boot that a submap belongs to, within its agent."""
+    return submap >> SUBMAP_BITS & MAX_BOOTS - 1
+
+
 def agent_of_keyframe(keyframe: KeyframeId) -> AgentId:
     """The agent that made a keyframe."""
     return agent_of_submap(submap_of_keyframe(keyframe))

@@ -5,6 +5,7 @@ import json
 import re
 import sys
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,14 @@ from kiteline_codec.sync.config import SyncConfig
 from kiteline_core.arrays import I64
 from kiteline_core.errors import KitelineError
 from kiteline_core.geometry import sim3
-from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, agent_of_keyframe
+from kiteline_core.ids import (
+    NO_KEYFRAME,
+    AgentId,
+    KeyframeId,
+    agent_of_keyframe,
+    boot_of_submap,
+    submap_of_keyframe,
+)
 from kiteline_lab.outputs.out_file import write_files
 
 FORMATS = ("tum", "ply", "pgm", "g2o")
@@ -42,14 +50,16 @@ def load(store: Path) -> Mapper:
     return station.mapper
 
 
-def files(mapper: Mapper, kind: str, name: str, agent: int | None = None) -> dict[str, bytes]:
-    """Contents of the files of one format, by file name. name: of the main file. agent: tum: whose trajectory.
+def files(mapper: Mapper, kind: str, name: str, agent: int | None = None, boot: int | None = None) -> dict[str, bytes]:
+    """Contents of the files of one format, by file name. name: of the main file.
+
+    agent, boot: tum: whose trajectory, and of which start; None: the only agent, all starts.
 
     tum: camera poses of keyframes in w. g2o: keyframes with edges to parents and covisible keyframes. pgm: with a
     YAML file beside it. Raises ExportError.
     """
     if kind == "tum":
-        return {name: _trajectory(mapper, agent)}
+        return {name: _trajectory(mapper, agent, boot)}
     if kind == "g2o":
         return {name: _graph(mapper)}
     made = map_files(mapper)
@@ -63,7 +73,7 @@ def files(mapper: Mapper, kind: str, name: str, agent: int | None = None) -> dic
     return {name: made["grid.pgm"], beside: text}
 
 
-def _trajectory(mapper: Mapper, agent: int | None) -> bytes:
+def _trajectory(mapper: Mapper, agent: int | None, boot: int | None) -> bytes:
     poses = keyframe_poses(mapper)
     here = sorted({int(agent_of_keyframe(k)) for k in poses})
     if agent is None and len(here) > 1:
@@ -71,9 +81,25 @@ def _trajectory(mapper: Mapper, agent: int | None) -> bytes:
     if agent is not None and agent not in here:
         raise ExportError(f"the map holds agents {here}, none with number {agent}")
     mine = [k for k in poses if agent is None or agent_of_keyframe(k) == AgentId(agent)]
+    boots = np.array([boot_of_submap(submap_of_keyframe(k)) for k in mine], np.int64)
+    if boot is not None and boot not in boots:
+        raise ExportError(f"the map holds boots {np.unique(boots).tolist()} of this agent, none with number {boot}")
+    chosen = np.ones(len(mine), np.bool_) if boot is None else boots == boot
+    mine, boots = [k for k, taken in zip(mine, chosen, strict=True) if taken], boots[chosen]
     stamps = np.array([mapper.map.keyframes.t_ns[mapper.map.rows[k]] for k in mine], np.int64)
+    if _overlap(stamps, boots):
+        raise ExportError(
+            f"boots {np.unique(boots).tolist()} of this agent flew at the same times, as where a recording is flown "
+            "again: choose one with --boot"
+        )
     order = np.argsort(stamps, kind="stable")
     return tum(stamps[order], np.array([sim3.rigid(poses[mine[i]]) for i in order]).reshape(-1, 4, 4))
+
+
+def _overlap(stamps: I64, boots: I64) -> bool:
+    """True if poses of one boot lie between those of another in time. Both (n,)."""
+    spans = sorted((stamps[boots == boot].min(), stamps[boots == boot].max()) for boot in np.unique(boots))
+    return any(begin <= end for (_, end), (begin, _) in pairwise(spans))
 
 
 def _graph(mapper: Mapper) -> bytes:
@@ -100,9 +126,10 @@ def main(argv: Sequence[str]) -> int:
         "--out", type=Path, required=True, metavar="F", help="file to write; pgm: a YAML file beside it"
     )
     parser.add_argument("--agent", type=int, help="tum: whose trajectory; needed if there are several")
+    parser.add_argument("--boot", type=int, help="tum: of which start; needed if a recording was flown several times")
     parser.add_argument("--force", action="store_true", help="overwrite F, and the file beside it")
     args = parser.parse_args(argv)
-    made = files(load(args.store), args.format, args.out.name, args.agent)
+    made = files(load(args.store), args.format, args.out.name, args.agent, args.boot)
     for path in write_files(args.out.parent, made, force=args.force):
         print(path)
     return 0

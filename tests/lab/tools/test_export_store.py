@@ -27,17 +27,18 @@ from kiteline_lab.tools.export import ExportError, files, main
 LEVEL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # a camera that looks along x
 
 
-def records(agent: int) -> tuple[Record, ...]:
+def records(agent: int, boot: int = 1, begin_s: float = 0.0) -> tuple[Record, ...]:
     """Three keyframes, half a metre apart, each with its own forty points."""
+    begin_ns = 1_700_000_000_123_456_789 + round(1e9 * begin_s)
     rng = np.random.default_rng(agent)
     camera = RectifiedCamera(640, 480, 400.0, 400.0, 320.0, 240.0, 0.1, True, np.eye(4))
     out: list[Record] = [CameraIntrinsics(AgentId(agent), camera)]
-    submap = submap_id(agent, 1, 0)
+    submap = submap_id(agent, boot, 0)
     parent = NO_KEYFRAME
     for i in range(3):
         keyframe = keyframe_id(submap, i)
         step = se3.from_rt(LEVEL, np.zeros(3)) if i == 0 else se3.from_rt(np.eye(3), np.array([0.0, 0.0, 0.5]))
-        out.append(KeyframeHeader(keyframe, 1_700_000_000_123_456_789 + i * 10**9, parent, step, 40))
+        out.append(KeyframeHeader(keyframe, begin_ns + i * 10**9, parent, step, 40))
         index = np.arange(40, dtype=np.uint16)
         uv = rng.uniform([10, 10], [630, 470], (40, 2)).astype(np.float32)
         depth = rng.uniform(2, 6, 40).astype(np.float32)
@@ -71,6 +72,19 @@ def test_one_trajectory_is_of_one_agent(mapper: Mapper) -> None:
     with pytest.raises(ExportError, match=r"agents \[0, 2\].*--agent"):
         files(mapper, "tum", "a.tum")
     assert files(mapper, "tum", "a.tum", agent=2)["a.tum"].count(b"\n") == 3
+
+
+def test_flights_of_the_same_times_are_not_mixed(mapper: Mapper) -> None:
+    for boot, begin_s in ((2, 3.0), (3, 1.5)):  # after the first flight, and during both
+        mapper.step(MapperInput(((AgentId(0), records(0, boot, begin_s)),)), 10**9)
+        mapper.placements[submap_id(0, boot, 0)] = np.eye(4)
+        if boot == 2:
+            assert files(mapper, "tum", "a.tum")["a.tum"].count(b"\n") == 6
+    with pytest.raises(ExportError, match=r"boots \[1, 2, 3\] .* at the same times.*--boot"):
+        files(mapper, "tum", "a.tum")
+    assert files(mapper, "tum", "a.tum", boot=3)["a.tum"].startswith(b"1700000001.623456789 ")
+    with pytest.raises(ExportError, match=r"boots \[1, 2, 3\] .* none with number 4"):
+        files(mapper, "tum", "a.tum", boot=4)
 
 
 def test_graph_holds_every_keyframe_and_parent(mapper: Mapper, tmp_path: Path) -> None:
