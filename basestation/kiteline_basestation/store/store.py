@@ -156,14 +156,22 @@ def backup(path: Path, out: Path) -> SavedMap:
     file, copy = path / FILE if path.is_dir() else path, out / FILE
     if copy.exists():
         raise StoreError(f"{copy}: there is a store already; expected a new folder")
-    saved = read(path)
+    saved, made = read(path), _missing_folders(out)
     try:
         salvage.write_new(copy, saved)
     except (OSError, sqlite3.Error) as error:
+        for folder in made:
+            with contextlib.suppress(OSError):
+                folder.rmdir()
         raise StoreError(f"{copy}: {error}; the backup was not made") from None
     if read(out) != SavedMap(saved.agents, saved.texts):
         raise StoreError(f"{copy}: the copy differs from {file}: is its disk sound?")
     return saved
+
+
+def _missing_folders(folder: Path) -> list[Path]:
+    """A folder and those above it that are not there yet, innermost first."""
+    return [place for place in (folder, *folder.parents) if not place.exists()]
 
 
 def repair(folder: Path) -> SavedMap:

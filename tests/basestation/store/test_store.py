@@ -4,6 +4,7 @@ import multiprocessing
 import os
 import shutil
 import signal
+import sqlite3
 import subprocess
 import sys
 import time
@@ -13,6 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from kiteline_basestation.store import checksums
 from kiteline_basestation.store.checksums import StoreError
 from kiteline_basestation.store.saved_map import SavedMap, SavedValues, pack, unpack
 from kiteline_basestation.store.store import FILE, Batch, Store, backup, batch_of, read
@@ -127,6 +129,20 @@ def test_a_backup_equals_its_store_also_while_a_base_writes(tmp_path: Path) -> N
     assert copy.texts == saved.texts and copy.faults == ()
     with pytest.raises(StoreError, match="a store already"):
         backup(tmp_path / "store", tmp_path / "copy")
+
+
+def test_a_backup_that_no_disk_takes_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(db: sqlite3.Connection, saved: SavedMap) -> None:
+        raise sqlite3.OperationalError("database or disk is full")
+
+    filled(tmp_path / "store")
+    (tmp_path / "mine").mkdir()
+    monkeypatch.setattr(checksums, "write_all", full)
+    for folder in ("new/copy", "mine/copy", "mine"):
+        with pytest.raises(StoreError, match="disk is full; the backup was not made"):
+            backup(tmp_path / "store", tmp_path / folder)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["mine", "store"]
+    assert not list((tmp_path / "mine").iterdir())
 
 
 READ_ONLY = """
