@@ -1,6 +1,7 @@
 """The frame of the poses sent: at the start, north, or where it was before a restart."""
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from math import cos, degrees, pi, radians, sin
 from pathlib import Path
@@ -196,7 +197,7 @@ def test_heading_of_a_nose_that_points_up(axes: str) -> None:
 
 def test_the_memory_outlives_a_process_but_not_a_boot(tmp_path: Path) -> None:
     last, path = LastPose((1.0, 2.0, -3.0), 0.5, armed=True), tmp_path / "agent0" / "last_pose.json"
-    memory = PoseMemory(path)
+    memory = PoseMemory(path, beside=lambda write: write())
     assert memory.load(0) is None
     memory.save(last, 10 * S)
     memory.save(replace(last, heading_rad=9.0), 10 * S + 1)  # too early for another write
@@ -206,6 +207,21 @@ def test_the_memory_outlives_a_process_but_not_a_boot(tmp_path: Path) -> None:
     stored = json.loads(path.read_text(encoding="utf-8"))
     path.write_text(json.dumps({**stored, "boot": "another"}), encoding="utf-8")
     assert PoseMemory(path).load(20 * S) is None
+    path.write_text(json.dumps({k: v for k, v in stored.items() if k != "boot"}), encoding="utf-8")
+    assert PoseMemory(path).load(20 * S) is None
     for garbage in ("", "{}", "[1]", '{"position_m": [1]}', "null"):
         path.write_text(garbage, encoding="utf-8")
         assert PoseMemory(path).load(20 * S) is None
+
+
+def test_a_disk_that_stalls_holds_up_no_messages(tmp_path: Path) -> None:
+    waiting: list[Callable[[], None]] = []
+    memory = PoseMemory(tmp_path / "last_pose.json", beside=waiting.append)
+    for second in range(10):
+        memory.save(LastPose((float(second), 0.0, 0.0), 0.0, armed=True), second * S)
+    assert len(waiting) == 1  # two writes would share a file
+    waiting.pop()()
+    memory.save(LastPose((10.0, 0.0, 0.0), 0.0, armed=True), 10 * S)
+    waiting.pop()()
+    found = memory.load(10 * S)
+    assert found is not None and found.position_m[0] == 10.0
