@@ -1,5 +1,6 @@
 """A LiveSource over one or two cameras: each is read, decoded and opened again by a thread of its own."""
 
+import contextlib
 import threading
 import time
 from collections import deque
@@ -154,7 +155,7 @@ class CameraSource:
             except Exception as error:  # whatever a driver or library does, the flight goes on
                 known = isinstance(error, CameraError)
                 text = str(error) if known else f"camera {camera.name} failed: {type(error).__name__}: {error}"
-                camera.close()
+                _release(camera)
                 is_open = False
                 with self._lock:
                     self._tell(watch.failed(self._clock.now_ns(), text))
@@ -162,9 +163,9 @@ class CameraSource:
                 retry_s = min(2.0 * retry_s, _MAX_RETRY_S)
                 continue
             if self._check(watch):
-                camera.close()
+                _release(camera)
                 is_open = False
-        camera.close()
+        _release(camera)
 
     def _check(self, watch: CameraWatch) -> bool:
         """Report outages and pass on unpaired images while no image comes. True if the device must be reopened."""
@@ -253,3 +254,9 @@ class CameraSource:
                 self._frames.popleft()
                 self._dropped += 1
             self._lock.notify_all()
+
+
+def _release(camera: Camera) -> None:
+    """Close a device. Whatever a driver or library raises then, it is opened again."""
+    with contextlib.suppress(Exception):
+        camera.close()

@@ -104,8 +104,8 @@ class PiCamera:
         steps = [camera.stop, camera.close]
         if hasattr(camera, "cancel_all_and_flush"):  # since 0.3.20; `stop` would wait behind the queued job
             steps.insert(0, camera.cancel_all_and_flush)
-        for step in steps:  # a camera that cannot be stopped is released nevertheless
-            with contextlib.suppress(RuntimeError, OSError):
+        for step in steps:  # a camera that cannot be stopped, for whatever reason, is released nevertheless
+            with contextlib.suppress(Exception):
                 step()
 
 

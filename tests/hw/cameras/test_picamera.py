@@ -146,6 +146,26 @@ def test_images_stamps_settings_and_a_failure(calibration: Path) -> None:
     assert Request.released > 0
 
 
+@pytest.mark.parametrize("where", ["library", "camera"])
+def test_a_camera_that_cannot_be_closed_is_opened_again(
+    calibration: Path, monkeypatch: pytest.MonkeyPatch, where: str
+) -> None:
+    def fail(_: object) -> None:
+        raise TypeError("'NoneType' object is not callable")
+
+    monkeypatch.setattr(*((Picamera2, "cancel_all_and_flush") if where == "library" else (PiCamera, "close")), fail)
+    source = open_source(f"picamera:0?fps=50&calibration={calibration}")
+    assert isinstance(source, CameraSource)
+    try:
+        said_until(source, "YUV420")
+        monkeypatch.setattr(Picamera2, "failing", True)
+        said_until(source, "failed")
+        monkeypatch.setattr(Picamera2, "failing", False)
+        assert len(said_until(source, "again after")) == 1
+    finally:
+        source.close()
+
+
 def test_images_that_come_later_than_a_read_waits_are_not_lost(
     calibration: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
