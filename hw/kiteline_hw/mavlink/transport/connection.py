@@ -3,9 +3,11 @@
 import contextlib
 import threading
 import time
+import traceback
 from collections import deque
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 from kiteline_hw.mavlink.transport.sockets import MavlinkTcp, MavlinkUdp
 from kiteline_hw.mavlink.transport.url import MavlinkUrl
@@ -20,7 +22,8 @@ class MavlinkConnection:
     """Sends messages, and calls back from a thread: `on_data` for received bytes, `on_tick` every `tick_s`.
 
     on_data: gets bytes, whether they are one whole datagram or the first after a gap, and, of a sender that is not
-    served yet, a function that serves it from now on. Both are called without any lock held. max_queued: messages
+    served yet, a function that serves it from now on. Both are called without any lock held; what one of them raises is
+    counted, and the first is printed: a message that is not understood must not end the others. max_queued: messages
     waiting for a slow serial port, the oldest are dropped; 0: no limit.
     """
 
@@ -31,6 +34,7 @@ class MavlinkConnection:
         self._url, self._required = url, required
         self._on_data, self._on_tick, self._tick_s = on_data, on_tick, tick_s
         self._outbox: deque[bytes] = deque(maxlen=max_queued or None)
+        self.callback_errors = 0
         self._closed = threading.Event()
         self._udp: MavlinkUdp | None = None
         self._tcp: MavlinkTcp | None = None
@@ -89,7 +93,15 @@ class MavlinkConnection:
             now_s = time.monotonic()
             if now_s >= due_s and not self._closed.is_set():
                 due_s = now_s + self._tick_s
-                self._on_tick()
+                self._call(self._on_tick)
+
+    def _call(self, callback: Callable[..., None], *arguments: Any) -> None:
+        try:
+            callback(*arguments)
+        except Exception:
+            self.callback_errors += 1
+            if self.callback_errors == 1:
+                traceback.print_exc()
 
     def _serve_udp(self, udp: MavlinkUdp, due_s: float) -> None:
         """Take datagrams until the next tick. Little is done for each: 200 a second come, to cold caches."""
@@ -99,18 +111,18 @@ class MavlinkConnection:
                 return
             if received is not None and received[0]:
                 data, stranger = received
-                self._on_data(data, True, None if stranger is None else partial(udp.adopt, stranger))
+                self._call(self._on_data, data, True, None if stranger is None else partial(udp.adopt, stranger))
             if time.monotonic() >= due_s:
                 return
 
     def _serve_tcp(self, tcp: MavlinkTcp) -> None:
         if tcp.wait(self._tick_s):
-            self._on_data(b"", True, None)
+            self._call(self._on_data, b"", True, None)
         for _ in range(_MAX_READS):
             data = None if self._closed.is_set() else tcp.receive()
             if data is None:
                 return
-            self._on_data(data, False, None)
+            self._call(self._on_data, data, False, None)
 
     def close(self) -> None:
         """Stop, within a second. May be called twice."""

@@ -16,6 +16,8 @@ from kiteline_hw.mavlink.coordinate_frames import mounting
 from kiteline_hw.mavlink.messages import Heartbeat, VehicleImu
 from kiteline_hw.mavlink.pose_sink import MavlinkPoseSink, SinkOptions
 from kiteline_hw.mavlink.transport import sockets
+from kiteline_hw.mavlink.transport.connection import MavlinkConnection
+from kiteline_hw.mavlink.transport.url import parse_mavlink_url
 from kiteline_hw.mavlink.tunnel.tunnel_end import AGENT_END, BASE_END, TunnelEnd
 from kiteline_hw.ports import LinkError, PoseSample, SourceReport
 from kiteline_hw.sim.flight_controller import FlightController
@@ -97,6 +99,31 @@ def serve_once(server: socket.socket, model: FlightController, done: threading.E
             answers = model.receive_stream(data, now_ns) if data else []
             for message in answers + model.poll(now_ns):
                 client.sendall(message)
+
+
+def test_a_fault_in_a_callback_does_not_end_the_others(capsys: pytest.CaptureFixture[str]) -> None:
+    taken: list[bytes] = []
+    ticks: list[int] = []
+
+    def on_data(data: bytes, datagram: bool, adopt: object) -> None:
+        taken.append(data)
+        raise KeyError("a fault")
+
+    def on_tick() -> None:
+        ticks.append(len(ticks))
+        raise RuntimeError("can't start new thread")
+
+    port = free_port(socket.SOCK_DGRAM)
+    url = parse_mavlink_url(f"udpin:127.0.0.1:{port}")
+    connection = MavlinkConnection(url, "mavlink", on_data, on_tick, 0.01, 0, required=True)
+    connection.start()
+    with contextlib.closing(connection), socket.socket(type=socket.SOCK_DGRAM) as controller:
+        end_s = time.monotonic() + 5.0
+        while len(taken) < 3 or len(ticks) < 3:
+            assert time.monotonic() < end_s
+            controller.sendto(b"x", ("127.0.0.1", port))
+            time.sleep(0.01)
+    assert connection.callback_errors >= 6 and capsys.readouterr().err.count("Traceback") == 1
 
 
 def test_tcp_and_again_after_the_controller_was_restarted() -> None:
