@@ -134,7 +134,8 @@ class AgentRuntime:
         try:
             folder.mkdir(parents=True, exist_ok=True)
             log = LogWriter(
-                folder / options.log_name, about, budget=budget, part_topic=STEP, encoder=self._encoder
+                folder / options.log_name, about, budget=budget, part_topic=STEP, encoder=self._encoder,
+                beside=options.log_optional,
             )  # fmt: skip
         except (OSError, SourceError) as error:
             if not options.log_optional:
@@ -146,7 +147,8 @@ class AgentRuntime:
         log.rig(self._log_shift_ns, source.rig, source.imu)
         log.flush()  # an agent that dies at once leaves a log that can be read
         paths = [folder / f"{options.trajectory_prefix}{name}" for name in ("live.tum", "odometry.tum")]
-        self._lines = live, odometry = LineFile(paths[0]), LineFile(paths[1])
+        live, odometry = [LineFile(path, beside=options.log_optional) for path in paths]
+        self._lines = live, odometry
         for file, path in zip(self._lines, paths, strict=True):
             self._files.callback(file.close)
             if options.trajectory_prefix:
@@ -305,6 +307,8 @@ class AgentRuntime:
         """Messages about files that cannot be written: each kind of trouble once in a flight."""
         if self._log is not None and self._log.why:
             self._notices.say("log", f"log: messages are lost: {self._log.why}; the flight goes on")
+        elif self._log is not None and self._log.waits_for:
+            self._notices.say("disk", f"log: it waits for the disk: {self._log.waits_for}; the flight goes on")
         for why in [file.why for file in self._lines if file.why][:1]:
             self._notices.say("lines", f"trajectory: poses are not written: {why}; the flight goes on")
         if self._budget is not None and self._budget.deleted:

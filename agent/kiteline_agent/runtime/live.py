@@ -79,6 +79,8 @@ def fly_live(
                 process.print_lines([f"the number of this start is drawn, as it cannot be kept: {start.kept}"])
         with starting(), long_work(stop, "compiling kernels"):  # those that could not be kept
             runtime = AgentRuntime(options, source, channel_with_spill(options), whole_process=True)
+        if parent is None:  # once the files are closed
+            stack.callback(lambda: process.print_lines(runtime.log_notes()))
         stack.callback(runtime.close)
         clock = MonotonicClock()
         controller = controller_link(options, source, clock, stack)
@@ -98,7 +100,7 @@ def fly_live(
         flight = _LiveFlight(runtime, base, controller, clock, parent, stop)
         flight.fly()
         if parent is None:
-            process.print_lines([f"over: {summary(runtime.counts)}", *runtime.take_notices(), *runtime.log_notes()])
+            process.print_lines([f"over: {summary(runtime.counts)}", *runtime.take_notices()])
         flight.drain()
         if parent is not None:
             parent.send_event("result", report=runtime.report())

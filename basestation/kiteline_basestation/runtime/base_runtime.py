@@ -121,7 +121,10 @@ class BaseRuntime:
             self._budget = LogBudget(self._folder, LOG_STEM, options.log_mib << 20)
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
-            log = LogWriter(self._folder / options.log_name, about, budget=self._budget, part_topic=STEP)
+            log = LogWriter(
+                self._folder / options.log_name, about, budget=self._budget, part_topic=STEP,
+                beside=options.log_optional,
+            )  # fmt: skip
         except (OSError, SourceError) as error:
             if not options.log_optional:
                 raise
@@ -135,6 +138,8 @@ class BaseRuntime:
         """Messages about files that cannot be written: each kind of trouble once."""
         if self._log is not None and self._log.why:
             self._notices.say("log", f"log: messages are lost: {self._log.why}; the base goes on")
+        elif self._log is not None and self._log.waits_for:
+            self._notices.say("disk", f"log: it waits for the disk: {self._log.waits_for}; the base goes on")
         if self._budget is not None and self._budget.deleted:
             limit = f"--log-mib {self.options.log_mib}, or a disk that is nearly full"
             self._notices.say("budget", f"log: the oldest logs are deleted: {limit}")
@@ -150,6 +155,8 @@ class BaseRuntime:
             troubles.append("log: there is none of this start")
         elif self._log is not None and self._log.why:
             troubles.append(f"log: messages are lost: {self._log.why}")
+        elif self._log is not None and self._log.waits_for:
+            troubles.append(f"log: it waits for the disk: {self._log.waits_for}")
         for kind, why in sorted(self.station.mapper.failures.items()):
             troubles.append(f"job {kind}: the last one failed, and its part of the map stays as it was: {why}")
         return {

@@ -64,6 +64,7 @@ def fly_live(options: BaseOptions, parent: process.Parent | None, stop: process.
         try:
             with starting(), long_work(stop, "compiling kernels"):
                 base = BaseRuntime(options, coded_channels(options, link_traits(options.link)), workers)
+            stack.callback(lambda: process.print_lines(base.take_notices()))
             stack.callback(lambda: closed.append(base.close()))
             process.notify("READY=1")  # a store or an import that takes minutes is no failed start
             with long_work(stop, "reading the map"):

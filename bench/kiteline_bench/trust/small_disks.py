@@ -14,6 +14,7 @@ from pathlib import Path
 
 from kiteline_lab.flights.processes import free_endpoint
 
+_TOLD = "log: it waits for the disk"
 _SIZE_MIB = {"agent": 64, "base": 24, "store": 12}
 _TRACKED = re.compile(r"over: (\d+) frames: (\d+) tracked")
 _KEYFRAMES = re.compile(r"stopped: (\d+) keyframe")
@@ -107,7 +108,7 @@ def main(recording: str, out: Path, instants: int) -> None:
     (out / "found.json").write_text(
         json.dumps({
             **lines, "codes": codes, "fills": fills, "full_s": full_s, "flown_s": flown_s,
-            "told": [said["agent"].count("log: messages are lost"), said["base"].count("log: messages are lost")],
+            "told": [said["agent"].count(_TOLD), said["base"].count(_TOLD)],
             "keyframes": 0 if kept is None else int(kept[1]), "restarted": 0 if flown is None else int(flown[2]),
         })
     )  # fmt: skip

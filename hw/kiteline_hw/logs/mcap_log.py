@@ -45,7 +45,7 @@ from kiteline_hw.logs.log_budget import LogBudget
 from kiteline_hw.logs.mcap_log_read import LogMessage, LogReader, read_frame
 from kiteline_hw.logs.mcap_write import McapWriter
 from kiteline_hw.logs.rig_json import LENS_NAMES, rig_to_json
-from kiteline_hw.logs.whole_file import WholeFile
+from kiteline_hw.logs.whole_file import BesideFile, WholeFile
 from kiteline_hw.ports import SourceError
 from kiteline_hw.system.closing import Closing
 
@@ -69,12 +69,13 @@ class LogWriter(Closing):
 
     budget: limits the logs of the folder; at a part of it a new file NAME_1.mcap, NAME_2.mcap… begins, with the next
     message on `part_topic`, and the oldest logs are deleted. dropped: messages not written. why: of the first of them;
-    "" if none was lost. encoder: of raw images; it is closed with the log.
+    "" if none was lost. encoder: of raw images; it is closed with the log. beside: the file is written by a thread, so
+    that no caller waits for a disk that stalls.
     """
 
     def __init__(
         self, path: Path | str, metadata: Mapping[str, str], *, budget: LogBudget | None = None,
-        part_topic: str | None = None, encoder: ImageEncoder | None = None,
+        part_topic: str | None = None, encoder: ImageEncoder | None = None, beside: bool = False,
     ) -> None:  # fmt: skip
         self.path = Path(path)
         self.dropped = 0
@@ -83,6 +84,8 @@ class LogWriter(Closing):
         self._metadata = dict(metadata)
         self._budget, self._part_topic = budget, part_topic
         self._part = 0
+        self._beside = beside
+        self._ended: list[BesideFile] = []  # earlier parts for which the disk may not have had the time yet
         self._rig: tuple[CameraRig, ImuCalibration | None] | None = None
         if budget is not None:
             budget.make_room()
@@ -225,8 +228,14 @@ class LogWriter(Closing):
             pieces += schemas.bytes_field(schemas.Fields, "numbers", numbers)
         self._write(topic, t_ns, schemas.Fields, pieces, _NO_NOTES)
 
+    @property
+    def waits_for(self) -> str:
+        """Why the disk takes nothing at present, while nothing is lost yet; "" if it does, and always if not beside."""
+        parts = [*self._ended, *([self._stream] if isinstance(self._stream, BesideFile) else [])]
+        return next((part.waits_for for part in parts if part.waits_for), "")
+
     def flush(self) -> None:
-        """Pass all logged data to the operating system; waits for images that are being encoded."""
+        """Pass all logged data to the operating system, or the thread beside; waits for images being encoded."""
         self._encoder.drain()
         try:
             self._writer.flush()
@@ -246,12 +255,23 @@ class LogWriter(Closing):
         except OSError as error:
             self._count_lost(error)
         finally:
-            self._stream.close()
+            self._end(self._stream)
+        for stream in self._ended:
+            stream.close()
+            if stream.unwritten:
+                self._count_lost(stream.fault, stream.unwritten)
 
-    def _count_lost(self, error: OSError) -> None:
-        """Count what the disk did not take."""
+    def _end(self, stream: WholeFile | BesideFile) -> None:
+        """End a part without waiting for the disk."""
+        stream.end()
+        self._ended = [part for part in self._ended if part.unwritten]
+        if isinstance(stream, BesideFile):
+            self._ended.append(stream)
+
+    def _count_lost(self, error: OSError, chunks: int = 1) -> None:
+        """Count what the disk did not take. chunks: of a message each at least."""
         self.why = self.why or error.strerror or str(error)
-        self.dropped += max(1, self._writer.lost)
+        self.dropped += max(chunks, self._writer.lost)
         self._writer.lost = 0
         if self._budget is not None:
             self._budget.make_room_beside(self._path)
@@ -259,7 +279,7 @@ class LogWriter(Closing):
     def _open(self, path: Path) -> None:
         self._path = path  # of the file that is being written
         try:
-            self._stream = WholeFile(path)
+            self._stream: WholeFile | BesideFile = BesideFile(path) if self._beside else WholeFile(path)
         except OSError as error:
             raise SourceError(f"{path}: cannot write the log: {error.strerror}") from error
         self._writer = McapWriter(self._stream, CHUNK_BYTES, "kiteline")
@@ -304,6 +324,8 @@ class LogWriter(Closing):
             elif abs(t_ns - self._flushed_ns) >= FLUSH_NS:
                 self._flushed_ns = t_ns
                 self._writer.flush()
+                if self._budget is not None and self.waits_for:
+                    self._budget.make_room_beside(self._path)
         except OSError as error:
             self._count_lost(error)
 
@@ -332,7 +354,7 @@ class LogWriter(Closing):
         except OSError as error:
             self._count_lost(error)
         finally:
-            stream.close()
+            self._end(stream)
         budget.make_room_beside(self._path)
         if self._rig is not None:
             self.rig(t_ns, *self._rig)

@@ -4,6 +4,7 @@ import errno
 import io
 import os
 import signal
+import threading
 import time
 from collections import Counter
 from dataclasses import replace
@@ -262,6 +263,37 @@ def test_an_agent_flies_without_a_log_that_cannot_begin(
     assert len(told) == 1 and "no log of this flight" in told[0]
     with pytest.raises((OSError, SourceError)):
         fly(AgentOptions(str(recording), str(tmp_path / "logs" / "agent0")), 99, 99, monkeypatch)
+
+
+def test_a_flight_does_not_wait_for_the_disk_of_its_log(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    go, pwrite = threading.Event(), os.pwrite
+
+    def stalled(fd: int, data: bytes, offset: int) -> int:
+        assert threading.current_thread() is not threading.main_thread()
+        go.wait(20.0)
+        return pwrite(fd, data, offset)
+
+    monkeypatch.setattr(os, "pwrite", stalled)
+    options = AgentOptions(str(recording), str(tmp_path), log_optional=True)
+    runtime = AgentRuntime(options, open_source(options.source), NoBaseChannel(), whole_process=False)
+    while runtime.next_ns is not None:
+        runtime.tick(Down(runtime.next_ns, Phase.FLY, ()))
+    go.set()
+    runtime.close()
+    assert runtime.report()["frames"] == 30 and runtime.take_notices() == runtime.log_notes() == []
+    with LogReader(tmp_path / "log.mcap") as log:
+        assert log.cut is None and log.topics["/left/image"] == 30
+    assert (tmp_path / "odometry.tum").read_text().count("\n") == 30
+
+
+def test_what_waits_for_a_full_disk_to_the_end_is_told_as_lost(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    runtime, _ = fly(AgentOptions(str(recording), str(tmp_path), log_optional=True), 5, 99, monkeypatch)
+    assert [line.split(":")[0] for line in runtime.log_notes()] == ["log", "trajectory", "trajectory"]
+    assert all("No space" in line for line in runtime.log_notes())
 
 
 @pytest.mark.parametrize("what", ["opened", "AgentRuntime"])

@@ -3,6 +3,8 @@
 import errno
 import os
 import tempfile
+import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,10 +12,12 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from kiteline_hw.logs import whole_file
 from kiteline_hw.logs.log_budget import LogBudget
+from kiteline_hw.logs.log_parts import WholeLog
 from kiteline_hw.logs.mcap_log import LogReader, LogWriter
 from kiteline_hw.logs.spill_file import SpillFile
-from kiteline_hw.logs.whole_file import LineFile, WholeFile
+from kiteline_hw.logs.whole_file import BesideFile, LineFile, WholeFile
 
 
 class SmallDisk:
@@ -104,6 +108,83 @@ def test_a_log_that_is_full_to_the_end_keeps_what_was_written(
     with LogReader(tmp_path / "log.mcap") as read:
         found = [int.from_bytes(m.blob()[:2], "little") for m in read.messages()]
     assert found == list(range(len(found))) and len(found) >= 30
+
+
+class StalledDisk:
+    """Answers no write until it is let go."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.go = threading.Event()
+        self._pwrite = os.pwrite
+        monkeypatch.setattr(os, "pwrite", self.pwrite)
+
+    def pwrite(self, fd: int, data: bytes, offset: int) -> int:
+        assert threading.current_thread() is not threading.main_thread()
+        self.go.wait(10.0)
+        return self._pwrite(fd, data, offset)
+
+
+def test_a_log_beside_waits_for_no_disk_and_is_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with LogWriter(tmp_path / "plain.mcap", {}) as plain:
+        disk = StalledDisk(monkeypatch)
+        log, lines = LogWriter(tmp_path / "log.mcap", {}, beside=True), LineFile(tmp_path / "a.tum", beside=True)
+        for k in range(200):
+            log.blob("/a", k, bytes([k]) * 2000)
+            lines.write(f"{k}\n")
+        assert not log.waits_for and log.dropped == lines.lost == 0
+        disk.go.set()
+        log.close()
+        lines.close()
+        monkeypatch.undo()
+        for k in range(200):
+            plain.blob("/a", k, bytes([k]) * 2000)
+    assert (tmp_path / "log.mcap").read_bytes() == (tmp_path / "plain.mcap").read_bytes()
+    assert (tmp_path / "a.tum").read_text().split() == [str(k) for k in range(200)]
+
+
+def test_what_a_stalled_disk_does_not_take_is_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(whole_file, "_CLOSE_S", 0.2)
+    disk, file = StalledDisk(monkeypatch), BesideFile(tmp_path / "file", most_bytes=10)
+    file.write(b"123456")
+    assert file.waits_for == "the disk does not answer"
+    with pytest.raises(OSError, match="does not answer"):
+        file.write(b"abcdef")
+    file.close()
+    assert file.closed and file.unwritten == 1
+    disk.go.set()
+
+
+def test_a_log_beside_goes_on_once_the_full_disk_has_room(
+    tmp_path: Path, small_disk: Callable[[int], SmallDisk], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(whole_file, "_RETRY_S", 0.01)
+    disk, budget = small_disk(100_000), LogBudget(tmp_path, "log", 200_000, 0)
+    log = LogWriter(tmp_path / "log00001.mcap", {}, budget=budget, beside=True)
+    for k in range(100):
+        log.blob("/a", k, k.to_bytes(2, "little") * 1000)
+    end_s = time.monotonic() + 5.0
+    while log.waits_for != os.strerror(errno.ENOSPC):
+        assert time.monotonic() < end_s
+        time.sleep(0.01)
+    disk.room = 10**9
+    log.close()
+    assert log.dropped == 0 and log.why == ""
+    with WholeLog(tmp_path / "log00001.mcap") as read:
+        assert [int.from_bytes(m.blob()[:2], "little") for m in read.messages()] == list(range(100))
+
+
+def test_a_log_beside_on_a_disk_that_stays_full_says_so(tmp_path: Path, small_disk: Callable[[int], SmallDisk]) -> None:
+    small_disk(100_000)
+    log, lines = LogWriter(tmp_path / "log.mcap", {}, beside=True), LineFile(tmp_path / "a.tum", beside=True)
+    for k in range(200):
+        log.blob("/a", k, k.to_bytes(2, "little") * 1000)
+    log.close()
+    lines.write("one\n")
+    lines.close()
+    assert log.dropped > 0 and "No space" in log.why and lines.lost == 1 and "No space" in lines.why
+    with LogReader(tmp_path / "log.mcap") as read:
+        found = [int.from_bytes(m.blob()[:2], "little") for m in read.messages()]
+    assert found == list(range(len(found))) and found
 
 
 def put(folder: Path, name: str, size: int, age: int) -> None:
