@@ -51,6 +51,7 @@ SAVE_FRAMES = 200  # frames between two looks at whether the rig file is up to d
 PROGRESS_FRAMES = 10  # frames between two reports of progress, and between two readings of the memory in use
 # events that begin so are noted in the report, as many at most
 _WARNING, _MOST_WARNINGS = ("imu:", "images:", "odometer: no samples"), 10
+_SAVE_S = 5.0  # s that the disk may take for the rig file at the end
 _IMAGES_WAITING = 12  # images that wait to be encoded, 9 MB; then live flights store images, others wait
 
 
@@ -80,6 +81,7 @@ class AgentRuntime:
             config = replace(config, keyframe=replace(config.keyframe, earlier=True))
         self._rig_file = RigFile(options.rig) if options.rig else None
         self._saving: threading.Thread | None = None  # what writes the rig file
+        self._rig_waits = False  # it did not come to an end
         begin_ns = time.process_time_ns()
         codec_warm.warm()
         warm(config)
@@ -301,7 +303,8 @@ class AgentRuntime:
         """A line for each file that is not whole."""
         files = [] if self._log is None else [("log", self._log.dropped, "messages", self._log.why)]
         files += [("trajectory", file.lost, "poses", file.why) for file in self._lines]
-        return [f"{name}: {lost} {what} were not written: {why}" for name, lost, what, why in files if lost]
+        notes = [f"{name}: {lost} {what} were not written: {why}" for name, lost, what, why in files if lost]
+        return notes + ["rig: what this flight found is not written: the disk does not answer"] * self._rig_waits
 
     def take_notices(self) -> list[str]:
         """Messages about files that cannot be written: each kind of trouble once in a flight."""
@@ -331,11 +334,13 @@ class AgentRuntime:
             self._notices.say("rig", f"rig: {error}")
 
     def close(self) -> None:
-        """Finish the files."""
+        """Finish the files. A disk that does not answer is awaited for some seconds."""
         if self._saving is not None:
-            self._saving.join()
-        if self._rig_file is not None:
-            self._write_rig(self.agent.known_rig())
+            self._saving.join(_SAVE_S)
+        self._save_rig()
+        if self._saving is not None:
+            self._saving.join(_SAVE_S)
+            self._rig_waits = self._saving.is_alive()
         self._files.close()
 
 

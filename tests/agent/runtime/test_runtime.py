@@ -244,6 +244,18 @@ def test_a_rig_file_that_cannot_be_written_is_told_once(
     assert len(told) == 1 and "rig.toml: cannot write" in told[0]
 
 
+def test_a_rig_file_that_the_disk_does_not_take_holds_up_no_end(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    go = threading.Event()
+    monkeypatch.setattr(RigFile, "save", lambda *_: go.wait(20.0))
+    monkeypatch.setattr(agent_runtime, "_SAVE_S", 0.1)
+    begin_s = time.monotonic()
+    runtime, _ = fly(AgentOptions(str(recording), str(tmp_path), rig=str(tmp_path / "rig.toml")), 99, 99, monkeypatch)
+    assert time.monotonic() - begin_s < 15.0 and "rig: what this flight found is not written" in runtime.log_notes()[0]
+    go.set()
+
+
 def test_a_rig_file_of_another_calibration_is_told(
     recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
