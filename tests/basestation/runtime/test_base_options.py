@@ -8,6 +8,7 @@ from kiteline_basestation import __main__ as program
 from kiteline_basestation.runtime.options import BaseOptions, coded_channels
 from kiteline_codec.sync.config import BudgetError
 from kiteline_hw.links.kinds import link_traits
+from kiteline_hw.system import process
 
 LINK = "serial:/dev/ttyUSB0:57600"
 
@@ -28,8 +29,8 @@ def test_a_base_says_at_once_that_it_loads(
         raise KeyboardInterrupt
 
     monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path))
-    monkeypatch.setattr(program.process, "outlive_terminal", lambda: None)
-    monkeypatch.setattr(program.process, "StopSignal", lambda: None)
+    monkeypatch.setattr(process, "outlive_terminal", lambda: None)
+    monkeypatch.setattr(process, "StopSignal", lambda: None)
     monkeypatch.setattr(program, "fly_live", begin)
     with pytest.raises(KeyboardInterrupt):
         program.main(["--link", "zenoh:tcp/127.0.0.1:1", "--insecure", *(["--quiet"] if quiet else [])])
