@@ -300,7 +300,7 @@ class Mapper:
         return self.merger.add_keyframe(keyframe)
 
     def _apply_merges(self, changes: MergeResult) -> tuple[tuple[AgentId, Key], ...]:
-        """Update bundles, placements and the grid after whole maps moved. Returns placements that are void."""
+        """Update bundles, placements and the grid after whole maps moved or went. Returns placements that are void."""
         for keyframe in changes.requeried:
             self._local_bundles.add(keyframe)
         self._local_bundles.void(changes.moved, changes.bent)
@@ -311,7 +311,7 @@ class Mapper:
             self.grid_updates.rebuild()
         return tuple(
             (agent_of_submap(submap), Key(SubmapPlacement.KIND, int(submap), 0))
-            for submap in withdrawn
+            for submap in (*withdrawn, *sorted(self._forgotten))
             if submap not in self.placements
         )
 

@@ -16,9 +16,9 @@ from kiteline_basestation.mapper import Mapper, MapperInput
 from kiteline_basestation.station import Station
 from kiteline_basestation.store.integrity import contradictions
 from kiteline_codec.channel import CodedChannel, coded_channel
-from kiteline_codec.schema import KEYFRAME_KINDS, CameraIntrinsics, CulledLandmarks
+from kiteline_codec.schema import KEYFRAME_KINDS, CameraIntrinsics, CulledLandmarks, SubmapPlacement
 from kiteline_codec.sync.resumption import agent_session
-from kiteline_core.ids import submap_of_keyframe
+from kiteline_core.ids import AgentId, submap_of_keyframe
 from tests.basestation.feeding import STEP_NS, WITHOUT_GRID, feed
 from tests.entries import entries_of
 
@@ -46,6 +46,37 @@ def test_deleted_maps_leave_their_memory_to_the_next_ones(make_flight: MakeFligh
     for keyframe in stays.keyframes:
         assert np.array_equal(mapper.map.pose(keyframe), alone.map.pose(keyframe))
     assert mapper.map.count_live() == alone.map.count_live() == len(mapper.map.live_landmarks())
+
+
+def test_an_agent_has_no_place_in_a_map_that_is_deleted(make_flight: MakeFlight, words: Any) -> None:
+    """It was out of reach, and went on in the map by its placement until its next start."""
+    flight, stays = make_flight(keyframes=10), make_flight(keyframes=10, agent=1, seed=5)
+    ends = {f.agent: coded_channel(agent_session(1, 1), 0, "wifi") for f in (flight, stays)}
+    station = Station(WITHOUT_GRID, lambda agent: coded_channel(1, 0, "wifi", peer=agent), words)
+    down: dict[AgentId, tuple[bytes, ...]] = {}
+    done: tuple[JobDone, ...] = ()
+    placed: set[int] = set()
+    for n in range(90):
+        packets = {}
+        for f in (flight, stays):
+            if n == 0:
+                ends[f.agent].put(CameraIntrinsics(f.agent, f.camera))
+            records = ends[f.agent].receive(down.get(f.agent, ()), n * STEP_NS)
+            placed |= {r.submap for r in records if isinstance(r, SubmapPlacement)}
+            placed -= {key.id for key in ends[f.agent].take_removed() if key.kind == SubmapPlacement.KIND}
+            for record in f.records[n] if n < len(f.records) else ():
+                ends[f.agent].put(record)
+            packets[f.agent] = ends[f.agent].poll(n * STEP_NS)
+        orders = [Command(1, "delete", '{"map": "0.1.0"}')] if n == 60 else []
+        if orders:
+            assert placed == {submap_of_keyframe(flight.keyframes[0])}
+        output = station.step(packets, done, n * STEP_NS, orders)
+        assert all(answer.ok for answer in output.answers)
+        done, down = tuple(run_job(job) for job in output.jobs), dict(output.packets)
+    assert placed == set()
+    channel = station.channels[flight.agent]
+    assert isinstance(channel, CodedChannel)
+    assert not any(key.kind == SubmapPlacement.KIND for key in channel.own_values())
 
 
 def test_flights_that_come_and_are_deleted_leave_nothing_behind(

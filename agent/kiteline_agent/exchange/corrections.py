@@ -96,9 +96,8 @@ class Corrections:
             moved |= self._apply_corrections(anchor)
         self._cache.remove(removed)
         for key in removed:
-            if key.kind == SubmapPlacement.KIND:  # its merge was undone, and its place is not known yet
-                self._S_w_m.pop(SubmapId(key.id), None)
-                self._recognised.discard(SubmapId(key.id))
+            if key.kind == SubmapPlacement.KIND:
+                self._withdraw(SubmapId(key.id))
             if key.kind == GridTile.KIND:  # far away, or of another storey
                 column, row, storey = GridTile.place(key)
                 if (held := self.tiles.get((column, row))) is not None and held.storey == storey:
@@ -152,6 +151,20 @@ class Corrections:
         else:
             self._recognised.discard(record.submap)
         return False
+
+    def _withdraw(self, submap: SubmapId) -> None:
+        """A submap has no place in w any more: its merge was undone, or its map is deleted.
+
+        Live poses of the active one do not go on in w from where it lay.
+        """
+        if submap == self._own_world:  # its placement was not applied yet
+            return
+        self._S_w_m.pop(submap, None)
+        self._recognised.discard(submap)
+        if submap == self._map.active:
+            self._smoothing.clear()
+            self._filter.clear()
+            self._whole.clear()
 
     def _take_calibration(self, record: DisparityCalibration) -> bool:
         if self._calibrate is not None:

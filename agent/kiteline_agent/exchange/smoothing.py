@@ -31,6 +31,11 @@ class Smoothing:
         """Report the next corrected pose at once."""
         self._goal = None
 
+    def clear(self) -> None:
+        """Forget the world: no pose was reported in the one that follows."""
+        self._T_w_o = self._goal = None
+        self._hasty = False
+
     def begin(self, T_w_o: F64) -> None:
         """Corrections move the pose from here (4,4), if none was reported yet."""
         if self._T_w_o is None:

@@ -66,6 +66,26 @@ def test_a_withdrawn_placement_recognises_nothing(corrections: Corrections) -> N
     assert corrections.in_world(SECOND, np.eye(4), np.eye(4), 0, metric=True) is None
 
 
+def test_poses_in_the_world_end_where_a_submap_has_no_place_in_it(corrections: Corrections) -> None:
+    """They went on where the map lay that a user deleted, or by the merge that was found wrong."""
+    corrections.take([SubmapPlacement(FIRST, FAR, recognised=True)], [])
+    assert corrections.in_world(FIRST, np.eye(4), np.eye(4), 0, metric=True) is not None
+    corrections.take([], [Key(SubmapPlacement.KIND, int(FIRST), 0)])
+    assert corrections.in_world(FIRST, np.eye(4), np.eye(4), 50_000_000, metric=True) is None
+    assert corrections.in_world(SECOND, np.eye(4), FAR, 100_000_000, metric=True) is None
+    corrections.take([SubmapPlacement(FIRST, np.eye(4))], [])
+    placed = corrections.in_world(FIRST, np.eye(4), np.eye(4), 150_000_000, metric=True)
+    assert np.allclose(placed, np.eye(4))  # at once, not at the speed of corrections
+
+
+def test_a_world_of_the_agents_own_does_not_end_with_a_placement_that_was_never_applied(
+    corrections: Corrections,
+) -> None:
+    corrections.move_on_board(FIRST, FAR)
+    corrections.take([], [Key(SubmapPlacement.KIND, int(FIRST), 0)])
+    assert np.allclose(in_world(corrections), np.eye(4))
+
+
 TILTED = GravityAlignment(FIRST, se3.exp(np.array([0.2, 0.1, 0.0, 0.4, -0.2, 0.0])))
 
 
