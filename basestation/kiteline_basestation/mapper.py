@@ -27,8 +27,8 @@ from kiteline_basestation.map.map_tables import CULLED, LANDMARK
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.mapper_state import MapperCounts, MapperState, map_state, restore_map
 from kiteline_basestation.merging.graph_job import POSE_GRAPH
-from kiteline_basestation.merging.map_merger import NO_CLOSURES, MapMerger, MergerState
-from kiteline_basestation.merging.merges import NOTHING, MergeResult
+from kiteline_basestation.merging.map_merger import NO_CLOSURES, MapMerger
+from kiteline_basestation.merging.merges import NOTHING, MergeResult, MergerState
 from kiteline_basestation.refinement import culling, landmark_matching, triangulation
 from kiteline_basestation.refinement.bundle_job import FULL_BUNDLE, LOCAL_BUNDLE
 from kiteline_basestation.refinement.local_bundles import LocalBundles

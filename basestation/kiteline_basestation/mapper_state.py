@@ -12,7 +12,7 @@ from kiteline_basestation.grid.image_scans import MadeScan
 from kiteline_basestation.intake.intake import IntakeState
 from kiteline_basestation.intake.placements import PlacementState
 from kiteline_basestation.map.sparse_map import SparseMap
-from kiteline_basestation.merging.map_merger import MergerState
+from kiteline_basestation.merging.merges import MergerState
 from kiteline_core.arrays import F64
 from kiteline_core.geometry.disparity_offset import TERMS
 from kiteline_core.ids import AgentId, KeyframeId, SubmapId

@@ -6,7 +6,7 @@ accepted when enough keyframes agree on one correction and few or none contradic
 
 from bisect import insort
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -147,6 +147,12 @@ class LoopDetector:
             self.verified += 1
             found = found or self._weigh(match) or self._verify_neighbours(match)
         return found
+
+    def contradict(self, pairs: Iterable[SubmapPair]) -> None:
+        """A full bundle rejected the matches of these submaps: more of them, and others, have to merge them again."""
+        for key in {_pair(*pair) for pair in pairs}:
+            self._matches.pop(key, None)
+            self._contradicted[key] = self._contradicted.get(key, 0) + 1
 
     def rescale(self, factor: Mapping[KeyframeId, float]) -> None:
         """Multiply lengths of pending matches near keyframes, in units of their submaps."""

@@ -5,8 +5,8 @@ bundle (job). A newer closure in a map cancels its pending jobs. A merge that th
 undone. Every method that moves maps returns what the mapper has to apply.
 """
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -20,16 +20,19 @@ from kiteline_basestation.merging import loop_consistency as consistency
 from kiteline_basestation.merging.correction import apply_scales, keyframes_of, move_keyframes, scale_map
 from kiteline_basestation.merging.correction_jobs import CorrectionJobs, FullBundle
 from kiteline_basestation.merging.essential_graph import GraphResult
-from kiteline_basestation.merging.loop_detector import (
-    Contradiction,
-    DetectorState,
-    LoopClosure,
-    LoopDetector,
-    known_matches,
-)
+from kiteline_basestation.merging.loop_detector import Contradiction, LoopClosure, LoopDetector, known_matches
 from kiteline_basestation.merging.loop_edges import LoopEdge, LoopMatch, rescaled, slot_pairs
 from kiteline_basestation.merging.loop_verification import MAX_NEIGHBOURS
-from kiteline_basestation.merging.merges import NOTHING, MapMerge, MergeResult, fused_across, is_contradicted
+from kiteline_basestation.merging.merges import (
+    NOTHING,
+    MapMerge,
+    MergeResult,
+    MergerState,
+    edges_out_of,
+    fused_across,
+    is_contradicted,
+    resting_on,
+)
 from kiteline_basestation.refinement import disparity_calibration as disparity
 from kiteline_basestation.refinement import landmark_matching
 from kiteline_basestation.refinement.apply_bundle import apply_bundle, keep_scales
@@ -45,24 +48,6 @@ from kiteline_core.places.place_index import Vocabulary
 _LOOP_GAP = 30  # keyframes; landmarks observed again after so many count as a loop
 _REQUERIES = 2  # keyframes of merged maps that are matched to the other map in one step
 NO_CLOSURES = dict.fromkeys(("loops", "merges", "merges_undone", "loop_matches", "matches_refused"), 0)
-
-
-@dataclass(frozen=True, slots=True)
-class MergerState:
-    """State of a `MapMerger` that outlives the process; pending jobs are due again."""
-
-    loops: int = 0
-    undone: int = 0
-    last_return: Mapping[SubmapId, int] = field(default_factory=dict)
-    uncertain_at: Mapping[SubmapId, int] = field(default_factory=dict)
-    bundled_sizes: Mapping[SubmapId, int] = field(default_factory=dict)
-    graphs_due: tuple[SubmapId, ...] = ()
-    bundles_due: tuple[SubmapId, ...] = ()
-    requery: tuple[KeyframeId, ...] = ()
-    edges: tuple[LoopEdge, ...] = ()
-    unfused: Mapping[SubmapId, tuple[LoopMatch, ...]] = field(default_factory=dict)
-    merges: tuple[MapMerge, ...] = ()
-    detector: DetectorState = field(default_factory=DetectorState)
 
 
 class MapMerger:
@@ -175,6 +160,7 @@ class MapMerger:
             return NOTHING
         last = next((m for m in reversed(self.merges) if m.into == map_id), None)
         if last is not None and is_contradicted(self._map, last, window, result, self._config):
+            self.detector.contradict(edges_out_of(last.moved, self._edges))
             return self.undo(last)
         changed = self._apply_full_bundle(bundle, result)
         if agents:
@@ -212,9 +198,9 @@ class MapMerger:
         merge = next((m for m in reversed(self.merges) if submap in m.moved), None)
         if merge is None:
             return None
-        rest = frozenset(self._map.submaps_of_map(merge.into)).difference(merge.moved)  # `-` of its keys is a set
-        self.detector.kept_apart.append((frozenset(merge.moved), rest))
-        return self.undo(merge)
+        changes = self.undo(merge)
+        self.detector.kept_apart.append((frozenset(merge.moved), frozenset(self._map.submaps_of_map(merge.into))))
+        return changes
 
     def delete(self, submaps: Collection[SubmapId]) -> None:
         """Drop all that concerns deleted submaps."""
@@ -234,20 +220,28 @@ class MapMerger:
             merge.forget(gone)
 
     def undo(self, merge: MapMerge) -> MergeResult:
-        """Separate a merged map again: move it back, and unfuse its landmarks from those of the other map."""
-        sparse_map = self._map
+        """Separate a merged map again: move it back, and unfuse its landmarks from those of the other map.
+
+        Later merges that rest on it are undone as well, and searched again.
+        """
+        sparse_map, result, again = self._map, NOTHING, list[SubmapId]()
+        while (other := resting_on(merge, self.merges[self.merges.index(merge) + 1 :], self._edges)) is not None:
+            again += other.moved
+            result += self.undo(other)
         at, split = self.merges.index(merge), frozenset(merge.moved)
         rest = sparse_map.map_id(merge.into)  # it may have been merged into another map since
         self.merges.remove(merge)
         for later in self.merges[at:]:  # they no longer hold what is apart from now on
             later.forget(split)
         self.undone += 1
+        self.detector.requested.discard((min(merge.map_id, merge.into), max(merge.map_id, merge.into)))
         self._corrections.cancel_pending(rest)
         self._edges = [
             e for e in self._edges if (submap_of_keyframe(e.new) in split) == (submap_of_keyframe(e.old) in split)
         ]
         self._unfused.pop(rest, None)
-        self._requery = [k for k in self._requery if submap_of_keyframe(k) not in split]
+        left = (k for k in self._requery if submap_of_keyframe(k) not in split)
+        self._requery = list(dict.fromkeys([*left, *(k for s in again for k in sparse_map.submaps[s])]))
         fused = fused_across(sparse_map, split)
         sparse_map.unfuse(fused)
         self._publisher.mark_changed_slots(FusedLandmarks.KIND, fused)
@@ -258,7 +252,7 @@ class MapMerger:
             if submap != merge.map_id:
                 sparse_map.root_submaps[submap] = merge.map_id
             sparse_map.move_submap(submap, S_w_m)
-        return MergeResult(moved=frozenset({rest, merge.map_id}), split=split)
+        return result + MergeResult(moved=frozenset({rest, merge.map_id}), split=split)
 
     # -- saved state -------------------------------------------------------------------------------------------------
 

@@ -1,6 +1,6 @@
-"""Merges of maps, and what a step of the map merger changed."""
+"""Merges of maps, what rests on them, and what a step of the map merger changed."""
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -8,9 +8,11 @@ import numpy as np
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.map.map_tables import LANDMARK
 from kiteline_basestation.map.sparse_map import SparseMap
+from kiteline_basestation.merging.loop_detector import DetectorState, SubmapPair
+from kiteline_basestation.merging.loop_edges import LoopEdge, LoopMatch
 from kiteline_basestation.refinement.bundle_window import BundleWindow
 from kiteline_core.arrays import F64, I32, I64
-from kiteline_core.ids import SEQUENCE_BITS, KeyframeId, SubmapId
+from kiteline_core.ids import SEQUENCE_BITS, KeyframeId, SubmapId, submap_of_keyframe
 from kiteline_core.optimisation.bundle import BundleResult
 
 _MIN_KEPT = 0.5  # share of inliers among observations that a merge fused: below it the merge is undone
@@ -37,6 +39,24 @@ class MapMerge:
         self.moved = {submap: S_w_m for submap, S_w_m in self.moved.items() if submap not in submaps}
 
 
+@dataclass(frozen=True, slots=True)
+class MergerState:
+    """State of a `MapMerger` that outlives the process; pending jobs are due again."""
+
+    loops: int = 0
+    undone: int = 0
+    last_return: Mapping[SubmapId, int] = field(default_factory=dict)
+    uncertain_at: Mapping[SubmapId, int] = field(default_factory=dict)
+    bundled_sizes: Mapping[SubmapId, int] = field(default_factory=dict)
+    graphs_due: tuple[SubmapId, ...] = ()
+    bundles_due: tuple[SubmapId, ...] = ()
+    requery: tuple[KeyframeId, ...] = ()
+    edges: tuple[LoopEdge, ...] = ()
+    unfused: Mapping[SubmapId, tuple[LoopMatch, ...]] = field(default_factory=dict)
+    merges: tuple[MapMerge, ...] = ()
+    detector: DetectorState = field(default_factory=DetectorState)
+
+
 def is_contradicted(
     sparse_map: SparseMap, merge: MapMerge, window: BundleWindow, result: BundleResult, config: BaseConfig
 ) -> bool:
@@ -51,6 +71,21 @@ def is_contradicted(
     if int(np.count_nonzero(moved)) < config.loops.min_inliers:
         return False
     return float(np.mean(result.inlier[moved])) < _MIN_KEPT
+
+
+def edges_out_of(submaps: Collection[SubmapId], edges: Iterable[LoopEdge]) -> list[SubmapPair]:
+    """The submaps of edges that lead out of some submaps: the one inside, then the other one."""
+    ends = [(submap_of_keyframe(edge.new), submap_of_keyframe(edge.old)) for edge in edges]
+    return [(a, b) if a in submaps else (b, a) for a, b in ends if (a in submaps) != (b in submaps)]
+
+
+def resting_on(merge: MapMerge, later: Iterable[MapMerge], edges: Sequence[LoopEdge]) -> MapMerge | None:
+    """The first of later merges that has edges to submaps of the merged map alone: its map lies where that one lay."""
+    for other in later:
+        pairs = edges_out_of(other.moved, edges)
+        if pairs and all(a in merge.moved or b in merge.moved for a, b in pairs):
+            return other
+    return None
 
 
 def fused_across(sparse_map: SparseMap, submaps: Collection[SubmapId]) -> I32:

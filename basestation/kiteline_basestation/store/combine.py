@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from kiteline_basestation.intake.placements import PlacementState
 from kiteline_basestation.mapper_state import MapperState, MapState
 from kiteline_basestation.merging.loop_detector import DetectorState
-from kiteline_basestation.merging.map_merger import MergerState
+from kiteline_basestation.merging.merges import MergerState
 from kiteline_basestation.store.saved_map import SavedMap, SavedValues
 from kiteline_basestation.store.state_texts import state_of, texts_of
 from kiteline_codec.schema import KEYFRAME_KINDS, GridTile, Key, KeyframeHeader, SubmapPlacement, WireError

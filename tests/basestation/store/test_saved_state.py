@@ -13,8 +13,7 @@ from kiteline_basestation.job_kinds import run_job
 from kiteline_basestation.jobs import JobDone
 from kiteline_basestation.management import Command
 from kiteline_basestation.mapper_state import MapperState, MapState
-from kiteline_basestation.merging.map_merger import MergerState
-from kiteline_basestation.merging.merges import MapMerge
+from kiteline_basestation.merging.merges import MapMerge, MergerState
 from kiteline_basestation.station import Import, Station
 from kiteline_basestation.store.combine import combine
 from kiteline_basestation.store.integrity import contradictions

@@ -11,8 +11,7 @@ from kiteline_basestation.intake.placements import PlacementState
 from kiteline_basestation.mapper_state import MapperState, MapState
 from kiteline_basestation.merging.loop_detector import DetectorState
 from kiteline_basestation.merging.loop_edges import LoopEdge, LoopMatch
-from kiteline_basestation.merging.map_merger import MergerState
-from kiteline_basestation.merging.merges import MapMerge
+from kiteline_basestation.merging.merges import MapMerge, MergerState
 from kiteline_basestation.store import state_texts
 from kiteline_basestation.store.state_texts import StateWriter, state_of, texts_of
 from kiteline_codec.schema import LivePose

@@ -1,0 +1,83 @@
+"""What rests on a merge that is undone, and whether it is made again."""
+
+import itertools
+import json
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+from kiteline_basestation.job_kinds import run_job
+from kiteline_basestation.management import Command
+from kiteline_basestation.mapper import Mapper, MapperInput
+from kiteline_basestation.merging import map_merger
+from kiteline_basestation.store.integrity import contradictions
+from kiteline_core.geometry import se3
+from kiteline_core.ids import submap_of_keyframe
+from tests.basestation.feeding import STEP_NS, WITHOUT_GRID, feed
+
+MakeFlight = Callable[..., Any]
+ELSEWHERE = se3.exp(np.array([3.0, -1.0, 0.2, 0.02, -0.03, 1.1]))
+ELSEWHERE_TOO = se3.exp(np.array([-2.0, 2.0, 0.1, 0.01, 0.02, -0.7]))
+
+
+def order(mapper: Mapper, verb: str, clock: Iterator[int], **given: Any) -> None:
+    """Carry a command out, and run the jobs that follow."""
+    output = mapper.step(MapperInput((), (), (Command(1, verb, json.dumps(given)),)), next(clock))
+    assert output.answers[0].ok, output.answers[0].text
+    rest(mapper, clock, output)
+
+
+def rest(mapper: Mapper, clock: Iterator[int], output: Any = None) -> None:
+    """Step until the mapper is idle."""
+    while output is None or not mapper.idle:
+        done = () if output is None else tuple(run_job(job) for job in output.jobs)
+        output = mapper.step(MapperInput((), done), next(clock))
+
+
+@pytest.mark.parametrize("by_user", [True, False])
+def test_a_map_that_matched_a_wrongly_merged_one_alone_goes_with_it(
+    make_flight: MakeFlight, words: Any, by_user: bool
+) -> None:
+    """It stayed in the map with which it has nothing in common, where the wrong merge had put it."""
+    other = make_flight(keyframes=12, turns=0.2, seed=9)
+    wrong = make_flight(keyframes=20, turns=0.6, agent=1)
+    last = make_flight(keyframes=20, turns=0.6, start=0.3, variant=1, agent=2, T_w_m=ELSEWHERE)
+    mapper, clock = Mapper(WITHOUT_GRID, words), itertools.count(10**12, STEP_NS)
+    feed(mapper, [other, wrong])
+    order(mapper, "merge", clock, map="1.1.0", into="0.1.0", T_into_map=ELSEWHERE_TOO.ravel().tolist())
+    feed(mapper, [last])
+    maps = [submap_of_keyframe(flight.keyframes[0]) for flight in (other, wrong, last)]
+    assert {mapper.map.map_id(submap) for submap in maps} == {maps[0]}
+    merger = mapper.merger
+    assert merger is not None
+    if by_user:
+        order(mapper, "split", clock, map="1.1.0")
+    else:
+        changes = merger.undo(merger.merges[0])
+        mapper._apply_merges(changes)
+        rest(mapper, clock)
+    assert [mapper.map.map_id(submap) for submap in maps] == [maps[0], maps[1], maps[1]]
+    assert contradictions(mapper) == []
+    T_b_c = mapper.map.submap_pose(maps[1]), mapper.map.submap_pose(maps[2])
+    assert np.allclose(se3.inverse(T_b_c[0]) @ T_b_c[1], ELSEWHERE, atol=0.03)
+
+
+@pytest.mark.parametrize("requested", [False, True])
+def test_a_merge_that_bundles_contradict_is_not_made_again_at_each_keyframe(
+    make_flight: MakeFlight, words: Any, monkeypatch: pytest.MonkeyPatch, requested: bool
+) -> None:
+    """A bundle that rejects it asks for more matches the next time, also after a user's command to search for them."""
+    monkeypatch.setattr(map_merger, "is_contradicted", lambda *_: True)
+    a = make_flight(keyframes=40, turns=0.8)
+    b = make_flight(keyframes=40, turns=0.8, start=0.1, variant=1, agent=1, T_w_m=ELSEWHERE)
+    mapper = Mapper(WITHOUT_GRID, words)
+    merger = mapper.merger
+    assert merger is not None
+    pair = submap_of_keyframe(a.keyframes[0]), submap_of_keyframe(b.keyframes[0])
+    if requested:
+        merger.search_overlap(pair[1], pair[0])
+    feed(mapper, [a, b])
+    assert 1 <= merger.undone < 10  # of 80 keyframes
+    assert merger.detector.state().contradicted == {pair: merger.undone} and not merger.detector.requested
