@@ -47,6 +47,7 @@ class GridUpdates:
         self._labels: dict[KeyframeId, U8] = {}  # of keypoints
         self._scanning: set[AgentId] = set()  # agents that send scans
         self._due: dict[KeyframeId, None] = {}  # may have moved, or are new
+        self._unplaced: dict[SubmapId, dict[KeyframeId, None]] = {}  # have scans, and no place in w yet
         self._unmade: dict[KeyframeId, None] = {}  # their scan is to be made from landmarks
         self._waited = 0  # busy steps since something could be drawn
 
@@ -147,11 +148,16 @@ class GridUpdates:
             if keyframe in self._scans:
                 self._due[keyframe] = None
         self._map.moved_rows.clear()
+        for submap in [s for s in self._unplaced if self._is_placed(s)]:
+            self._due.update(self._unplaced.pop(submap))
 
     def _draw(self, grid: ScanGrid, keyframe: KeyframeId) -> int:
         """Draw the scans of a keyframe where it is now. Returns how many changed."""
         S_w_k, changed = self._pose(keyframe), 0
-        for part, (scan, T_k_s) in self._scans.get(keyframe, {}).items():
+        scans, submap = self._scans.get(keyframe, {}), submap_of_keyframe(keyframe)
+        if scans and not self._is_placed(submap):
+            self._unplaced.setdefault(submap, {})[keyframe] = None
+        for part, (scan, T_k_s) in scans.items():
             if S_w_k is None:
                 changed += grid.remove((keyframe, part))
             else:
@@ -196,15 +202,18 @@ class GridUpdates:
         for part in self._scans.pop(keyframe, {}):
             self.grid.remove((keyframe, part))
         self._due.pop(keyframe, None)
+        self._unplaced.get(submap_of_keyframe(keyframe), {}).pop(keyframe, None)
         self._unmade.pop(keyframe, None)
 
     def _pose(self, keyframe: KeyframeId) -> F64 | None:
         """S_w_k (4,4) of a keyframe; None if its submap is not placed, or not in metres."""
         submap = submap_of_keyframe(keyframe)
-        S_w_m, T_m_k = self._placements.get(submap), self._map.pose(keyframe)
-        if S_w_m is None or T_m_k is None or self._map.is_up_to_scale(self._map.map_id(submap)):
-            return None
-        return S_w_m @ T_m_k
+        T_m_k = self._map.pose(keyframe)
+        return None if T_m_k is None or not self._is_placed(submap) else self._placements[submap] @ T_m_k
+
+    def _is_placed(self, submap: SubmapId) -> bool:
+        """True if a submap has a place in w, and is in metres."""
+        return submap in self._placements and not self._map.is_up_to_scale(self._map.map_id(submap))
 
     def _make(self, keyframe: KeyframeId) -> None:
         """Make a scan of the landmarks of a keyframe and of those before it, and label those that are new in it."""

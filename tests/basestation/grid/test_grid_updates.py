@@ -13,7 +13,7 @@ from kiteline_basestation.grid.scan_grid import ScanGrid
 from kiteline_basestation.job_kinds import run_job
 from kiteline_basestation.jobs import JobDone
 from kiteline_basestation.mapper import Mapper, MapperInput
-from kiteline_codec.schema import CameraIntrinsics, KeyframeScan, Record, ScanImages, messages
+from kiteline_codec.schema import CameraIntrinsics, KeyframeHeader, KeyframeScan, Record, ScanImages, messages
 from kiteline_core.arrays import F64, I8, Bool
 from kiteline_core.geometry import se3
 from kiteline_core.ground.column_scan import level_rotation
@@ -190,6 +190,19 @@ def test_scans_that_come_before_their_camera_wait_for_it(make_flight: MakeFlight
     mapper.step(MapperInput(((flight.agent, tuple(scans(flight))),), ()), 0)
     assert len(mapper.grid) == 0
     feed(mapper, flight, [[r for r in group if not isinstance(r, KeyframeScan)] for group in groups])
+    assert_equal(mapper.grid, from_scratch(mapper, scans(flight)))
+
+
+def test_scans_that_come_before_their_submap_is_placed_are_drawn_then(make_flight: MakeFlight) -> None:
+    """Over a thin link landmarks come last, and a submap is placed with its first keyframe that has some."""
+    flight = make_flight(keyframes=6, turns=0.3)
+    heads = [[r for r in group if isinstance(r, KeyframeHeader)] for group in flight.records]
+    late = [[r for r in group if not isinstance(r, KeyframeHeader)] for group in flight.records]
+    mapper = Mapper(BaseConfig())
+    feed(mapper, flight, [[r for group in heads for r in group], scans(flight)], more=1)
+    assert not mapper.placements and len(mapper.grid) == 0
+    feed(mapper, flight, late)
+    assert mapper.placements and len(mapper.grid) == 6
     assert_equal(mapper.grid, from_scratch(mapper, scans(flight)))
 
 
