@@ -108,17 +108,25 @@ class GridUpdates:
         if 0 < self._waited <= _MOST_WAITS:
             return
         self._waited = 0
-        scanless = {a for a in map(agent_of_keyframe, self._unmade) if self._is_scanless(a)}
-        ready = [keyframe for keyframe in sorted(self._unmade) if agent_of_keyframe(keyframe) in scanless]
-        for keyframe in ready[: self._config.made_per_step]:
-            del self._unmade[keyframe]
-            self._make(keyframe)
+        self._make_some(self._config.made_per_step)
         drawn = 0
         for keyframe in sorted(self._due)[: _LOOKED * self._config.drawn_per_step]:
             if drawn >= self._config.drawn_per_step:
                 break
             del self._due[keyframe]
             drawn += self._draw(self.grid, keyframe)
+
+    def make_all(self) -> None:
+        """Make the scans of all landmarks that wait for one: those of a restored map in which no step follows."""
+        self._make_some(len(self._unmade))
+
+    def _make_some(self, most: int) -> None:
+        """Make scans of landmarks, of the oldest keyframes first."""
+        scanless = {a for a in map(agent_of_keyframe, self._unmade) if self._is_scanless(a)}
+        ready = [keyframe for keyframe in sorted(self._unmade) if agent_of_keyframe(keyframe) in scanless]
+        for keyframe in ready[:most]:
+            del self._unmade[keyframe]
+            self._make(keyframe)
 
     def _is_scanless(self, agent: AgentId) -> bool:
         """True if an agent's landmarks are to be drawn: it has one camera, or would have sent a scan by now."""

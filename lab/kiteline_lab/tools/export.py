@@ -47,6 +47,7 @@ def load(store: Path) -> Mapper:
     station = Station(BaseConfig(), lambda _: CodedChannel(SyncConfig(), 1))
     for fault in restore(station, read(store), 0).faults:
         print(f"{store}: {fault}", file=sys.stderr)
+    station.mapper.grid_updates.make_all()
     return station.mapper
 
 

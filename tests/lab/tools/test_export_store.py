@@ -23,6 +23,7 @@ from kiteline_hw.ports import SourceError
 from kiteline_lab.evaluation import trajectories
 from kiteline_lab.grids.files import read_grid
 from kiteline_lab.tools.export import ExportError, files, main
+from tests.basestation.conftest import fly, room
 
 LEVEL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # a camera that looks along x
 
@@ -165,3 +166,24 @@ def test_files_that_are_no_store_are_named(tmp_path: Path) -> None:
         with pytest.raises(StoreError, match=store):
             main([str(tmp_path / store), "--format", "ply", "--out", str(tmp_path / "a.ply")])
     assert not (tmp_path / "a.ply").exists()
+
+
+def test_the_grid_of_landmarks_is_exported_from_a_store(tmp_path: Path) -> None:
+    """A restored base makes it again over its next steps, of which an export has none: the picture was empty."""
+    scene, rng = room(np.random.default_rng(1), 1800), np.random.default_rng(1)
+    scene.world[:700, 2] = -1.5  # a floor
+    scene.world[:700, :2] = rng.uniform(-1, 1, (700, 2)) * [3.9, 3.4]
+    flight = fly(keyframes=12, turns=0.6, points=1500, scene=scene)
+    made = Mapper()
+    made.step(MapperInput(((flight.agent, (CameraIntrinsics(flight.agent, flight.camera),)),)), 0)
+    for n, group in enumerate([*flight.records, *[[]] * 12]):
+        made.step(MapperInput(((flight.agent, tuple(group)),)), (n + 1) * 500_000_000)
+    assert len(made.grid) > 6
+    said = [CameraIntrinsics(flight.agent, flight.camera), *flight.all_records()]
+    codes = {messages.key(record): messages.encode(record) for record in said}
+    store = Store(tmp_path / "store")
+    store.write(batch_of(SavedMap({flight.agent: SavedValues(codes, {})}, texts_of(made.state())), SavedMap()))
+    store.close()
+    assert main([str(tmp_path / "store"), "--format", "pgm", "--out", str(tmp_path / "grid.pgm")]) == 0
+    grid = read_grid(tmp_path / "grid.yaml")
+    assert np.count_nonzero(grid.state == 0) > 200
