@@ -158,7 +158,7 @@ def test_a_log_beside_goes_on_once_the_full_disk_has_room(
     tmp_path: Path, small_disk: Callable[[int], SmallDisk], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(whole_file, "_RETRY_S", 0.01)
-    disk, budget = small_disk(100_000), LogBudget(tmp_path, "log", 200_000, 0)
+    disk, budget = small_disk(100_000), LogBudget(tmp_path, "log", 800_000, 0)
     log = LogWriter(tmp_path / "log00001.mcap", {}, budget=budget, beside=True)
     for k in range(100):
         log.blob("/a", k, k.to_bytes(2, "little") * 1000)
