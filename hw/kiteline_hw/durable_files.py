@@ -2,6 +2,8 @@
 
 import contextlib
 import os
+import threading
+from collections.abc import Callable
 from pathlib import Path
 
 
@@ -23,6 +25,11 @@ def write_atomically(path: Path, content: bytes) -> None:
             new.unlink(missing_ok=True)  # it takes room on a disk that may be full
         raise
     sync_folder(path.parent)
+
+
+def in_thread(work: Callable[[], None]) -> None:
+    """Do a piece of work on a disk that may stall, without waiting for it."""
+    threading.Thread(target=work, name="kiteline-disk", daemon=True).start()
 
 
 def link_newest(link: Path, target: Path) -> None:

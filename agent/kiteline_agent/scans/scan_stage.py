@@ -27,7 +27,7 @@ from kiteline_core.geometry.cameras import Rectifier
 from kiteline_core.ground.column_scan import ColumnScan
 from kiteline_core.ground.config import GroundConfig
 from kiteline_core.ground.disparity import DisparityStripes
-from kiteline_core.ground.ground_height import GroundHeight, Seen, Verdict, without_ground
+from kiteline_core.ground.ground_height import GroundHeight, Seen, Verdict
 from kiteline_core.ground.image_codes import encode_pair
 from kiteline_core.ground.segmentation import GroundSegmenter
 from kiteline_core.ground.wide_view import WideView
@@ -278,7 +278,7 @@ class ScanStage:
     def _take(self, verdict: Verdict[KeyframeScan]) -> None:
         """Share scans that are believed, and take back those that are not any more."""
         for wrong in verdict.withdrawn:
-            self._queue.put(_blank(wrong))
+            self._queue.put(wrong.without_ground())
         for record in verdict.believed:
             self._queue.put(record)
 
@@ -292,9 +292,4 @@ class ScanStage:
             return
         self._unbelieved += 1
         if self._unbelieved == _TELLS_OF:
-            self._queue.put(_blank(record))
-
-
-def _blank(record: KeyframeScan) -> KeyframeScan:
-    """A scan whose ground is not believed, as the base gets it."""
-    return KeyframeScan(record.keyframe, without_ground(record.scan), record.labels[:0], record.part, record.T_k_s)
+            self._queue.put(record.without_ground())

@@ -15,7 +15,7 @@ from kiteline_core.arrays import F64, I64
 from kiteline_core.geometry import disparity_offset
 from kiteline_core.ground.brightness import Brightness
 from kiteline_core.ground.config import GroundConfig
-from kiteline_core.ground.ground_height import GroundHeight, Seen, without_ground
+from kiteline_core.ground.ground_height import GroundHeight, Seen
 from kiteline_core.ids import (
     SEQUENCE_BITS,
     SUBMAP_BITS,
@@ -118,10 +118,7 @@ class ImageScans:
         labels[pending.index] = result.labels
         scan = KeyframeScan(record.keyframe, seen.scan, labels, record.part, record.T_k_s)
         verdict = self._ground_of(record).note(scan, Seen(record.T_o_c, *seen))
-        blank = [
-            KeyframeScan(wrong.keyframe, without_ground(wrong.scan), wrong.labels[:0], wrong.part, wrong.T_k_s)
-            for wrong in verdict.withdrawn
-        ]
+        blank = [wrong.without_ground() for wrong in verdict.withdrawn]
         return [self._keep(made) for made in (*blank, *verdict.believed)]
 
     def delete(self, submaps: Collection[SubmapId]) -> None:

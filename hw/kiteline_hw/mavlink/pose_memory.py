@@ -3,10 +3,10 @@
 import contextlib
 import json
 import os
-import threading
 from collections.abc import Callable
 from pathlib import Path
 
+from kiteline_hw.durable_files import in_thread
 from kiteline_hw.mavlink.start_frame import LastPose
 
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
@@ -22,17 +22,13 @@ def boot_id() -> str:
         return ""
 
 
-def _in_thread(work: Callable[[], None]) -> None:
-    threading.Thread(target=work, name="kiteline-pose", daemon=True).start()
-
-
 class PoseMemory:
     """Keeps the last pose in a file. Files that cannot be written or read count as none.
 
     The disk is written beside the messages: a card that stalls must not hold up heartbeats and inertial samples.
     """
 
-    def __init__(self, path: Path, beside: Callable[[Callable[[], None]], None] = _in_thread) -> None:
+    def __init__(self, path: Path, beside: Callable[[Callable[[], None]], None] = in_thread) -> None:
         """beside: does a piece of work without waiting for it."""
         self._path, self._beside = path, beside
         self._writing = False

@@ -1,6 +1,6 @@
 """The column scans of a keyframe and of frames after it, and which of its keypoints lie on the ground."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -13,6 +13,7 @@ from kiteline_codec.schema.record import IdOf, Key, Priority, Record, register
 from kiteline_core.arrays import F64, I64, U8
 from kiteline_core.geometry import se3
 from kiteline_core.ground.column_scan import MAX_COLUMNS, ColumnScan, level_rotation
+from kiteline_core.ground.ground_height import without_ground
 from kiteline_core.ids import MAX_KEYPOINTS, KeyframeId
 
 _AZIMUTH_STEPS = 1 << 12  # codes in 1 rad, of the first column: an error of 0.12 mrad
@@ -49,6 +50,10 @@ class KeyframeScan(Record):
     labels: U8
     part: int = 0
     T_k_s: F64 | None = None
+
+    def without_ground(self) -> "KeyframeScan":
+        """The scan where its ground is not believed: it shows the line of sight alone."""
+        return replace(self, scan=without_ground(self.scan), labels=self.labels[:0])
 
     def write(self, out: Writer) -> None:
         """Append direction of gravity or pose, columns and labels. Raises ValueError for values that have no code."""

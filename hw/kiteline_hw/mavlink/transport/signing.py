@@ -2,7 +2,6 @@
 
 import contextlib
 import hashlib
-import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -10,7 +9,7 @@ from typing import Any
 
 from pymavlink.dialects.v20 import common
 
-from kiteline_hw.durable_files import write_atomically
+from kiteline_hw.durable_files import in_thread, write_atomically
 from kiteline_hw.ports import LinkError
 
 _EPOCH_S = 1420070400  # s: 1 January 2015, at which stamps begin
@@ -34,10 +33,6 @@ def read_key(path: Path) -> bytes:
     return hashlib.sha256(text.encode()).digest()
 
 
-def _in_thread(work: Callable[[], None]) -> None:
-    threading.Thread(target=work, name="kiteline-stamp", daemon=True).start()
-
-
 class StampFile:
     """Keeps on disk a stamp later than all that were used, so that stamps increase even over a loss of power.
 
@@ -49,7 +44,7 @@ class StampFile:
         self,
         path: Path,
         wall_s: Callable[[], float] = time.time,
-        beside: Callable[[Callable[[], None]], None] = _in_thread,
+        beside: Callable[[Callable[[], None]], None] = in_thread,
     ) -> None:
         """beside: does a piece of work without waiting for it."""
         self._path, self._beside = path, beside
