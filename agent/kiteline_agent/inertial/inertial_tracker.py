@@ -277,11 +277,13 @@ class InertialTracker:
         self.begin_map(t_ns, T_m_b)
         state = self._smoother.state
         self.scale.start(state.velocity, self._smoother.gravity, state.bias, start.accel_noise)
+        self._scale_watch.begin()
 
     def reset(self) -> None:
         """Begin a new map at an unknown pose relative to the old one. Biases are kept."""
         self._smoother.stop()
         self._initialiser.clear()
+        self.scale.stop()
         self.clock.forget()
         self._last = None
         self.self_calibration.begin_map()

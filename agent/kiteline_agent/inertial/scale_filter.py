@@ -67,7 +67,7 @@ class ScaleFilter:
         return (scale, sigma) if abs(np.log(scale)) > max(_LEAST, _LEAST_DEVIATIONS * sigma / scale) else None
 
     def stop(self) -> None:
-        """Forget all."""
+        """Forget all: a map of another unit begins."""
         self.running = False
 
     def start(self, velocity: F64, gravity: F64, bias: F64, accel_noise: float) -> None:
@@ -77,6 +77,10 @@ class ScaleFilter:
         sigma = np.repeat([_START_SCALE, _START_GRAVITY_M_S2, _START_VELOCITY_M_S, _START_BIAS_M_S2], [1, 3, 3, 3])
         self._cov = np.diag(sigma**2)
         self.running, self.age_s = True, 0.0
+
+    def wait(self, dt_s: float) -> None:
+        """Process a time in which nothing was compared: the map grew, and the bias moved."""
+        self._walk(self._cov, dt_s)
 
     def resume(self, velocity: F64) -> None:
         """Continue after frames without images, at this velocity (3,) m/s in m."""
@@ -104,8 +108,7 @@ class ScaleFilter:
         rotate = np.kron(np.eye(2), r)
         both = np.r_[4:7, 10:13]
         cov[np.ix_(both, both)] += rotate @ motion.cov[3:, 3:] @ rotate.T
-        cov[_UNITS, _UNITS] += _SCALE_WALK**2 * dt
-        cov[_BIAS, _BIAS] += (_ACCEL_WALK**2 + self._calibration.accel_walk**2) * dt * np.eye(3)
+        self._walk(cov, dt)
         # update by the displacement that the images give, and by the length of gravity
         seen = (T_m_b1[:3, 3] + T_m_b1[:3, :3] @ self._p_b_c) - (T_m_b0[:3, 3] + r @ self._p_b_c)
         noise = np.diag(np.append(np.full(3, 2.0 * (_IMAGE_RAD * depth_m) ** 2), _GRAVITY_SIGMA_M_S2**2))
@@ -126,6 +129,11 @@ class ScaleFilter:
         self._x = now[:10]
         cov = (cov - gain @ h @ cov)[:10, :10]
         self._cov = 0.5 * (cov + cov.T)
+
+    def _walk(self, cov: F64, dt_s: float) -> None:
+        """Add to a covariance what scale and bias move by in dt_s."""
+        cov[_UNITS, _UNITS] += _SCALE_WALK**2 * dt_s
+        cov[_BIAS, _BIAS] += (_ACCEL_WALK**2 + self._calibration.accel_walk**2) * dt_s * np.eye(3)
 
     def correct(self, factor: float) -> None:
         """The map was scaled by `factor`, which was found here: the next correction waits."""

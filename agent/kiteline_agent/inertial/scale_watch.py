@@ -37,12 +37,24 @@ class ScaleWatch:
         self._has_come, self._samples_between = has_come, samples_between
         self._from: tuple[int, F64] | None = None  # time and pose at which the present interval begins
         self._waiting: _Interval | None = None  # whose last samples have not come
+        self._unknown_ns: int | None = None  # time of the first frame since which the state is not known
+
+    def begin(self) -> None:
+        """The filter was started at the last frame."""
+        self.forget()
+        self._unknown_ns = None
 
     def see(self, t_ns: int, T_m_b: F64, depth_m: float, state: InertialState | None) -> None:
         """Process a frame at T_m_b (4,4) by images, `depth_m` from what they see. state: after it, if it is known."""
-        if not self._filter.running or state is None:
-            self._filter.stop()
+        if not self._filter.running:
             return
+        if state is None:
+            self.forget()
+            self._unknown_ns = t_ns if self._unknown_ns is None else self._unknown_ns
+            return
+        if self._unknown_ns is not None:
+            self._filter.wait((t_ns - self._unknown_ns) * 1e-9)
+            self._unknown_ns = None
         if self._waiting is not None and self._has_come(self._waiting.end_ns):
             waiting, self._waiting = self._waiting, None
             if not self._compare(waiting, state):

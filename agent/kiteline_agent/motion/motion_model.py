@@ -94,7 +94,8 @@ class MotionModel:
         """Relative deviation of the map's lengths in metres; 0 where images measure them, or in a unit of its own."""
         if self._metric or not self.metric:
             return 0.0
-        return self.odometer.unit_sigma if self.tracker is None else self.tracker.scale.deviation
+        watched = self.tracker is not None and self.tracker.scale.running
+        return self.tracker.scale.deviation if self.tracker is not None and watched else self.odometer.unit_sigma
 
     @property
     def awaits_scale(self) -> bool:

@@ -13,7 +13,7 @@ from kiteline_codec.channel import RecordChannel, plain_pair
 from kiteline_codec.schema import KeyframeHeader, SubmapTie
 from kiteline_core import odometry
 from kiteline_core.arrays import F64
-from kiteline_core.frame import OdometryBatch
+from kiteline_core.frame import ImuBatch, OdometryBatch
 from kiteline_core.geometry import se3
 from kiteline_core.ids import AgentId
 from tests.agent.room_flight import RoomFlight
@@ -27,11 +27,13 @@ def fly(
     dark: range = range(0),
     *,
     one_eye: bool = False,
+    with_imu: bool = False,
     channel: RecordChannel | None = None,
 ) -> tuple[Agent, list[Estimate], list[str]]:
     rig = replace(room_flight.rig, right=None, T_c_r=None) if one_eye else room_flight.rig
-    agent = Agent(rig, None, AgentConfig(), Identity(AgentId(0), 0), channel or NoBaseChannel())
-    out, events, done = [], [], 0
+    imu = room_flight.imu if with_imu else None
+    agent = Agent(rig, imu, AgentConfig(), Identity(AgentId(0), 0), channel or NoBaseChannel())
+    out, events, done, felt = [], [], 0, 0
     for k, shown in enumerate(room_flight.frames):
         frame = replace(shown, right=None) if one_eye else shown
         if k in dark:
@@ -40,7 +42,11 @@ def fly(
         if driven is not None:
             end = int(np.searchsorted(driven.t_ns, frame.t_ns, side="right"))
             part, done = odometry.chosen(driven, slice(done, end)), end
-        output = agent.step(StepInput(frame, odometry=part), frame.t_ns)
+        samples, before = room_flight.samples, felt
+        felt = int(np.searchsorted(samples.t_ns, frame.t_ns, side="right"))
+        new = slice(before, felt)
+        batch = ImuBatch(samples.t_ns[new], samples.gyro[new], samples.accel[new]) if with_imu else None
+        output = agent.step(StepInput(frame, batch, odometry=part), frame.t_ns)
         assert output.estimate is not None
         out.append(output.estimate)
         events += output.events
@@ -132,6 +138,13 @@ def test_no_pose_is_given_in_another_unit_before_the_metre_is_known(room_flight:
     assert not any(e.tracked or e.quality >= 0 for e in found[:metric])
     assert all(e.tracked for e in found[metric:])
     assert found[metric].submap == agent.submap
+
+
+def test_an_odometer_gives_the_metre_beside_an_imu_too(room_flight: RoomFlight) -> None:
+    agent, found, _ = fly(room_flight, room_flight.driven, one_eye=True, with_imu=True)
+    assert agent.metric
+    told = [e.quality for e in found if e.tracked]
+    assert len(told) > 20 and min(told) > 80  # its lengths are known, by the odometer
 
 
 def _ate(room_flight: RoomFlight, found: list[Estimate]) -> float:

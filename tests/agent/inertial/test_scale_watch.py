@@ -35,8 +35,8 @@ class Filter:
         assert velocity is STATE.velocity
         self.resumed += 1
 
-    def stop(self) -> None:
-        self.running = False
+    def wait(self, dt_s: float) -> None:
+        self.calls.append(f"wait {dt_s:g} s")
 
     def rotate_map(self, R_new_old: F64) -> None:
         self.calls.append("rotate")
@@ -123,11 +123,28 @@ def test_after_a_late_gap_it_begins_at_the_present_frame() -> None:
     assert positions(flight) == [(10.0, 18.0)]
 
 
-def test_after_a_loss_it_begins_anew_and_without_a_state_it_stops() -> None:
+def test_after_a_loss_it_begins_anew() -> None:
     flight = Flight()
     flight.fly(PER_INTERVAL)
     flight.watch.forget()
     flight.fly(PER_INTERVAL + 1)
     assert positions(flight) == [(8.0, 16.0)]
+
+
+def test_without_a_state_it_waits_and_then_goes_on() -> None:
+    flight = Flight()
+    flight.fly(PER_INTERVAL)
+    for _ in range(4):  # the IMU's samples are missing
+        flight.watch.see(flight.t_ns, pose(0), 3.0, None)
+        flight.t_ns += FRAME_NS
+    flight.fly(PER_INTERVAL + 1)
+    assert flight.filter.calls == ["wait 0.2 s"] and flight.filter.resumed == 2
+    assert positions(flight) == [(12.0, 20.0)]
+
+
+def test_a_start_forgets_the_time_without_a_state() -> None:
+    flight = Flight()
     flight.watch.see(flight.t_ns, pose(0), 3.0, None)
-    assert not flight.filter.running
+    flight.watch.begin()
+    flight.fly(1)
+    assert flight.filter.calls == []
