@@ -214,8 +214,6 @@ class Agent:
             # 6. Update depths and slants of landmarks, and search those without a depth.
             if self._two_view_start is not None:
                 self._two_view_start.note_depths(track.depth_m[track.inlier])
-            if self._inertial_start is not None:
-                self._inertial_start.clear()
             # By images: what a fused pose differs by is in all pixels alike, and would move all depths together.
             self._depth.update_landmarks(ctx, by_images)
             self._slants.update(ctx, by_images)
@@ -231,10 +229,14 @@ class Agent:
             events += self._scan(ctx)
             # 8. Join an older submap that is recognised, or continue in a new one.
             events += self._submaps.join_older(ctx, track)
-            continued = self._submaps.continue_full(ctx, track) or self._submaps.restart_in_metres(ctx, track)
+            continued = (
+                self._submaps.continue_full(ctx, track)
+                or self._submaps.restart_in_metres(ctx, track)
+                or self._submaps.restart_by_imu(ctx, track)
+            )
             if continued:
                 self._corrections.note_continued(self.submap)
-            events += continued
+            events += continued + self._submaps.take_warnings()
             outcome = FrameOutcome(True, False, track.inliers, events)
         if self.right_camera is not None:
             outcome.events.extend(self.right_camera.share_rows())
@@ -272,7 +274,7 @@ class Agent:
         alignment = self._camera.align_gravity(ctx.t_ns)
         if alignment is None:
             return []
-        self._channel.put(alignment)
+        self._channel.put(self._camera.first_aligned(alignment))
         self._corrections.set_upright(alignment)
         return [f"submap tilted by {np.degrees(self._camera.gravity.tilt_rad):.1f} degrees"]
 

@@ -312,6 +312,59 @@ def test_a_map_begun_in_metres_stays_as_it_is_and_the_one_before_it_is_stretched
         assert np.allclose((placed_at[after] @ begin)[:3, 3], 2.0 * end[:3, 3], atol=1e-6)  # where it was left
 
 
+def told_metres(make_flight: MakeFlight, *, first_in_metres: bool) -> tuple[Mapper, list[Any]]:
+    """A base before it hears of the metre: submaps of four keyframes, each where the one before was left.
+
+    The last but one is in a unit of its own, half a metre long, the last one in metres.
+    """
+    parts = [make_flight(keyframes=4, turns=0.07, start=0.07 * n, submap=n, stereo=False) for n in range(3)]
+    flights = parts if first_in_metres else parts[1:]
+    own = in_own_unit(flights[-2], 0.5)
+    mapper = Mapper(WITHOUT_GRID)
+    batches: list[list[Record]] = [[CameraIntrinsics(own.agent, own.camera)]]
+    for n, flight in enumerate(flights):
+        submap = submap_of_keyframe(flight.keyframes[0])
+        batches += [[SubmapScale(submap, 1.0)]] if flight is not own else []
+        batches += [*flight.records, []]
+        if n + 1 < len(flights):
+            t_ns = flights[n + 1].records[0][0].t_ns - 10**8
+            batches.append([LivePose(flight.agent, t_ns, flight.keyframes[-1], np.eye(4), 80)])
+    for n, batch in enumerate(batches):
+        mapper.step(MapperInput(((own.agent, tuple(batch)),)), n * STEP_NS)
+    return mapper, flights
+
+
+def tell(mapper: Mapper, flight: Any, metres: float) -> None:
+    record = SubmapScale(submap_of_keyframe(flight.keyframes[0]), metres)
+    mapper.step(MapperInput(((flight.agent, (record,)),)), 10**12)
+
+
+def test_a_unit_that_grew_while_the_base_refined_is_as_long_as_its_agent_says(make_flight: MakeFlight) -> None:
+    mapper, (own, _) = told_metres(make_flight, first_in_metres=False)
+    submap = submap_of_keyframe(own.keyframes[0])
+    mapper._placements.rescale({submap: 1.002}, {})
+    tell(mapper, own, 2.0)
+    assert sim3.scale_of(mapper.placements[submap]) == pytest.approx(2.0)
+    mapper._placements.rescale({submap: 1.001}, {})  # what the base finds later stands
+    mapper.step(MapperInput(()), 2 * 10**12)
+    assert sim3.scale_of(mapper.placements[submap]) == pytest.approx(2.002)
+
+
+def test_a_later_submap_is_scaled_where_it_begins_and_the_next_one_goes_with_it(make_flight: MakeFlight) -> None:
+    mapper, (first, own, last) = told_metres(make_flight, first_in_metres=True)
+    before = {f.keyframes[0]: placed(mapper, f) for f in (first, own, last)}
+    assert lengths(before[own.keyframes[0]], own).mean() == pytest.approx(0.5, rel=0.1)
+    tell(mapper, own, 2.0)
+    now = [placed(mapper, f) for f in (first, own, last)]
+    np.testing.assert_array_equal(now[0], before[first.keyframes[0]])
+    np.testing.assert_allclose(now[1][0], before[own.keyframes[0]][0], atol=1e-6)
+    assert lengths(now[1], own).mean() == pytest.approx(1.0, rel=0.1)
+    np.testing.assert_allclose(np.diff(now[2], axis=0), np.diff(before[last.keyframes[0]], axis=0), atol=1e-6)
+    left, there = mapper.map.pose(own.keyframes[-1]), mapper.map.pose(last.keyframes[0])
+    S_own, S_last = (mapper.placements[submap_of_keyframe(f.keyframes[0])] for f in (own, last))
+    np.testing.assert_allclose((S_last @ there)[:3, 3], (S_own @ left)[:3, 3], atol=1e-6)
+
+
 def agent_of_record(record: Any) -> int:
     if isinstance(record, SubmapPlacement):
         return int(agent_of_submap(record.submap))

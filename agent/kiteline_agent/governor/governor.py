@@ -30,12 +30,12 @@ class Extra(Enum):
     KEYFRAME = "keyframe"
     SEARCH = "search"  # relocalisation
     SUBMAP = "submap"  # the first keyframe of a submap
-    SCAN = "scan"  # a part of a column scan: only what nothing else needs
+    PART = "part"  # of what can wait, a column scan or a search for the scale: only what nothing else needs
 
 
 _LONGER = 1.03  # growth of the expected period per frame, if the camera is slower than assumed
 _FIRST_LONGER = 2.5  # the same between the first two frames; a longer gap is due to the first frame's processing
-_GUESS = {Extra.KEYFRAME: 1.7, Extra.SEARCH: 3.5, Extra.SUBMAP: 3.0, Extra.SCAN: 0.5}  # at first, in full frames
+_GUESS = {Extra.KEYFRAME: 1.7, Extra.SEARCH: 3.5, Extra.SUBMAP: 3.0, Extra.PART: 0.5}  # at first, in full frames
 _OUTLIER = 1.5  # cost of a frame, in usual frames, above which it is clipped
 _SPREAD = 2.0  # mean deviations that cover nine of ten frames
 _ALONE = 1.1  # times the expected cost of a keyframe and its frame, which a window must have room for
@@ -165,18 +165,18 @@ class Governor:
         self.note(extra)
         return True
 
-    def may_scan(self) -> bool:
-        """True if a part of a scan fits in this frame, which does nothing else extra; it is booked then.
+    def may_do_part(self) -> bool:
+        """True if a part of what can wait fits in this frame, which does nothing else extra; it is booked then.
 
-        Scans are what is dropped first: none is made below full effort (`governed`), or without comfort at it.
+        That is what is dropped first: scans also below full effort (`governed`), all without comfort.
         """
         if self.on:
             if self._last_extra is not None:
                 return False
-            need_ns = self._frame_ns + self._expected_ns(Extra.SCAN)
+            need_ns = self._frame_ns + self._expected_ns(Extra.PART)
             if self._window_ns + need_ns > _COMFORT * self._budget_ns:
                 return False
-        self.note(Extra.SCAN)
+        self.note(Extra.PART)
         return True
 
     def note(self, extra: Extra) -> None:
@@ -203,7 +203,7 @@ class Governor:
             first = self._last_extra is Extra.SUBMAP and not self._measured  # nothing is tracked in it
             more_ns = max(cpu_ns - (0.0 if first else self._frame_ns), 0.0)
             self._extra_ns[self._last_extra] += (more_ns - known_ns) * (2.0 * _LEARNING if known_ns else 1.0)
-            if self._last_extra not in (Extra.SEARCH, Extra.SCAN):
+            if self._last_extra not in (Extra.SEARCH, Extra.PART):
                 self._count_keyframe(self._last_t_ns)
         elif self._measured:
             cpu_ns = min(cpu_ns, round(_OUTLIER * self._frame_ns))  # outliers: a frame that lost and regained tracking

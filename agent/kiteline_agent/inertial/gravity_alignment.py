@@ -62,7 +62,7 @@ class GravityAligner:
         self._began_ns: int | None = None
         self._R_l_o: F64 | None = None if inertial is not None else np.eye(3)
         self._renewed = self._known = False
-        self.tilt_rad = 0.0  # of the first submap
+        self.tilt_rad = 0.0  # of the first submap, or of the one that continues it
 
     @property
     def R_l_o(self) -> F64 | None:
@@ -90,11 +90,13 @@ class GravityAligner:
             R_m_b = AHEAD @ self._camera.T_b_c[:3, :3].T
         return se3.from_rt(R_m_b, np.zeros(3)) @ self._camera.T_b_c
 
-    def update(self, t_ns: int, T_m_b: F64, R_o_m: F64, submap: SubmapId, *, first: bool) -> GravityAlignment | None:
+    def update(
+        self, t_ns: int, T_m_b: F64, R_o_m: F64, submap: SubmapId, *, continued: bool
+    ) -> GravityAlignment | None:
         """Process a frame tracked at T_m_b (4,4), with R_o_m (3,3) from the submap to the odometry frame.
 
-        first: it is the first submap. Returns the record for the base, once, if that submap is tilted: also where the
-        samples began so late that a flight controller got poses before, whose frame stays as it was.
+        continued: the submap is the first one, or continues it. Returns how it is tilted, once, if it is: also where
+        the samples began so late that a flight controller got poses before, whose frame stays as it was.
         """
         if self._known or self._inertial is None:
             return None
@@ -109,10 +111,15 @@ class GravityAligner:
         if self._R_l_o is None:
             self._R_l_o = level_rotation(R_o_m @ R_l_m[2])
         self.tilt_rad = float(np.linalg.norm(se3.so3_log(R_l_m)))
-        if not first or self._renewed or self.tilt_rad < _MIN_TILT_RAD:
+        if not continued or self._renewed or self.tilt_rad < _MIN_TILT_RAD:
             return None
-        # Rotate about the vehicle, so that its position in the world does not jump.
-        here = T_m_b[:3, 3]
-        T_l_m = se3.from_rt(R_l_m, here - R_l_m @ here)
-        # Rounded as on the wire: the base places the submap exactly there, and its placement moves nothing.
-        return GravityAlignment(submap, quantise.pose(quantise.pose_codes(T_l_m)))
+        return upright_about(submap, R_l_m, T_m_b[:3, 3])
+
+
+def upright_about(submap: SubmapId, R_l_m: F64, here: F64) -> GravityAlignment:
+    """The record of a tilted submap. here: (3,) of the vehicle, which stays where it is in the world.
+
+    Rounded as on the wire: the base places the submap exactly there, and its placement moves nothing.
+    """
+    T_l_m = se3.from_rt(R_l_m, here - R_l_m @ here)
+    return GravityAlignment(submap, quantise.pose(quantise.pose_codes(T_l_m)))

@@ -43,7 +43,8 @@ class TimedPose:
 class InertialStartState:
     """A known state at a frame, in any frame w.
 
-    T_w_b: (4,4). velocity: (3,) m/s. bias: (6,). gravity: (3,) m/s^2. cov: (17,17) as in InertialState, of full rank.
+    T_w_b: (4,4). velocity: (3,) m/s. bias: (6,). gravity: (3,) m/s^2. cov: (17,17) as in InertialState, of full rank;
+    None: that of StartDeviations.
     accel_noise: factor on the accelerometer's noise. offset: of time; None: not found.
     """
 
@@ -51,7 +52,7 @@ class InertialStartState:
     velocity: F64
     bias: F64
     gravity: F64
-    cov: F64
+    cov: F64 | None
     accel_noise: float = 1.0
     offset: TimeOffset | None = None
 

@@ -15,8 +15,9 @@ from kiteline_agent.inertial.samples.sample_buffer import SampleBuffer
 from kiteline_agent.initialisation import corner_tracks
 from kiteline_agent.initialisation.contradiction import ContradictionWatch, contradicts, exceeds_lens_errors
 from kiteline_agent.initialisation.corner_tracks import CornerObservations, CornerTracks, TrackedKeyframe
+from kiteline_agent.initialisation.inertial_map import InertialMap
 from kiteline_agent.initialisation.landmark_realignment import realigned
-from kiteline_agent.initialisation.metric_restart import MetricPoints, window_points
+from kiteline_agent.initialisation.metric_restart import window_points
 from kiteline_agent.initialisation.window.window_bundle import InertialBundle, lens_prior
 from kiteline_agent.initialisation.window.window_noise import LEAST, MOST, Vibration, WindowNoise, vibration
 from kiteline_agent.initialisation.window.window_samples import WindowSamples
@@ -58,28 +59,6 @@ _LANDMARKS = 220  # of the window, with the longest tracks: errors of few add up
 
 
 @dataclass(frozen=True, slots=True)
-class InertialMap:
-    """The first keyframe of a map in metres, and the state there.
-
-    frame: the newest keyframe of the window. points: new landmarks. solution: its window. cov: (17,17) of the state, as
-    in InertialState. scale_sigma: relative deviation of the scale. duration_s: length of the window. accel_noise:
-    factor on the accelerometer's noise. lens: (8,) found of the camera (lens_correction), with which the landmarks'
-    pixels are corrected. keyframes (K), corners (K,P): of the window.
-    """
-
-    frame: FrameContext
-    points: MetricPoints
-    solution: WindowSolution
-    cov: F64
-    scale_sigma: float
-    duration_s: float
-    accel_noise: float
-    lens: F64
-    keyframes: tuple[TrackedKeyframe, ...]
-    corners: CornerObservations
-
-
-@dataclass(frozen=True, slots=True)
 class _Solved:
     """A solution, its landmarks (P,3) m and the keyframe (P,) that saw each first."""
 
@@ -115,6 +94,7 @@ class InertialStart:
         self._work = work
         self._may_go_on = may_go_on
         self._attempt: InParts[InertialMap | None] | None = None  # that has begun
+        self._beside_map = False  # it began while a map was tracked
         start = config.inertial_start
         detector = replace(config.detector, cell_px=start.corner_tracks.cell_px, max_corners=corner_tracks.CORNERS)
         self._tracks = CornerTracks(camera, detector, start.corner_tracks)
@@ -147,6 +127,11 @@ class InertialStart:
         self._contradiction.begin_again()
 
     @property
+    def keyframe_t_ns(self) -> int | None:
+        """Stamp of the newest keyframe of the window; None without one."""
+        return self._tracks.keyframes[-1].t_ns if self._tracks.keyframes else None
+
+    @property
     def contradicted(self) -> bool:
         """True if images and IMU certainly contradict each other, so that no scale will be known."""
         return self._contradiction.certain
@@ -169,6 +154,21 @@ class InertialStart:
 
     def add(self, ctx: FrameContext, imu: ImuPrior) -> InertialMap | None:
         """Follow the corners into a frame whose samples were taken in. Returns a map once its scale is known."""
+        if self._beside_map:  # it would begin a map at an older frame than this one
+            self._attempt, self._beside_map = None, False
+        self._follow(ctx, imu)
+        return self.go_on()
+
+    def add_beside_map(self, ctx: FrameContext, imu: ImuPrior) -> InertialMap | None:
+        """The same while a map is tracked, which must not wait: of a solution each frame does one part.
+
+        The map that is returned is of the frame in which its solution began.
+        """
+        self._follow(ctx, imu)
+        self._beside_map = self._attempt is not None
+        return self.go_on(1)
+
+    def _follow(self, ctx: FrameContext, imu: ImuPrior) -> None:
         every = self._config.governor.cpu_percent <= 0.0  # else the frames between keyframes do not come here
         self._work.followed += int(every)
         shows = not every or self._tracks.follow(ctx.images.left)
@@ -179,11 +179,11 @@ class InertialStart:
                 self._bound_window(ctx.t_ns)
                 if self._attempt is None:
                     self._attempt = self._begin(ctx, imu)
-        return self.go_on()
 
-    def go_on(self) -> InertialMap | None:
-        """Go on with the solution, as CPU time allows. Returns a map once its scale is known."""
-        while self._attempt is not None and self._may_go_on():
+    def go_on(self, parts: float = np.inf) -> InertialMap | None:
+        """Go on by at most so many parts, as CPU time allows. Returns a map once the solution tells its scale."""
+        while self._attempt is not None and parts > 0 and self._may_go_on():
+            parts -= 1
             try:
                 with np.errstate(all="ignore"):  # see InertialBundle.solving
                     next(self._attempt)

@@ -44,13 +44,20 @@ class MetricPoints:
         local_map.sigma_rho[slot, :n] = self.sigma_rho[:n]
 
 
-def metric_points(ctx: FrameContext, track: Track, local_map: LocalMap, unit_m: float) -> MetricPoints:
-    """The inliers of a track as new landmarks of its frame. unit_m: metres in one unit of the old map."""
+def metric_points(
+    ctx: FrameContext, track: Track, local_map: LocalMap, unit_m: float, lens: F64 | None = None
+) -> MetricPoints:
+    """The inliers of a track as new landmarks of its frame. unit_m: metres in one unit of the old map.
+
+    lens: (8,) errors with which the frame's pixels are corrected from here on, and were not when it was tracked.
+    """
     keep = np.flatnonzero(track.inlier)
     depth = track.depth_m[keep]
     relative = np.linalg.norm(track.ray[keep], axis=1) / depth
     octave = local_map.octave[track.rows[keep]]
     uv = track.observed[keep, :2]
+    if lens is not None:
+        uv = _true_pixels(uv, lens, local_map.camera)
     return metric_points_at(ctx, uv, octave, unit_m * depth, relative, local_map.camera)
 
 
@@ -65,8 +72,14 @@ def window_points(
     uv = corners.xy[-1, seen] * focal + centre
     octave = np.zeros(len(uv), np.uint8)
     found = metric_points_at(ctx, uv, octave, solution.depth_m[seen], solution.depth_sigma[seen], camera)
-    true = lens_correction.true_place((found.points.uv - centre) / focal, solution.state.lens)
-    return replace(found, points=replace(found.points, uv=true * focal + centre))
+    true = _true_pixels(found.points.uv, solution.state.lens, camera)
+    return replace(found, points=replace(found.points, uv=true))
+
+
+def _true_pixels(uv: F64, lens: F64, camera: RectifiedCamera) -> F64:
+    """Where a true camera would show what this one shows at pixels (n,2). lens: (8,) its errors."""
+    focal, centre = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
+    return np.asarray(lens_correction.true_place((uv - centre) / focal, lens) * focal + centre)
 
 
 def metric_points_at(

@@ -4,7 +4,7 @@ import numpy as np
 
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.covariance.pose_covariance import PoseCovariance
-from kiteline_agent.inertial.gravity_alignment import GravityAligner, level_rotation
+from kiteline_agent.inertial.gravity_alignment import GravityAligner, level_rotation, upright_about
 from kiteline_agent.keyframes.reference import ReferenceKeyframe
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.mapping.submaps import Submaps
@@ -46,6 +46,7 @@ class CameraState:
         self.gravity = GravityAligner(camera, self.motion.tracker)
         self.reference = ReferenceKeyframe(local_map)
         self.submaps = Submaps(identity)
+        self._T_o_first: F64 | None = None  # the first submap where images led from it into the next one
 
     @property
     def T_m_b(self) -> F64:
@@ -130,10 +131,24 @@ class CameraState:
         return reckoned.trusted
 
     def align_gravity(self, t_ns: int) -> GravityAlignment | None:
-        """Estimate the vertical; a record, once, if the first submap is tilted because it began in motion."""
-        return self.gravity.update(
-            t_ns, self.T_m_b, self.pose.T_o_m[:3, :3], self.submaps.active, first=self.submaps.opened == 1
-        )
+        """Estimate the vertical; a record, once, if the active submap is tilted: it is the first one, or continues it.
+
+        Not while lengths are not metres: accelerations tell nothing then, and no pose that has to be upright is sent.
+        """
+        if not self.motion.metric:
+            return None
+        opened = self.submaps.opened
+        continued = opened == 1 or (opened == 2 and self._T_o_first is not None)
+        return self.gravity.update(t_ns, self.T_m_b, self.pose.T_o_m[:3, :3], self.submaps.active, continued=continued)
+
+    def first_aligned(self, alignment: GravityAlignment) -> GravityAlignment:
+        """How the first submap is tilted, by which the base aligns its world, where the active one continues it."""
+        T_o_first = self._T_o_first
+        if T_o_first is None or alignment.submap == self.submaps.first:
+            return alignment
+        up = T_o_first[:3, :3].T @ self.pose.T_o_m[:3, :3] @ alignment.T_l_m[2, :3]
+        here = se3.transform(se3.inverse(T_o_first), (self.pose.T_o_m @ self.T_m_b)[None, :3, 3])[0]
+        return upright_about(self.submaps.first, level_rotation(up), here)
 
     # changes of the map under the camera; the odometry frame stays still
 
@@ -193,6 +208,13 @@ class CameraState:
     def set_first_gravity(self, gravity_b: F64) -> None:
         """Set the camera where the flight begins: body at the origin, z up. gravity_b: (3,) in the body."""
         self.pose.T_m_c = se3.from_rt(level_rotation(-gravity_b), np.zeros(3)) @ se3.inverse(self.T_c_b)
+
+    def continue_in_metres(self, unit_m: float) -> F64:
+        """Begin a new submap in this tracked frame. unit_m: m, one unit of the old one. Returns T_new_old (4,4)."""
+        self.leave_map()
+        if self.submaps.opened == 1:
+            self._T_o_first = self.pose.T_o_m.copy()
+        return self.pose.rescale(unit_m)
 
     def leave_submap(self) -> None:
         """Leave the active submap for a new one that begins here."""

@@ -12,7 +12,7 @@ from kiteline_agent.imaging import features
 from kiteline_agent.imaging.feature_kernels import BORDER
 from kiteline_agent.imaging.features import DetectorConfig
 from kiteline_agent.initialisation.corner_tracks import CornerObservations, TrackedKeyframe
-from kiteline_agent.initialisation.inertial_start import InertialMap
+from kiteline_agent.initialisation.inertial_map import InertialMap
 from kiteline_agent.initialisation.window import lens_correction
 from kiteline_agent.keyframes.new_landmarks import EarlierView, NewPoints
 from kiteline_core.arrays import F64

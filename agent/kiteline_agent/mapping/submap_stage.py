@@ -7,9 +7,11 @@ import numpy as np
 from kiteline_agent.governor.governor import Extra, Governor
 from kiteline_agent.inertial.imu_initialisation import InertialStartState
 from kiteline_agent.inertial.inertial_tracker import InertialTracker
-from kiteline_agent.initialisation.inertial_start import InertialMap, InertialStart
+from kiteline_agent.initialisation.inertial_map import InertialMap
+from kiteline_agent.initialisation.inertial_start import InertialStart
 from kiteline_agent.initialisation.metric_restart import MetricPoints, metric_points
 from kiteline_agent.initialisation.two_view_start import TwoViewStart
+from kiteline_agent.initialisation.unscaled_path import UnscaledPath
 from kiteline_agent.initialisation.window import lens_correction
 from kiteline_agent.keyframes.depth_from_motion import DepthFromMotion
 from kiteline_agent.keyframes.keyframe_maker import KeyframeMaker
@@ -79,6 +81,7 @@ class SubmapStage:
         self._inertial_start = inertial_start
         self._governor = governor
         self._channel = channel
+        self._path = UnscaledPath(local_map)
         self._loss: _Loss | None = None
         self._warnings: list[str] = []
         self._start_watch, self._views_watch = StartWatch(), StartWatch(VIEWS_S)
@@ -267,16 +270,68 @@ class SubmapStage:
         if len(metric.sigma_rho) < ctx.config.local_map.first_points:
             return []
         self._restart(ctx, unit_m, metric)
-        self._two_view_start.rescale(unit_m)
         if correction is None:
             return [f"mono: metric, one unit was {unit_m:.3g} m", "submap: opened"]
         return [f"mono: scale corrected by {unit_m:.4f}, within {100.0 * correction[1]:.1f} %", "submap: opened"]
 
-    def _restart(self, ctx: FrameContext, unit_m: float, metric: MetricPoints) -> None:
+    def _restart(self, ctx: FrameContext, unit_m: float, metric: MetricPoints) -> F64:
+        """Begin a submap in metres here. Returns T_new_old (4,4)."""
         camera = self._camera
         self._channel.put(SubmapScale(camera.submaps.active, unit_m))
         T_new_old = self._begin_at_track(ctx, unit_m, metric, tells_scale=True)
         camera.motion.set_scale(ctx.t_ns, unit_m, T_new_old)
+        if self._two_view_start is not None:
+            self._two_view_start.rescale(unit_m)
+        return T_new_old
+
+    def restart_by_imu(self, ctx: FrameContext, track: Track) -> list[str]:
+        """Continue a monocular map in a new submap in metres where the samples of its IMU begin late, or come back.
+
+        The window that tells the scale before there is a map is solved beside this one. Returns events.
+        """
+        start, camera = self._inertial_start, self._camera
+        inertial = camera.motion.tracker
+        if start is None or inertial is None:
+            return []
+        if camera.motion.metric or camera.motion.odometer.has_samples or not start.add_samples(ctx):
+            self._forget_window(start)
+            return []
+        if not (camera.submaps.room and self._governor.may_do_part()):
+            return []
+        found = start.add_beside_map(ctx, inertial.known)
+        if start.keyframe_t_ns == ctx.t_ns:
+            self._path.add(ctx.t_ns, camera.reference.keyframe, camera.reference.T_k_c)
+        if start.contradicted:
+            camera.ignore_imu()
+            self._warnings = [*start.take_warnings(), _IGNORED]
+        if found is None:
+            return []
+        events = self._continue_by_window(ctx, track, found)
+        if events:
+            self._forget_window(start)
+        return events
+
+    def _continue_by_window(self, ctx: FrameContext, track: Track, found: InertialMap) -> list[str]:
+        """Continue in metres by a window of some frames ago; nothing while that does not tell the map's unit."""
+        camera, solution = self._camera, found.solution
+        unit = self._path.unit(tuple(k.t_ns for k in found.keyframes), solution.state, self._map.camera.T_b_c)
+        sigma = np.inf if unit is None else float(np.hypot(unit.sigma, found.scale_sigma))
+        if unit is None or sigma > _SCALE_SIGMA or track.inliers < ctx.config.local_map.first_points:
+            return []
+        ctx = self._corrected(ctx, found.lens)
+        T_new_old = self._restart(ctx, unit.metres, metric_points(ctx, track, self._map, unit.metres, found.lens))
+        gravity = T_new_old[:3, :3] @ unit.R_m_w @ solution.gravity
+        state = InertialStartState(
+            camera.T_m_b, camera.pose.velocity, solution.bias, gravity, None, found.accel_noise, solution.offset
+        )  # fmt: skip
+        camera.motion.begin_metric_map(ctx.t_ns, state)
+        text = f"mono: metric within {100.0 * sigma:.1f} %, from {found.duration_s:.1f} s of images and IMU"
+        return [f"{text}, one unit was {unit.metres:.3g} m", "submap: opened"]
+
+    def _forget_window(self, start: InertialStart) -> None:
+        """Lengths are metres, or nothing tells them."""
+        self._path.clear()
+        start.clear()
 
     def continue_full(self, ctx: FrameContext, track: Track) -> list[str]:
         """Continue in a new submap where the ids of keyframes in the active one are used up. Returns events.
@@ -303,8 +358,7 @@ class SubmapStage:
         """
         camera = self._camera
         since, T_k_c = camera.reference.keyframe, camera.reference.T_k_c.copy()
-        camera.leave_map()
-        T_new_old = camera.pose.rescale(unit_m)
+        T_new_old = camera.continue_in_metres(unit_m)
         if unit_m != 1.0:
             self._map.drop_submap(camera.submaps.active)
         submap = camera.open_submap()

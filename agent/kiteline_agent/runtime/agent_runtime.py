@@ -73,6 +73,7 @@ class AgentRuntime:
         self.channel = channel
         self.counts = FrameCounts()
         self._warnings: list[str] = []
+        self._own_unit: set[int] = set()  # submaps with poses whose lengths are not metres
         self.flight_counts: dict[str, int | float] | None = None  # when the last frame had been flown
         self.rss_mib = 0.0
         grid = "agent" if options.grid == "base" and isinstance(channel, NoBaseChannel) else options.grid
@@ -246,6 +247,8 @@ class AgentRuntime:
             self._record.step(step_input, output, now_ns, now_ns + self._log_shift_ns)
         if frame is not None:
             self.counts.count(output.estimate, output.predicted)
+            if output.estimate is not None and output.estimate.tracked and not self.agent.metric:
+                self._own_unit.add(output.estimate.submap)
             if len(self._warnings) < _MOST_WARNINGS:
                 self._warnings += [event for event in output.events if event.startswith(_WARNING)]
             if self._record is not None:
@@ -288,6 +291,7 @@ class AgentRuntime:
             "skipped": dict(sorted(skipped.items())),
             "notes": notes,
             "scale": "metric" if self.agent.metric else "own",
+            "own_unit_submaps": sorted(self._own_unit),
             **self.agent.motion_reports(),
             "drain": {key: total[key] - self.flight_counts[key] for key in ("bytes_up", "bytes_down")},
             "timing": {

@@ -138,7 +138,7 @@ class ScanStage:
         if self._begun is None or (of_keyframe and self._begun.is_replaceable):
             self._begin_if_due(ctx, of_keyframe)
             return None
-        if of_keyframe or not self._governor.may_scan():
+        if of_keyframe or not self._governor.may_do_part():
             return None  # a keyframe is work enough for a frame
         begun = self._begun
         if begun.as_images:

@@ -75,6 +75,7 @@ class Intake:
         self.gravity: dict[SubmapId, GravityAlignment] = {}
         self.loss_ties: dict[SubmapId, SubmapTie] = {}  # how a submap lies to the one before it, over a loss
         self.fresh_ties: set[SubmapId] = set()  # of those, the ones that no placement follows yet
+        self.fresh_scales: set[SubmapId] = set()  # whose metres were told, and no placement follows yet
         self.last_contact_ns: dict[AgentId, int] = {}
         self.deleted: set[SubmapId] = set()  # records of these submaps are ignored
         self._rooted: list[KeyframeId] = []  # at which submaps begin without their first keyframe, not taken yet
@@ -168,6 +169,7 @@ class Intake:
         self._waiting = {k: t for k, t in self._waiting.items() if k in unused}
         self.inertial_ties.clear()  # they were used, or undone
         self.fresh_ties.clear()
+        self.fresh_scales.clear()
         self.deleted.update(state.deleted)
 
     def forget(self, submaps: Collection[SubmapId]) -> None:
@@ -181,6 +183,7 @@ class Intake:
         self._scans = [scan for scan in self._scans if submap_of_keyframe(scan.keyframe) not in submaps]
         self._images = [images for images in self._images if submap_of_keyframe(images.keyframe) not in submaps]
         self.fresh_ties.difference_update(submaps)
+        self.fresh_scales.difference_update(submaps)
         self.inertial_ties.forget(submaps)
         for submap in submaps:
             for known in (self.last_pose, self.tracked_ns, self.gravity, self.loss_ties):
@@ -211,6 +214,7 @@ class Intake:
 
     def _take_scale(self, record: SubmapScale, now_ns: int) -> None:
         self._map.metres_per_unit[record.submap] = record.metres
+        self.fresh_scales.add(record.submap)
         if record.metres == 1.0:
             self._map.metric_submaps.add(record.submap)
 

@@ -62,17 +62,39 @@ class SubmapPlacements:
         if np.allclose(gravity.T_l_m[:3, :3], sim3.rigid(self.S_w_m[first])[:3, :3], 0.0, 1e-9):
             return False
         scale = sim3.scale_of(self.S_w_m[first])
-        return self._move_world(sim3.of(scale, gravity.T_l_m) @ sim3.inverse(self.S_w_m[first]))
+        S_l_m = sim3.of(scale, sim3.with_scaled_translation(gravity.T_l_m, scale))
+        return self._move_world(S_l_m @ sim3.inverse(self.S_w_m[first]))
 
     def make_metric(self) -> bool:
-        """Rescale w to metres when the agent of the first submap reports its scale. Returns True if it changed."""
+        """Scale what agents told the metre of: w by the first submap, in a w in metres others that lie alone.
+
+        Returns True if something changed.
+        """
+        waiting, self._intake.fresh_scales = sorted(self._intake.fresh_scales), set()
+        changed = False
+        for submap in waiting:
+            placed, metres = self.S_w_m.get(submap), self._map.metres_per_unit[submap]
+            if not self._map.is_up_to_scale(self._map.map_id(submap)):
+                continue
+            if placed is None:
+                self._intake.fresh_scales.add(submap)
+                continue
+            factor = metres / sim3.scale_of(placed)
+            if submap == self.first:
+                changed = self._move_world(sim3.of(factor, np.eye(4))) or changed
+            elif self._in_metres and self._map.submaps_of_map(submap) == [submap]:
+                S_w_m = sim3.scaled_about(placed, factor, self._map.first_pose(submap))
+                if self._place(submap, S_w_m):
+                    self._move_later(submap, S_w_m @ sim3.inverse(placed))
+                    changed = True
+        return changed
+
+    @property
+    def _in_metres(self) -> bool:
+        """True if w is in metres."""
         first = self.first
-        metres = None if first is None else self._map.metres_per_unit.get(first)
-        if first is None or metres is None or not self._map.is_up_to_scale(self._map.map_id(first)):
-            return False
-        if sim3.scale_of(self.S_w_m[first]) != 1.0 or metres == 1.0:
-            return False
-        return self._move_world(sim3.of(metres, np.eye(4)))
+        known = first is not None and first in self._map.metres_per_unit
+        return known or (first is not None and not self._map.is_up_to_scale(self._map.map_id(first)))
 
     def place_new(self, keyframe: KeyframeId) -> None:
         """Place the submap of a new keyframe: the first of all at w, a later one where the last one was left."""

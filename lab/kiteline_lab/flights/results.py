@@ -21,6 +21,11 @@ from kiteline_lab.flights.plan import FlightPlan
 from kiteline_lab.flights.refined_path import refined_path
 from kiteline_lab.plots.plot import Line, can_plot, plot_trajectories
 
+_OTHER_UNIT = (
+    "agent {}: {} poses are in another unit of length than those at the flight's end: they are in its files, and left "
+    "out of accuracy and plot"
+)
+
 
 def write_results(out: Path, plan: FlightPlan, outcome: FlightOutcome) -> Report:
     """Write what the processes themselves did not, and report.json; returns the report. No plot without matplotlib."""
@@ -34,11 +39,14 @@ def write_results(out: Path, plan: FlightPlan, outcome: FlightOutcome) -> Report
         truth = source.ground_truth
         # Without a scale in metres a trajectory has a unit of its own.
         alignment = TrajectoryAlignment.SIM3 if mine.get("scale") == "own" else TrajectoryAlignment.SE3
-        odometry = [(e.t_ns, e.T_o_b) for e in estimates if not e.initialising]
-        live = [(e.t_ns, pose) for e in estimates if (pose := live_pose(e)) is not None]
         if part is None:  # it may have ended between writing its trajectories and its log: the log counts
-            write_tum(out / f"agent{k}" / "live.tum", live)
-            write_tum(out / f"agent{k}" / "odometry.tum", odometry)
+            write_tum(out / f"agent{k}" / "live.tum", _live(estimates))
+            write_tum(out / f"agent{k}" / "odometry.tum", _odometry(estimates))
+        judged = in_unit_of_end(estimates, mine)
+        if len(judged) < len(estimates):
+            left_out = sum(e.tracked for e in estimates) - sum(e.tracked for e in judged)
+            report["notes"].append(_OTHER_UNIT.format(k, left_out))
+        live, odometry = _live(judged), _odometry(judged)
         mine["accuracy"] = {
             "live": _accuracy(live, truth, alignment),
             "odometry": _accuracy(odometry, truth, alignment),
@@ -63,6 +71,21 @@ def write_results(out: Path, plan: FlightPlan, outcome: FlightOutcome) -> Report
         _plot(out / "trajectory.png", lines, plan.sources)
     write_report(out / "report.json", report)
     return report
+
+
+def _live(estimates: Sequence[Estimate]) -> list[tuple[int, F64]]:
+    return [(e.t_ns, pose) for e in estimates if (pose := live_pose(e)) is not None]
+
+
+def _odometry(estimates: Sequence[Estimate]) -> list[tuple[int, F64]]:
+    return [(e.t_ns, e.T_o_b) for e in estimates if not e.initialising]
+
+
+def in_unit_of_end(estimates: Sequence[Estimate], agent: Report) -> Sequence[Estimate]:
+    """Estimates whose unit is as that at the flight's end: metres, or one of the map's own."""
+    own = set(agent.get("own_unit_submaps", []))
+    ends_in_own = agent.get("scale") == "own"
+    return [e for e in estimates if (e.submap in own) == ends_in_own] if own else estimates
 
 
 def read_estimates(log: Path) -> list[Estimate]:

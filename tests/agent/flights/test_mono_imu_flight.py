@@ -1,6 +1,7 @@
 """Flights of one camera with an IMU through a rendered room: metres, budgets, an IMU that contradicts the images."""
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +15,7 @@ from kiteline_agent.runtime.controller import pose_sample
 from kiteline_agent.runtime.frame_counts import FrameCounts, live_line, odometry_line
 from kiteline_agent.step import Estimate, Identity, StepInput
 from kiteline_codec.channel import plain_pair
-from kiteline_codec.schema import KeyframeHeader, NewLandmarks, Observations
+from kiteline_codec.schema import GravityAlignment, KeyframeHeader, NewLandmarks, Observations, SubmapScale, SubmapTie
 from kiteline_core.arrays import F64
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration
 from kiteline_core.geometry import se3
@@ -29,11 +30,11 @@ from tests.agent.mono_room import (
 )
 
 
-def imu_at(t_s: F64, haste: float) -> ImuBatch:
+def imu_at(t_s: F64, haste: float, along: Callable[[float], F64] = path) -> ImuBatch:
     """Samples of an IMU in the camera, whose y axis points down, on the path `haste` times as fast."""
     h, gyro, accel = 1e-3, [], []
     for t in t_s:
-        before, here, after = (path(3.0 + 20.0 * haste * x) for x in (t - h, t, t + h))
+        before, here, after = (along(3.0 + 20.0 * haste * x) for x in (t - h, t, t + h))
         gyro.append(se3.so3_log(before[:3, :3].T @ after[:3, :3]) / (2.0 * h))
         moved = (before[:3, 3] - 2.0 * here[:3, 3] + after[:3, 3]) / h**2
         accel.append(here[:3, :3].T @ (moved - np.array([0.0, 9.81, 0.0])))
@@ -181,3 +182,69 @@ def test_without_samples_a_monocular_map_keeps_its_own_unit() -> None:
     assert estimates[40].initialising
     first = next(e for e in estimates if e.tracked)
     assert np.degrees(np.arccos(-first.T_o_b[2, 1])) < 12.0  # the camera counts as level where the flight began
+
+
+LOOKS_DOWN_RAD = 0.2
+
+
+def swing(k: float) -> F64:
+    """`path`, to and fro, of a camera that looks down."""
+    s, T = max(k - 3, 0) * 0.05, path(k)
+    return se3.from_rt(
+        T[:3, :3] @ se3.so3_exp(np.array([-LOOKS_DOWN_RAD, 0.0, 0.0])),
+        np.array([T[0, 3], T[1, 3], 1.2 * np.sin(0.45 * s)]),
+    )
+
+
+@pytest.mark.parametrize("percent", [0.0, 60.0])
+def test_an_imu_whose_samples_begin_late_gives_metres_to_the_map_that_is_tracked(percent: float) -> None:
+    """An agent that begins before its flight controller has a map in a unit of its own by then."""
+    near, far = plain_pair()
+    config = AgentConfig()
+    two_views = replace(config.two_view_start, median_depth_m=8.0)  # twice what it is
+    config = replace(config, governor=replace(config.governor, cpu_percent=percent), two_view_start=two_views)
+    one = Agent(RIG, ImuCalibration(), config, Identity(AgentId(0), 0), near)
+    flown: dict[int, Estimate] = {}
+    words: list[str] = []
+    begin, samples, end, haste = 4, 100, 320, 1.7
+    cpu_ns, metric = 0, 0
+    for k in range(begin, end):
+        t_s = (k - 3) * 0.05
+        image = Frame(round(t_s * 1e9), room(swing(3.0 + haste * (k - 3)))[0])
+        imu = imu_at(t_s - np.arange(9, -1, -1) * 0.005, haste, swing) if k >= samples else None
+        output = one.step(StepInput(image, imu, cpu_ns=cpu_ns), image.t_ns)
+        cpu_ns = cost_ns(one.work)
+        words += output.events
+        if output.estimate is not None:  # a budget lets frames wait before there is a map
+            flown[k] = output.estimate
+        if not metric and one.metric:
+            metric = k
+    assert samples + 40 < metric < samples + 200
+    (word,) = [w for w in words if "one unit was" in w]
+    assert word.startswith("mono: metric within")
+    first = next(k for k, e in flown.items() if e.tracked)
+    assert all(flown[k].tracked for k in range(first, end))  # the search holds up no frame
+    later = [flown[k] for k in range(metric, end)]
+    found = np.array([e.T_m_b[:3, 3] for e in later if e.T_m_b is not None])
+    true = np.array([swing(3.0 + haste * (k - 3)) for k in range(metric, end)])
+    scale, error_m = similar(found, true[:, :3, 3])
+    assert scale == pytest.approx(1.0, abs=0.04) and error_m < 0.02
+    assert min(e.quality for e in later) > 60
+    # upright for a flight controller from the first pose in metres on
+    assert all(e.R_l_o is None for k, e in flown.items() if k < metric)
+    up = np.array([(e.R_l_o @ e.T_o_b[:3, :3])[2] for e in later[5:] if e.R_l_o is not None])
+    assert len(up) == len(later) - 5
+    assert np.degrees(np.arccos(np.clip((up * -true[5:, 1, :3]).sum(axis=1), -1.0, 1.0))).max() < 2.0
+    # the base is told how long a unit was, how the submaps lie to each other, and how the first one is tilted
+    records = far.receive((), 0)
+    old, new = (submap for submap in sorted({e.submap for e in flown.values()}))
+    metres = {r.submap: r.metres for r in records if isinstance(r, SubmapScale)}
+    own = np.array([e.T_m_b[:3, 3] for k in range(metric - 60, metric) if (e := flown[k]).T_m_b is not None])
+    was = np.array([swing(3.0 + haste * (k - 3))[:3, 3] for k in range(metric - 60, metric)])
+    assert metres[new] == 1.0 and metres[old] == pytest.approx(similar(own, was)[0], rel=0.04)
+    (tie,) = [r for r in records if isinstance(r, SubmapTie)]
+    assert tie.submap == new and submap_of_keyframe(tie.since) == old
+    (alignment,) = [r for r in records if isinstance(r, GravityAlignment)]
+    assert alignment.submap == old  # there the camera had counted as level
+    tilt_rad = float(np.linalg.norm(se3.so3_log(alignment.T_l_m[:3, :3])))
+    assert tilt_rad == pytest.approx(LOOKS_DOWN_RAD, abs=0.15)

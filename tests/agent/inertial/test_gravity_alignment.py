@@ -41,7 +41,7 @@ def test_the_accelerometer_alone_sets_the_body_upright() -> None:
 def test_without_an_imu_gravity_is_not_awaited() -> None:
     aligner = GravityAligner(CAMERA, None)
     np.testing.assert_array_equal(aligner.R_l_o, np.eye(3))
-    assert aligner.update(0, np.eye(4), np.eye(3), SubmapId(0), first=True) is None
+    assert aligner.update(0, np.eye(4), np.eye(3), SubmapId(0), continued=True) is None
     ahead = aligner.first_pose(None)[:3, :3]
     np.testing.assert_allclose(ahead @ [0.0, 0.0, 1.0], [1.0, 0.0, 0.0], atol=1e-12)
 
@@ -50,11 +50,11 @@ def test_the_base_is_told_once_and_the_place_stays() -> None:
     knows = Knows()
     aligner = GravityAligner(CAMERA, knows)
     T_m_b = se3.from_rt(np.eye(3), np.array([1.0, 2.0, 3.0]))
-    assert aligner.update(0, T_m_b, np.eye(3), SubmapId(0), first=True) is None
+    assert aligner.update(0, T_m_b, np.eye(3), SubmapId(0), continued=True) is None
     assert aligner.R_l_o is None
     lean = se3.so3_exp(np.array([0.2, -0.3, 0.0]))
     knows.up = lean.T
-    level = aligner.update(10**8, T_m_b, np.eye(3), SubmapId(0), first=True)
+    level = aligner.update(10**8, T_m_b, np.eye(3), SubmapId(0), continued=True)
     np.testing.assert_allclose((level.T_l_m @ T_m_b)[:3, 3], T_m_b[:3, 3], atol=1e-4)  # rounded as on the wire
     told = messages.decode(messages.key(level), messages.encode(level))
     assert isinstance(told, GravityAlignment)
@@ -65,21 +65,21 @@ def test_the_base_is_told_once_and_the_place_stays() -> None:
     np.testing.assert_array_equal(echo.S_w_m, level.T_l_m)
     np.testing.assert_allclose(aligner.R_l_o @ lean @ [0.0, 0.0, 1.0], [0.0, 0.0, 1.0], atol=1e-9)
     assert aligner.tilt_rad == pytest.approx(np.hypot(0.2, 0.3))
-    assert aligner.update(2 * 10**8, T_m_b, np.eye(3), SubmapId(0), first=True) is None
+    assert aligner.update(2 * 10**8, T_m_b, np.eye(3), SubmapId(0), continued=True) is None
 
 
 def test_what_leans_hardly_is_left_and_patience_ends() -> None:
     knows = Knows()
     hardly = GravityAligner(CAMERA, knows)
     knows.up = se3.so3_exp(np.array([0.02, 0.0, 0.0]))
-    assert hardly.update(0, np.eye(4), np.eye(3), SubmapId(0), first=True) is None
+    assert hardly.update(0, np.eye(4), np.eye(3), SubmapId(0), continued=True) is None
     assert abs(hardly.R_l_o[2, 1]) > 0.01  # the flight controller gets even this
     knows.up = None
     patient = GravityAligner(CAMERA, knows)
     for t_s in (0.0, 1.0, 1.9):
-        patient.update(int(t_s * 1e9), np.eye(4), np.eye(3), SubmapId(0), first=True)
+        patient.update(int(t_s * 1e9), np.eye(4), np.eye(3), SubmapId(0), continued=True)
         assert patient.R_l_o is None
-    patient.update(int(2.1e9), np.eye(4), np.eye(3), SubmapId(0), first=True)
+    patient.update(int(2.1e9), np.eye(4), np.eye(3), SubmapId(0), continued=True)
     np.testing.assert_array_equal(patient.R_l_o, np.eye(3))
 
 
@@ -87,13 +87,13 @@ def test_samples_that_begin_late_set_the_map_upright_but_turn_no_controller() ->
     knows = Knows()
     aligner = GravityAligner(CAMERA, knows)
     for t_s in (0.0, 2.1):
-        assert aligner.update(round(1e9 * t_s), np.eye(4), np.eye(3), SubmapId(0), first=True) is None
+        assert aligner.update(round(1e9 * t_s), np.eye(4), np.eye(3), SubmapId(0), continued=True) is None
     knows.up = se3.so3_exp(np.array([0.3, 0.0, 0.0]))
-    level = aligner.update(round(4e9), np.eye(4), np.eye(3), SubmapId(0), first=True)
+    level = aligner.update(round(4e9), np.eye(4), np.eye(3), SubmapId(0), continued=True)
     assert level is not None and aligner.tilt_rad == pytest.approx(0.3)
     np.testing.assert_allclose(level.T_l_m[:3, :3], knows.up, atol=1e-4)
     np.testing.assert_array_equal(aligner.R_l_o, np.eye(3))  # what it was told is not taken back
-    assert aligner.update(round(5e9), np.eye(4), np.eye(3), SubmapId(0), first=True) is None
+    assert aligner.update(round(5e9), np.eye(4), np.eye(3), SubmapId(0), continued=True) is None
 
 
 def test_gravity_is_known_after_five_frames_in_motion() -> None:

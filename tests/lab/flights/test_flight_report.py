@@ -17,6 +17,7 @@ from kiteline_lab.flights.flight_report import statistic, table, without_timing,
 from kiteline_lab.flights.fly import fly
 from kiteline_lab.flights.plan import Options
 from kiteline_lab.flights.refined_path import refined_path
+from kiteline_lab.flights.results import in_unit_of_end
 
 
 @dataclass(frozen=True)
@@ -196,3 +197,14 @@ def test_the_table_tells_what_was_skipped_and_what_to_check() -> None:
         "note: 1 skipped: damaged chunk", "note: imu: no gravity",
     ]  # fmt: skip
     assert table({"agents": [agent, agent], "base": None}).splitlines()[-1] == "note: agent 1: imu: no gravity"
+
+
+def test_poses_in_another_unit_than_at_the_end_are_not_judged() -> None:
+    flown = [
+        FlownFrame(n, n > 1, np.eye(4), np.eye(4), KeyframeId(0), np.eye(4), SubmapId(n // 3)) for n in range(8)
+    ]  # fmt: skip
+    metric, own = ({"scale": scale, "own_unit_submaps": [0, 2]} for scale in ("metric", "own"))
+    assert [e.t_ns for e in in_unit_of_end(flown, metric)] == [3, 4, 5]
+    assert [e.t_ns for e in in_unit_of_end(flown, own)] == [0, 1, 2, 6, 7]
+    assert in_unit_of_end(flown, {"scale": "metric", "own_unit_submaps": []}) is flown
+    assert in_unit_of_end(flown, {}) is flown
