@@ -19,6 +19,7 @@ from kiteline_bench.harness.faults import (
     flickering,
     late_samples,
     rearranged,
+    samples_from,
     samples_in_bursts,
     scattered_stamps,
     smeared,
@@ -211,6 +212,10 @@ def test_samples_of_the_imu_are_left_out_or_stamped_late(flight: Recording) -> N
     assert len(left) + len(gone) == len(everything)
     assert ((gone - everything[0]) * 1e-9 % 0.5 >= 0.3 - 1e-9).all() and 0.3 < len(gone) / len(everything) < 0.5
     assert all(item.imu is None for item in without_samples(flight.without_imu(), 0.5, 0.2).items)
+    begun = stamps(samples_from(sampled, 0.3))
+    first_ns = flight.items[0].frame.t_ns + 300_000_000
+    np.testing.assert_array_equal(begun, everything[everything >= first_ns])
+    assert samples_from(sampled, 0.3).imu is sampled.imu  # the rig has one all the same
 
 
 def test_stamps_scatter_and_keep_their_order(flight: Recording) -> None:

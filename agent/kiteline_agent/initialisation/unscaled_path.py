@@ -43,11 +43,12 @@ class UnscaledPath:
     def unit(self, t_ns: tuple[int, ...], window: WindowState, T_b_c: F64) -> MapUnit | None:
         """The unit in which the path is as long as in a window with these stamps; None if too little tells it.
 
-        The similarity with the least squared distances between both paths, whose rotation is that of the cameras.
+        Of the newest half, as the unit drifts. The rotation is that of the cameras.
         """
         rows = {t: k for k, t in enumerate(t_ns)}
         slots = {keyframe: self._map.slot_of(keyframe) for _, keyframe, _ in self._frames}
         known = [(rows[t], slots[k], T_k_c) for t, k, T_k_c in self._frames if t in rows and slots[k] >= 0]
+        known = known[-max(len(known) // 2, _LEAST_FRAMES) :]
         if len(known) < _LEAST_FRAMES:
             return None
         row = [k for k, _, _ in known]

@@ -130,6 +130,17 @@ def without_samples(recording: Recording, every_s: float, length_s: float) -> Re
     return _each_batch(recording, kept)
 
 
+def samples_from(recording: Recording, begin_s: float) -> Recording:
+    """Leave out the inertial samples of the first `begin_s`: an agent that runs before its flight controller."""
+    begin_ns = recording.items[0].frame.t_ns + round(1e9 * begin_s)
+
+    def kept(imu: ImuBatch) -> ImuBatch | None:
+        keep = imu.t_ns >= begin_ns
+        return chosen(imu, keep) if keep.any() else None
+
+    return _each_batch(recording, kept)
+
+
 def late_samples(recording: Recording, late_s: float) -> Recording:
     """Stamp the inertial samples late, so that a recording gives them after their frames; negative: early."""
     samples = _joined_imu(recording.items)

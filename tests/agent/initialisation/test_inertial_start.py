@@ -220,37 +220,6 @@ def test_a_window_begins_after_the_samples_that_are_missing(monkeypatch: pytest.
     assert solved == [17]
 
 
-def test_beside_a_map_a_solution_is_spread_over_frames_and_begins_no_map_after_a_loss(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    start = InertialStart(CAMERA, CALIBRATION, AgentConfig(), Work())
-    monkeypatch.setattr(start._tracks, "follow", lambda _left: True)
-    monkeypatch.setattr(start._tracks, "is_due", lambda _t_ns: True)
-    monkeypatch.setattr(start._tracks, "add", lambda *_: True)
-    monkeypatch.setattr(start, "_bound_window", lambda _t_ns: None)
-    parts: list[int] = []
-
-    def begin(ctx: Any, _imu: Any) -> Any:
-        for part in range(3):
-            parts.append(part)
-            yield
-        return ctx.number
-
-    monkeypatch.setattr(start, "_begin", begin)
-
-    def frame(number: int) -> Any:
-        return SimpleNamespace(number=number, t_ns=50_000_000 * number, images=SimpleNamespace(left=None))
-
-    found: Any
-    for number in range(3):
-        assert start.add_beside_map(frame(number), EXACT) is None and len(parts) == number + 1
-    found = start.add_beside_map(frame(3), EXACT)
-    assert found == 0 and parts == [0, 1, 2]  # of the frame in which it began
-    assert start.add_beside_map(frame(4), EXACT) is None
-    found = start.add(frame(5), EXACT)  # the map is lost: one begins at this frame or not at all
-    assert found == 5
-
-
 def test_samples_that_miss_in_every_window_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each window would begin after the last gap, and none is ever solved."""
     start = InertialStart(CAMERA, CALIBRATION, AgentConfig(), Work())
