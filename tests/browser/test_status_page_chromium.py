@@ -17,7 +17,7 @@ import pytest
 from websockets.sync.client import ClientConnection, connect
 
 from kiteline_basestation.config import GridConfig
-from kiteline_basestation.grid.grid_view import GridViews
+from kiteline_basestation.grid.grid_view import GridView, GridViews
 from kiteline_basestation.grid.kept_scan import keep
 from kiteline_basestation.grid.scan_grid import ScanGrid
 from kiteline_basestation.web.server import serve
@@ -145,7 +145,7 @@ def test_the_page_draws_the_map_and_writes_the_numbers(browser: Browser, tmp_pat
         browser.call("Page.navigate", url=handle.url)
         browser.wait("document.querySelectorAll('article').length", "2")
         browser.wait("document.querySelector('#totals [data-label=Landmarks]').textContent", "2,480")
-        browser.wait("document.querySelector('article .quality output').textContent", "86 %")
+        browser.wait("document.querySelector('article .quality .value').textContent", "86 %")
         browser.wait("document.querySelectorAll('article .traffic dd')[0].textContent", "3.0 kB/s")
         browser.wait("getComputedStyle(document.getElementById('empty')).display", "none")
         browser.wait("document.querySelector('article .curve').getAttribute('d') !== null", "True")
@@ -157,4 +157,111 @@ def test_the_page_draws_the_map_and_writes_the_numbers(browser: Browser, tmp_pat
         assert browser.complaints == []
     finally:
         handle.close()
-    browser.wait("document.getElementById('link').textContent", "no connection to the base")
+    browser.wait("document.getElementById('state').textContent", "no connection to the base")
+
+
+def test_what_is_old_is_shown_as_old_and_another_base_starts_afresh(browser: Browser) -> None:
+    """Agents of a base that was gone stayed "live", and beside those of the next one."""
+    now = room()
+    handle = serve("127.0.0.1", 0, lambda: now)
+    browser.call("Page.navigate", url=handle.url)
+    browser.wait("document.querySelectorAll('article').length", "2")
+    browser.wait("document.body.classList.contains('stale')", "False")
+    port = int(handle.url.rsplit(":", 1)[1].rstrip("/"))
+    handle.close()
+    browser.wait("document.body.classList.contains('stale')", "True")
+    browser.wait("/ (1|2|3) s old/.test(document.getElementById('since').textContent)", "True")
+    other = replace(now, agents=now.agents[1:], now_ns=now.started_ns + 10**9)
+    handle = serve("127.0.0.1", port, lambda: other)
+    try:
+        browser.wait("document.body.classList.contains('stale')", "False")
+        browser.wait("[...document.querySelectorAll('article .name')].map(n => n.textContent).join()", "Agent 1")
+        other = replace(other, agents=())
+        browser.wait("document.querySelectorAll('article').length", "0")
+        browser.wait("document.getElementById('none').hidden", "False")
+    finally:
+        handle.close()
+
+
+def test_units_places_and_troubles_are_written(browser: Browser) -> None:
+    now = room()
+    first, second = now.agents
+    now = replace(
+        now, agents=(replace(first, own_unit=True), replace(second, T_w_c=None, path=second.path[:0])),
+        troubles=("store maps: not written: the disk is full",), own_unit=True,
+    )  # fmt: skip
+    handle = serve("127.0.0.1", 0, lambda: now)
+    try:
+        browser.call("Page.navigate", url=handle.url)
+        browser.wait("document.querySelectorAll('article').length", "2")
+        browser.wait("document.getElementById('troubles').innerText", "store maps: not written: the disk is full")
+        browser.wait("[...document.querySelectorAll('.pose dt')].map(n => n.textContent).slice(0, 5).join()",
+                     "x,y,z,heading,x, m")  # fmt: skip
+        browser.wait("document.querySelectorAll('.note')[0].textContent.startsWith('Own unit of length')", "True")
+        browser.wait("document.querySelectorAll('.note')[1].textContent.startsWith('Not placed')", "True")
+        now = replace(now, agents=now.agents[1:], points=now.points[:0], labels=now.labels[:0], grid=GridView(0.05),
+                      map_revision=2)  # fmt: skip
+        browser.wait("document.getElementById('empty').innerText", "No map has a place in the world yet")
+        now = replace(now, agents=(), troubles=())
+        browser.wait("document.getElementById('troubles').hidden", "True")
+        browser.wait("document.getElementById('empty').innerText", "Waiting for the first keyframe")
+    finally:
+        handle.close()
+
+
+def test_keyboard_and_screen_reader(browser: Browser) -> None:
+    now = room()
+    tick = 0
+
+    def snapshot() -> PageSnapshot:
+        nonlocal tick
+        tick += 1
+        return replace(now, now_ns=now.now_ns + tick * 10**9)
+
+    handle = serve("127.0.0.1", 0, snapshot)
+    try:
+        browser.call("Page.navigate", url=handle.url)
+        browser.wait("document.querySelectorAll('article').length", "2")
+        browser.text("""
+            window.said = 0;
+            for (const live of document.querySelectorAll("[role=status], [role=alert], output"))
+                new MutationObserver(() => { said += 1; })
+                    .observe(live, {childList: true, characterData: true, subtree: true});""")
+        before = browser.text("document.getElementById('since').textContent")
+        browser.wait(f"document.getElementById('since').textContent !== {before!r}", "True")
+        assert browser.text("said") == "0"  # the time that the base runs is not read out twice a second
+        browser.text("document.querySelectorAll('.name')[1].focus()")
+        for kind in ("keyDown", "keyUp"):
+            browser.call("Input.dispatchKeyEvent", type=kind, key="Enter", windowsVirtualKeyCode=13, text="\r")
+        browser.wait("[...document.querySelectorAll('.name')].map(n => n.ariaPressed).join()", "false,true")
+        browser.text("document.getElementById('fit').click()")
+        browser.wait("[...document.querySelectorAll('.name')].map(n => n.ariaPressed).join()", "false,false")
+        assert browser.text("document.activeElement === document.querySelectorAll('.name')[1]") == "True"
+        assert browser.complaints == []
+    finally:
+        handle.close()
+
+
+@pytest.mark.parametrize(("width", "height"), [(390, 844), (740, 360), (1000, 700), (1360, 820)])
+def test_nothing_overlaps(browser: Browser, width: int, height: int) -> None:
+    """On a phone the legend lay over the map; on its side the map left nothing to scroll by."""
+    now = room()
+    handle = serve("127.0.0.1", 0, lambda: now)
+    try:
+        browser.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=True)
+        browser.call("Page.navigate", url=handle.url)
+        browser.wait("document.querySelectorAll('article').length", "2")
+        browser.text("document.getElementById('where').textContent = '-12.34, -56.78 m'")
+        overlapping = """
+            const boxes = ['tools', 'legend', 'where'].map((id) => document.getElementById(id).getBoundingClientRect());
+            boxes.some((a, i) => boxes.slice(i + 1).some((b) =>
+                a.left < b.right && b.left < a.right && a.top < b.bottom && b.top < a.bottom))"""
+        assert (
+            browser.text("(() => {" + overlapping.replace("boxes.some((a, i)", "return boxes.some((a, i)") + "})()")
+            == "False"
+        )
+        assert browser.text("document.documentElement.scrollWidth <= innerWidth") == "True"
+        lowest = "document.getElementById('canvas').getBoundingClientRect().bottom"
+        assert width > 820 or browser.text(f"{lowest} < innerHeight - 40") == "True"
+    finally:
+        handle.close()

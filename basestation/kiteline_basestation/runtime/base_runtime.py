@@ -148,7 +148,17 @@ class BaseRuntime:
     def state(self) -> dict[str, Any]:
         """The process as JSON types: its link, memory and store, and what is wrong now, a line each."""
         options, keeper = self.options, self.keeper
-        troubles = missing_extras()
+        return {
+            "link": options.link,
+            "session": options.session,
+            "memory_mib": round(self.rss_mib, 1),
+            "store": None if keeper is None else {"folder": options.store, "up_to_date": keeper.idle},
+            "troubles": self.troubles(),
+        }
+
+    def troubles(self) -> list[str]:
+        """What is wrong now, a line each."""
+        options, keeper, troubles = self.options, self.keeper, missing_extras()
         if keeper is not None and keeper.fault is not None:
             troubles.append(f"store {options.store}: not written: {keeper.fault}")
         if options.log_name and self._log is None:
@@ -159,13 +169,7 @@ class BaseRuntime:
             troubles.append(f"log: it waits for the disk: {self._log.waits_for}")
         for kind, why in sorted(self.station.mapper.failures.items()):
             troubles.append(f"job {kind}: the last one failed, and its part of the map stays as it was: {why}")
-        return {
-            "link": options.link,
-            "session": options.session,
-            "memory_mib": round(self.rss_mib, 1),
-            "store": None if keeper is None else {"folder": options.store, "up_to_date": keeper.idle},
-            "troubles": troubles,
-        }
+        return troubles
 
     def restore_maps(self, now_ns: int) -> Restored | None:
         """Load the map of the store and the imported ones; None if there are none.

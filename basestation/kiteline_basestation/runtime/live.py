@@ -88,7 +88,7 @@ def fly_live(options: BaseOptions, parent: process.Parent | None, stop: process.
         while not stop:
             now_ns = loop.turn()
             if page is not None:
-                page.update(base.station, now_ns)
+                page.update(base.station, now_ns, base.troubles)
             process.notify("WATCHDOG=1")
             stop.wait(_POLL_S)
         loop.end()

@@ -2,10 +2,13 @@
 
 const TILE = 64; // cells along a side of a tile
 const POINTS = 1, TILES = 2, PATH = 3; // kinds of binary messages, see messages.py
-const LIGHT = ["#2a78d6", "#c2417c", "#6a4fc9", "#0f8b8d", "#b5730a", "#7d5a3c", "#4a7a12", "#8b2fa8"];
-const DARK = ["#5a9cec", "#e46fa4", "#9a86ee", "#3fbfc0", "#e0a33c", "#c09a78", "#8dc04c", "#c77be0"];
+const INTERRUPTED = -32768; // a path has no line here
+// Of agents; the first four differ for colour-blind readers, too.
+const LIGHT = ["#2a78d6", "#c2417c", "#b5730a", "#0f8b8d", "#6a4fc9", "#7d5a3c", "#4a7a12", "#8b2fa8"];
+const DARK = ["#5a9cec", "#e46fa4", "#e0a33c", "#3fbfc0", "#9a86ee", "#c09a78", "#8dc04c", "#c77be0"];
 const dark = matchMedia("(prefers-color-scheme: dark)");
 
+export const onColours = (changed) => dark.addEventListener("change", changed);
 export const agentColour = (agent) => (dark.matches ? DARK : LIGHT)[agent % LIGHT.length];
 const css = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 const rgb = (hex) => [1, 3, 5].map((i) => parseInt(hex.slice(i, i + 2), 16));
@@ -20,9 +23,12 @@ export class MapCanvas {
     this.centre = [0, 0]; // m
     this.fitted = true; // the whole map is shown, until the user moves it
     this.following = null;
+    this.onFollow = () => {}; // is told the agent that is kept in the middle, null none
+    this.stale = false;
+    this.own_unit = false; // lengths are no metres
     this.clear();
     new ResizeObserver(() => this.redraw()).observe(canvas);
-    dark.addEventListener("change", () => { this.tiles.forEach((tile) => { tile.image = null; }); this.paintTiles(); this.redraw(); });
+    onColours(() => { this.tiles.forEach((tile) => { tile.image = null; }); this.paintTiles(); this.redraw(); });
     this.addListeners();
   }
 
@@ -32,8 +38,13 @@ export class MapCanvas {
     this.points = null;
     this.paths = new Map();
     this.poses = [];
+    this.mapped = false;
+    this.stale = false;
     this.redraw();
   }
+
+  // What is shown is old: agents are drawn grey.
+  setStale(stale) { this.stale = stale; this.redraw(); }
 
   receive(buffer) {
     const header = new DataView(buffer);
@@ -47,22 +58,27 @@ export class MapCanvas {
       const places = new Int32Array(buffer, 16, 2 * n);
       for (let i = 0; i < n; i++) {
         const [column, row] = [places[2 * i], places[2 * i + 1]];
-        const cells = new Int8Array(buffer, 16 + 8 * n + i * TILE * TILE, TILE * TILE);
+        const cells = new Int8Array(buffer, 16 + 8 * n + i * TILE * TILE, TILE * TILE).slice(); // else one tile keeps the message
         const tile = { column, row, cells, image: null };
         if (cells.some((c) => c >= 0)) this.tiles.set(`${column},${row}`, tile);
         else this.tiles.delete(`${column},${row}`);
       }
       this.paintTiles();
     }
-    this.empty.hidden = this.tiles.size + (this.points?.n ?? 0) + this.paths.size > 0;
-    this.empty.style.display = this.empty.hidden ? "none" : "";
     this.redraw();
   }
 
-  agents(list) { this.poses = list.filter((a) => a.position); this.redraw(); }
+  agents(list) {
+    this.poses = list.filter((a) => a.position);
+    for (const agent of this.paths.keys()) if (!list.some((a) => a.agent === agent)) this.paths.delete(agent);
+    this.mapped = list.some((a) => a.counts.some(({ label, value }) => label === "Keyframes" && value > 0));
+    this.stale = false;
+    this.redraw();
+  }
   layer(name, on) { this.layers[name] = on; this.redraw(); }
-  fit() { this.fitted = true; this.following = null; this.redraw(); }
-  follow(agent) { this.following = this.following === agent ? null : agent; this.fitted = false; this.redraw(); }
+  fit() { this.fitted = true; this.keepInMiddle(null); this.redraw(); }
+  follow(agent) { this.keepInMiddle(this.following === agent ? null : agent); this.fitted = false; this.redraw(); }
+  keepInMiddle(agent) { this.following = agent; this.onFollow(agent); }
 
   redraw() {
     if (this.waiting) return;
@@ -96,7 +112,7 @@ export class MapCanvas {
         add((column * TILE + (i % TILE)) * this.cell_m, (row * TILE + Math.floor(i / TILE)) * this.cell_m);
       }
     }
-    for (const { n, scale, xyz } of this.paths.values()) for (let i = 0; i < n; i++) add(xyz[3 * i] * scale, xyz[3 * i + 1] * scale);
+    for (const { n, scale, xyz } of this.paths.values()) for (let i = 0; i < n; i++) if (xyz[3 * i] !== INTERRUPTED) add(xyz[3 * i] * scale, xyz[3 * i + 1] * scale);
     for (const a of this.poses) add(a.position[0], a.position[1]);
     if (!isFinite(box[0]) && this.points) {
       const { n, scale, xyz } = this.points;
@@ -126,6 +142,7 @@ export class MapCanvas {
     const g = this.context, s = this.scale;
     g.setTransform(ratio, 0, 0, ratio, 0, 0);
     g.clearRect(0, 0, width, height);
+    this.showEmpty();
     this.toScreen = (x, y) => [width / 2 + (x - this.centre[0]) * s, height / 2 - (y - this.centre[1]) * s];
 
     if (this.layers.grid) {
@@ -142,6 +159,12 @@ export class MapCanvas {
     if (this.layers.paths) for (const [agent, path] of this.paths) this.drawPath(g, agent, path);
     for (const a of this.poses) this.drawAgent(g, a);
     this.drawScaleBar(g, width, height);
+  }
+
+  showEmpty() {
+    const some = this.tiles.size + (this.points?.n ?? 0) > 0 || [...this.paths.values()].some((path) => path.n > 0);
+    this.empty.hidden = some;
+    if (!some) this.empty.textContent = this.mapped ? "No map has a place in the world yet" : "Waiting for the first keyframe";
   }
 
   gridStep() { // a round number of metres, about 90 px wide
@@ -183,23 +206,24 @@ export class MapCanvas {
 
   drawPath(g, agent, { n, scale, xyz }) {
     const at = (i) => this.toScreen(xyz[3 * i] * scale, xyz[3 * i + 1] * scale);
+    const whole = (i) => xyz[3 * i] !== INTERRUPTED;
     g.lineJoin = g.lineCap = "round";
     for (const [colour, wide] of [[css("--page"), 5], [agentColour(agent), 2.2]]) {
       g.strokeStyle = colour;
       g.lineWidth = wide;
       g.beginPath();
-      for (let i = 0; i < n; i++) g[i ? "lineTo" : "moveTo"](...at(i));
+      for (let i = 0; i < n; i++) if (whole(i)) g[i && whole(i - 1) ? "lineTo" : "moveTo"](...at(i));
       g.stroke();
     }
     if (this.scale > 25) {
       g.fillStyle = agentColour(agent);
-      for (let i = 0; i < n; i++) { g.beginPath(); g.arc(...at(i), 2.6, 0, 7); g.fill(); }
+      for (let i = 0; i < n; i++) if (whole(i)) { g.beginPath(); g.arc(...at(i), 2.6, 0, 7); g.fill(); }
     }
   }
 
   drawAgent(g, a) {
     const [x, y] = this.toScreen(a.position[0], a.position[1]);
-    const inactive = a.link === "lost" || a.link === "never" || (a.quality !== null && a.quality < 0);
+    const inactive = this.stale || a.link === "lost" || a.link === "never" || (a.quality !== null && a.quality < 0);
     g.save();
     g.translate(x, y);
     g.save();
@@ -231,7 +255,7 @@ export class MapCanvas {
     g.stroke();
     g.font = "12px system-ui, sans-serif";
     g.textAlign = "center";
-    g.fillText(step >= 1 ? `${step} m` : `${Math.round(step * 100)} cm`, right - long / 2, y - 6);
+    g.fillText(this.own_unit ? `${step} (own unit)` : step >= 1 ? `${step} m` : `${Math.round(step * 100)} cm`, right - long / 2, y - 6);
     g.textAlign = "left";
   }
 
@@ -249,14 +273,14 @@ export class MapCanvas {
     const move = (dx, dy) => {
       this.centre = [this.centre[0] - dx / this.scale, this.centre[1] + dy / this.scale];
       this.fitted = false;
-      this.following = null;
+      this.keepInMiddle(null);
       this.redraw();
     };
     c.addEventListener("wheel", (e) => { e.preventDefault(); zoom(1.0015 ** -e.deltaY, place(e)); }, { passive: false });
     c.addEventListener("pointerdown", (e) => { c.setPointerCapture(e.pointerId); held.set(e.pointerId, [e.offsetX, e.offsetY]); });
     c.addEventListener("pointermove", (e) => {
       const [px, py] = place(e);
-      this.cursor.textContent = `${(this.centre[0] + px / this.scale).toFixed(2)}, ${(this.centre[1] - py / this.scale).toFixed(2)} m`;
+      this.cursor.textContent = `${(this.centre[0] + px / this.scale).toFixed(2)}, ${(this.centre[1] - py / this.scale).toFixed(2)}${this.own_unit ? "" : " m"}`;
       const old = held.get(e.pointerId);
       if (!old) return;
       const now = [e.offsetX, e.offsetY];

@@ -3,7 +3,7 @@
 A binary message starts with 16 bytes, little endian: kind u8, agent u8, 0 u16, n u32, scale f32, 0 u32. Then by kind:
 1 points: int16 (n,3) times scale = metres in w, uint8 (n) labels.
 2 tiles: int32 (n,2) column, row; int8 (n,64,64): -1 unknown, 0 free, else occupied; scale is the side of a cell in m.
-3 path of an agent's keyframes: int16 (n,3) times scale = metres in w.
+3 path of an agent's keyframes: int16 (n,3) times scale = metres in w; -32768 where it is interrupted.
 """
 
 import struct
@@ -16,7 +16,7 @@ from kiteline_basestation.grid.grid_view import GridView
 from kiteline_basestation.grid.tile_store import Place
 from kiteline_basestation.web.numbers import AGENT_COUNTS, TOTALS, as_json
 from kiteline_basestation.web.snapshot import AgentStatus, PageSnapshot
-from kiteline_core.arrays import F64, U8
+from kiteline_core.arrays import F64, I16, U8
 
 POINTS, TILES, PATH = 1, 2, 3  # kinds of binary messages
 
@@ -26,6 +26,7 @@ FRESH_S = 1.5  # s since the last packet: a heartbeat a second, and half of one 
 LOST_S = 10.0  # s since the last packet: by then a reconnecting link would be back
 
 _S = 1e-9  # s in a ns
+_INTERRUPTED = -32768  # of a path: no position, and no line to it
 
 
 def status(now: PageSnapshot, before: PageSnapshot | None = None) -> dict[str, Any]:
@@ -36,6 +37,8 @@ def status(now: PageSnapshot, before: PageSnapshot | None = None) -> dict[str, A
         "up_s": _rounded((now.now_ns - now.started_ns) * _S, 1),
         "agents": [_agent(a, older.get(a.agent), now.now_ns, span_s) for a in now.agents],
         "totals": as_json(TOTALS, now),
+        "troubles": list(now.troubles),
+        "unit": _unit(now.own_unit),
         "map_revision": now.map_revision,
     }
 
@@ -56,12 +59,18 @@ def _agent(a: AgentStatus, before: AgentStatus | None, now_ns: int, span_s: floa
         "quality": int(a.quality) if a.quality is not None and heard else None,
         "position": None if pose is None else [_rounded(float(v), 3) for v in pose[:3, 3]],
         "heading_deg": None if pose is None else _heading_deg(pose),
+        "unit": _unit(a.own_unit),
         "counts": as_json(AGENT_COUNTS, a),
         "bytes_up": a.bytes_up,
         "bytes_down": a.bytes_down,
         "rate_up": up,
         "rate_down": down,
     }
+
+
+def _unit(own: bool) -> str:
+    """Name of a unit of length, as in the replies to `kiteline maps`."""
+    return "own" if own else "metre"
 
 
 def link_state(silent_s: float | None) -> str:
@@ -94,16 +103,19 @@ def points_message(points: F64, labels: U8) -> bytes:
     if len(keep) > MAX_POINTS:
         keep = keep[np.linspace(0, len(keep) - 1, MAX_POINTS).astype(np.int64)]
     scale, coded = _coded(points[keep])
-    return _header(POINTS, 0, len(keep), scale) + coded + labels[keep].astype(np.uint8).tobytes()
+    return _header(POINTS, 0, len(keep), scale) + coded.tobytes() + labels[keep].astype(np.uint8).tobytes()
 
 
 def path_message(agent: int, path: F64) -> bytes:
-    """Positions (k,3) of an agent's keyframes, evenly thinned to MAX_PATH."""
-    path = path[np.isfinite(path).all(axis=1)]
+    """Positions (k,3) of an agent's keyframes, evenly thinned to MAX_PATH; interrupted where they are not finite."""
+    lost = np.asarray(~np.isfinite(path).all(axis=1))
     if len(path) > MAX_PATH:
-        path = path[np.linspace(0, len(path) - 1, MAX_PATH).astype(np.int64)]
-    scale, coded = _coded(path)
-    return _header(PATH, agent, len(path), scale) + coded
+        kept = lost.copy()
+        kept[np.linspace(0, len(path) - 1, MAX_PATH).astype(np.int64)] = True
+        path, lost = path[kept], lost[kept]
+    scale, codes = _coded(np.where(lost[:, None], 0.0, path))
+    codes[lost] = _INTERRUPTED
+    return _header(PATH, agent, len(path), scale) + codes.tobytes()
 
 
 def tiles_message(grid: GridView, places: Sequence[Place]) -> bytes:
@@ -117,6 +129,6 @@ def _header(kind: int, agent: int, n: int, scale: float) -> bytes:
     return struct.pack("<BBHIfI", kind, agent, 0, n, scale, 0)
 
 
-def _coded(points: F64) -> tuple[float, bytes]:
+def _coded(points: F64) -> tuple[float, I16]:
     scale = float(np.float32(max(float(np.abs(points).max()) if len(points) else 0.0, 1.0) / 32766.0))
-    return scale, np.rint(points / scale).astype("<i2").tobytes()
+    return scale, np.rint(points / scale).astype("<i2")

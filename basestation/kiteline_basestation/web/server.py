@@ -193,15 +193,15 @@ class _Page:
                 self._recent.clear()
 
     async def _show(self, viewer: ServerConnection) -> None:
-        revision: int | None = None
+        revision: tuple[int, int] | None = None
         held = GridView(1.0)
         map_s = -MAP_PERIOD_S
         while True:
             now, before = self._snapshots()
             await viewer.send(_json(now, before).decode())
-            changed = now.map_revision != revision or now.grid is not held
+            changed = (now.map_revision, now.layout) != revision or now.grid is not held
             if changed and time.monotonic() - map_s >= MAP_PERIOD_S:
-                revision, map_s = now.map_revision, time.monotonic()
+                revision, map_s = (now.map_revision, now.layout), time.monotonic()
                 for message in map_messages(now):
                     await viewer.send(message)
                 async for message in self._tiles(held, now.grid):

@@ -1,5 +1,8 @@
 """The status page of a running base; its loop replaces the snapshot, so that no lock is needed."""
 
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
 from kiteline_basestation.station import Station
 from kiteline_basestation.web.server import address, serve
 from kiteline_basestation.web.snapshot import empty_snapshot, take_snapshot
@@ -22,11 +25,12 @@ class StatusPage:
         """The page's URL."""
         return self._handle.url
 
-    def update(self, station: Station, now_ns: int) -> None:
-        """Take a new snapshot if the last one is old enough."""
+    def update(self, station: Station, now_ns: int, troubles: Callable[[], Sequence[str]]) -> None:
+        """Take a new snapshot if the last one is old enough. troubles: what is wrong with the process, a line each."""
         if now_ns - self._taken_ns >= _PERIOD_NS:
             self._taken_ns = now_ns
-            self._snapshot = take_snapshot(station, now_ns, self._started_ns, self._snapshot)
+            now = take_snapshot(station, now_ns, self._started_ns, self._snapshot)
+            self._snapshot = replace(now, troubles=tuple(troubles()))
 
     def close(self) -> None:
         """Stop serving."""

@@ -55,12 +55,13 @@ def _agent(agent: Mapping[str, Any], rates: tuple[float, float] | None) -> tuple
     silent_s = agent["silent_s"]
     link = agent["link"] if silent_s is None or agent["link"] == "live" else f"{agent['link']}, {_span(silent_s)}"
     quality, position = agent["quality"], agent["position"]
+    unit = " (own unit)" if agent["unit"] == "own" else ""
     counts = {number["label"]: str(number["value"]) for number in agent["counts"]}
     return (
         str(agent["agent"]),
         link,
         "-" if quality is None else "no pose" if quality < 0 else str(quality),
-        "not placed" if position is None else " ".join(f"{v:.2f}" for v in position),
+        "not placed" if position is None else " ".join(f"{v:.2f}" for v in position) + unit,
         counts["Keyframes"],
         counts["Landmarks"],
         counts["Submaps"],

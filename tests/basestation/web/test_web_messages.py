@@ -136,3 +136,24 @@ def test_a_viewer_gets_the_tiles_that_it_does_not_hold() -> None:
     assert (second[1, -1] == UNKNOWN).all()
     assert (second[5, 2][1:] == 3).all() and second[5, 2][0, 0] == UNKNOWN
     assert not differences(new, new)
+
+
+def test_a_path_is_interrupted_between_submaps_also_where_it_is_thinned() -> None:
+    path = np.arange(15.0).reshape(5, 3)
+    path[2] = np.nan
+    message = messages.path_message(0, path)
+    codes = np.frombuffer(message, "<i2", 15, 16).reshape(5, 3)
+    assert (codes[2] == -32768).all() and (codes[[0, 1, 3, 4]] != -32768).all()
+    long = np.zeros((3 * messages.MAX_PATH, 3))
+    long[[100, 101 + messages.MAX_PATH]] = np.nan
+    message = messages.path_message(0, long)
+    n = header(message)[2]
+    assert n <= messages.MAX_PATH + 2
+    assert np.count_nonzero(np.frombuffer(message, "<i2", 3 * n, 16).reshape(n, 3)[:, 0] == -32768) == 2
+
+
+def test_units_and_troubles_are_told() -> None:
+    out = messages.status(snapshot(agent(0, own_unit=True), agent(1), troubles=("store: not written",)))
+    assert [a["unit"] for a in out["agents"]] == ["own", "metre"]
+    assert (out["unit"], out["troubles"]) == ("metre", ["store: not written"])
+    assert messages.status(snapshot(own_unit=True))["unit"] == "own"

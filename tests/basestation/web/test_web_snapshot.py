@@ -1,5 +1,7 @@
 """The status page's snapshot of a station that has flown."""
 
+import json
+import urllib.request
 from collections.abc import Callable
 from typing import Any
 
@@ -10,12 +12,15 @@ from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.grid.placed_map import placed_map
 from kiteline_basestation.job_kinds import run_job
 from kiteline_basestation.jobs import JobDone
+from kiteline_basestation.management import Command
 from kiteline_basestation.station import Station
 from kiteline_basestation.web import snapshot
 from kiteline_basestation.web.messages import status
 from kiteline_basestation.web.snapshot import empty_snapshot, take_snapshot
+from kiteline_basestation.web.status_page import StatusPage
 from kiteline_codec.channel import CodedChannel
 from kiteline_codec.sync.config import SyncConfig
+from kiteline_core.geometry import se3
 from kiteline_core.ids import AgentId
 
 S = 1_000_000_000
@@ -67,3 +72,58 @@ def test_overview_follows_a_flight(make_flight: Callable[..., Any], monkeypatch:
     assert {*map(tuple, some.tolist())} <= {*map(tuple, everything.points.tolist())}
     radius = np.linalg.norm(now.agents[0].path - now.agents[0].path.mean(axis=0), axis=1)
     np.testing.assert_allclose(radius, 1.2, atol=0.1)
+
+
+def station_with(*flights: Any) -> Station:
+    """A station that has received all records of one agent's flights."""
+    agent = CodedChannel(SyncConfig(), 1)
+    station = Station(BaseConfig(), lambda _: CodedChannel(SyncConfig(), 1))
+    for flight in flights:
+        for record in flight.all_records():
+            agent.put(record)
+    for tick in range(40):
+        now_ns = (tick + 1) * S // 10
+        for _, packets in station.step({AgentId(0): agent.poll(now_ns)}, (), now_ns).packets:
+            agent.receive(packets, now_ns)
+    return station
+
+
+def test_no_line_leads_from_one_submap_to_the_next(make_flight: Callable[..., Any]) -> None:
+    station = station_with(make_flight(keyframes=4, turns=0.1), make_flight(keyframes=3, turns=0.1, boot=2, seed=3))
+    mapper = station.mapper
+    mapper.placements.update({submap: np.eye(4) for submap in mapper.map.submaps})
+    path = take_snapshot(station, 5 * S, 0).agents[0].path
+    assert np.flatnonzero(np.isnan(path).all(axis=1)).tolist() == [4] and path.shape == (8, 3)
+
+
+@pytest.mark.parametrize("stereo", [True, False])
+def test_a_map_without_a_scale_says_so(make_flight: Callable[..., Any], stereo: bool) -> None:
+    now = take_snapshot(station_with(make_flight(keyframes=4, turns=0.1, stereo=stereo)), 5 * S, 0)
+    assert now.own_unit == now.agents[0].own_unit == (not stereo)
+
+
+def test_the_page_tells_what_is_wrong_with_the_base() -> None:
+    station = Station(BaseConfig(), lambda _: CodedChannel(SyncConfig(), 1))
+    page = StatusPage("127.0.0.1:0", 0)
+    try:
+        page.update(station, S, lambda: ["store maps: not written: the disk is full"])
+        with urllib.request.urlopen(f"{page.url}status.json", timeout=5) as answer:
+            assert json.load(answer)["troubles"] == ["store maps: not written: the disk is full"]
+    finally:
+        page.close()
+
+
+def test_points_are_taken_again_when_maps_move_or_go(make_flight: Callable[..., Any]) -> None:
+    """The page showed the landmarks of a deleted map, and those of a merged one at its old place."""
+    station = station_with(make_flight(keyframes=30, turns=0.5))
+    mapper = station.mapper
+    (submap,) = mapper.map.submaps
+    now = take_snapshot(station, 5 * S, 0)
+    assert take_snapshot(station, 6 * S, 0, now).points is now.points
+    mapper.placements[submap] = se3.from_rt(np.eye(3), np.array([100.0, 0.0, 0.0])) @ mapper.placements[submap]
+    moved = take_snapshot(station, 6 * S, 0, now)
+    np.testing.assert_allclose(moved.points[:, 0], now.points[:, 0] + 100.0)
+    assert (moved.map_revision, moved.layout) != (now.map_revision, now.layout)
+    station.step({}, (), 7 * S, [Command(1, "delete", '{"map": "0.1.0"}')])
+    gone = take_snapshot(station, 7 * S, 0, moved)
+    assert len(gone.points) == 0 and (gone.map_revision, gone.layout) != (moved.map_revision, moved.layout)

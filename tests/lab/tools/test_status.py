@@ -37,6 +37,9 @@ def test_lines_tell_agents_map_and_store() -> None:
     assert totals.startswith("keyframes 5, landmarks 70, loops 2, merges 0, mapped 0.0 m²") and "267 MiB" in totals
     assert head.split()[:3] == ["agent", "link", "quality"]
     assert first.split() == ["0", "live", "80", "0.00", "0.00", "0.00", "3", "40", "1", "120", "5", "-"]
+    own = report()
+    own["agents"][0]["unit"] = "own"
+    assert status.lines(own)[3].split()[3:8] == ["0.00", "0.00", "0.00", "(own", "unit)"]
     assert second.split()[:7] == ["7", "lost,", "3", "min", "-", "not", "placed"]  # what was long ago says nothing
 
 
