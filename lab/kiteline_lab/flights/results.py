@@ -25,6 +25,7 @@ _OTHER_UNIT = (
     "agent {}: {} poses are in another unit of length than those at the flight's end: they are in its files, and left "
     "out of accuracy and plot"
 )
+_MOST_PLACED = 0.95  # share of live poses in w: a few more come before the base's first answer
 
 
 def write_results(out: Path, plan: FlightPlan, outcome: FlightOutcome) -> Report:
@@ -51,15 +52,16 @@ def write_results(out: Path, plan: FlightPlan, outcome: FlightOutcome) -> Report
             "live": _accuracy(live, truth, alignment),
             "odometry": _accuracy(odometry, truth, alignment),
         }
-        label = f"agent {k}" if len(plan.sources) > 1 else ""
-        lines.append(Line(f"{label} live".strip(), _trajectory(live)))
+        label = f"agent {k} " if len(plan.sources) > 1 else ""
+        own_unit = alignment is TrajectoryAlignment.SIM3
+        lines.append(live_line(f"{label}live", judged, own_unit))
         drained: Report = dict(part["drain"]) if part is not None else {}
         if outcome.base is not None:
             T_b_c = Rectifier(source.rig).camera.T_b_c
             refined = refined_path(estimates, outcome.at_last_frame, T_b_c)
             write_tum(out / "base" / f"agent{k}.tum", refined)
             mine["accuracy"]["base"] = _accuracy(refined, truth, alignment)
-            lines.append(Line(f"{label} base".strip(), _trajectory(refined)))
+            lines.append(Line(f"{label}base", _trajectory(refined), own_unit))
             drained["accuracy"] = _accuracy(refined_path(estimates, outcome.drained, T_b_c), truth, alignment)
         report["agents"].append(mine)
         report["drain"]["agents"].append(drained)
@@ -116,6 +118,16 @@ def _from_log(source: FrameSource, estimates: Sequence[Estimate]) -> Report:
 def _trajectory(poses: Sequence[tuple[int, F64]]) -> Trajectory:
     t_ns = np.array([t for t, _ in poses], np.int64)
     return Trajectory(t_ns, np.array([pose for _, pose in poses], np.float64).reshape(-1, 4, 4))
+
+
+def live_line(name: str, estimates: Sequence[Estimate], own_unit: bool) -> Line:
+    """The live poses to draw: those in w alone if many are in a frame of their own, which fits nothing else."""
+    shown = [e for e in estimates if live_pose(e) is not None]
+    placed = [e for e in shown if e.T_w_b is not None]
+    if 0 < len(placed) < _MOST_PLACED * len(shown):
+        name += f", the {len(placed) / len(shown):.0%} in w"
+        shown = placed
+    return Line(name, _trajectory(_live(shown)), own_unit)
 
 
 def _accuracy(

@@ -7,7 +7,7 @@ import io
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -21,17 +21,21 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-COLOURS = ("#1f6fb2", "#d1495b", "#2a9d5c", "#8e5ea2", "#e08e20", "#3bb0bf")  # distinct for colour-blind readers too
+# Distinct for colour-blind readers too (Okabe and Ito, 2008).
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
+_DASHES: tuple[Any, ...] = ("-", (0, (4, 2)), "-.", ":")  # alternate, so that a line shows through one that covers it
+_LONGEST_TITLE = 100  # letters that fit above the panels
 TRUTH_COLOUR = "#9a9a9a"
 INK = "#333333"
 
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """One estimated trajectory and its name in the legend."""
+    """One estimated trajectory and its name in the legend. own_unit: its lengths are in no metres."""
 
     name: str
     trajectory: Trajectory
+    own_unit: bool = False
 
 
 def can_plot() -> bool:
@@ -44,7 +48,8 @@ def plot_trajectories(
 ) -> None:
     """Write a PNG, whatever the name ends in. truth: drawn in grey, and adds a panel of errors.
 
-    align: first align each line with the truth by rotation and translation (as ATE does), if enough poses match.
+    align: first align each line with the truth by rotation and translation, and by scale if it has a unit of its own
+    (as ATE does), if enough poses match.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -55,31 +60,36 @@ def plot_trajectories(
 
     figure = Figure(figsize=(11.0, 5.6), dpi=130, layout="constrained")
     FigureCanvasAgg(figure)
-    top, height, error = _panels(figure, with_error=truth is not None)
+    unit = "own unit of length" if truth is None and drawn and all(line.own_unit for line in drawn) else "m"
+    top, height, error = _panels(figure, unit, with_error=truth is not None)
+    top.set_xlabel("xyz"[across], fontsize=9, color=INK)
+    top.set_ylabel("xyz"[along], fontsize=9, color=INK)
     if truth is not None and len(truth.t_ns):
         shown = _during(truth, drawn)
         p = shown.T_w_b[:, :3, 3]
         top.plot(p[:, across], p[:, along], color=TRUTH_COLOUR, lw=2.6, label="truth", zorder=1)
         height.plot((shown.t_ns - start_ns) / 1e9, sign * p[:, up], color=TRUTH_COLOUR, lw=2.2, zorder=1)
-    errors: list[tuple[F64, F64, str]] = []
+    errors: list[tuple[F64, F64, dict[str, Any]]] = []
     for i, line in enumerate(drawn):
-        colour = COLOURS[i % len(COLOURS)]
+        dashes = _DASHES[(i % 2 + 2 * (i // len(COLOURS))) % len(_DASHES)]
+        style = {"color": COLOURS[i % len(COLOURS)], "ls": dashes}
         t_s = (line.trajectory.t_ns - start_ns) / 1e9
         p = line.trajectory.T_w_b[:, :3, 3]
         if len(p) == 0:
             continue
         _, path_xy = _with_gaps(t_s, p[:, [across, along]])
-        top.plot(path_xy[:, 0], path_xy[:, 1], color=colour, lw=1.3, label=_as_text(line.name), zorder=2)
-        top.plot(p[:1, across], p[:1, along], "o", color=colour, ms=5, zorder=3)
-        height.plot(*_with_gaps(t_s, sign * p[:, up]), color=colour, lw=1.2, zorder=2)
+        top.plot(path_xy[:, 0], path_xy[:, 1], lw=1.3, label=_as_text(line.name), zorder=2, **style)
+        top.plot(p[:1, across], p[:1, along], "o", color=style["color"], ms=5, zorder=3)
+        height.plot(*_with_gaps(t_s, sign * p[:, up]), lw=1.2, zorder=2, **style)
         if error is not None and truth is not None:
             i_est, true = truth_at(line.trajectory.t_ns, truth)
             distance = np.linalg.norm(p[i_est] - true[:, :3, 3], axis=1)
-            errors.append((t_s[i_est], distance, colour))
+            errors.append((t_s[i_est], distance, style))
     if error is not None:
         _draw_errors(error, errors)
     if title:
-        figure.suptitle(_as_text(title), x=0.01, ha="left", color=INK, fontsize=12, fontweight="bold")
+        short = title if len(title) <= _LONGEST_TITLE else f"…{title[-_LONGEST_TITLE:]}"
+        figure.suptitle(_as_text(short), x=0.01, ha="left", color=INK, fontsize=12, fontweight="bold")
     if top.get_legend_handles_labels()[0]:
         top.legend(frameon=False, fontsize=9, labelcolor=INK)
     png = io.BytesIO()
@@ -92,26 +102,26 @@ def _as_text(name: str) -> str:
     return name.encode(errors="backslashreplace").decode().replace("$", r"\$")
 
 
-def _panels(figure: Figure, *, with_error: bool) -> tuple[Axes, Axes, Axes | None]:
+def _panels(figure: Figure, unit: str, *, with_error: bool) -> tuple[Axes, Axes, Axes | None]:
     grid = figure.add_gridspec(2, 2, width_ratios=(1.15, 1.0))
     top = figure.add_subplot(grid[:, 0])
     height = figure.add_subplot(grid[0, 1] if with_error else grid[:, 1])
     error = figure.add_subplot(grid[1, 1], sharex=height) if with_error else None
     top.set_aspect("equal", adjustable="datalim")
-    _style(top, "from above, m", "")
-    _style(height, "height, m", "" if with_error else "time, s")
+    _style(top, f"from above, {unit}; dot: start", "")
+    _style(height, f"height, {unit}", "" if with_error else "time, s")
     if error is not None:
         _style(error, "", "time, s")
     return top, height, error
 
 
-def _draw_errors(axes: Axes, errors: Sequence[tuple[F64, F64, str]]) -> None:
-    """Draw distances in mm, cm or m, by the largest of them."""
+def _draw_errors(axes: Axes, errors: Sequence[tuple[F64, F64, dict[str, Any]]]) -> None:
+    """Draw distances in mm, cm or m, by the largest of them. errors: times in s, distances in m, and how to draw."""
     largest_m = max((float(off.max()) for _, off, _ in errors if len(off)), default=0.0)
     per_m, unit = (1e3, "mm") if largest_m < 0.1 else (1e2, "cm") if largest_m < 1.0 else (1.0, "m")
-    for t_s, off, colour in errors:
-        axes.plot(*_with_gaps(t_s, per_m * off), color=colour, lw=1.2)
-    axes.set_title(f"error, {unit}", loc="left", fontsize=10, color=INK)
+    for t_s, off, style in errors:
+        axes.plot(*_with_gaps(t_s, per_m * off), lw=1.2, **style)
+    axes.set_title(f"distance to the truth, {unit}", loc="left", fontsize=10, color=INK)
     axes.set_ylim(bottom=0.0)
 
 
@@ -129,10 +139,11 @@ def _style(axes: Axes, title: str, x: str) -> None:
 
 def _aligned(line: Line, truth: Trajectory) -> Line:
     try:
-        matched = match(line.trajectory, truth, TrajectoryAlignment.SE3)
+        matched = match(line.trajectory, truth, TrajectoryAlignment.SIM3 if line.own_unit else TrajectoryAlignment.SE3)
     except ValueError:
         return line
-    return Line(f"{line.name}  ({_length(position_errors(matched))})", Trajectory(matched.t_ns, matched.estimate))
+    told = f"ATE {_length(position_errors(matched))}" + (", scale fitted" if line.own_unit else "")
+    return Line(f"{line.name}  ({told})", Trajectory(matched.t_ns, matched.estimate), line.own_unit)
 
 
 def _length(errors: F64) -> str:

@@ -30,21 +30,26 @@ def evaluate_files(
 
         matched = metrics.match(est, true, alignment, max_difference_ns)
         line = Line("estimate", Trajectory(matched.t_ns, matched.estimate))
-        plot_trajectories(plot, [line], true, f"ATE {result.ate_m.rmse:.3f} m rmse over {result.path_m:.0f} m")
+        title = f"ATE {result.ate_m.rmse:.3f} m rmse over {result.path_m:.0f} m ({_fitted(result)})"
+        plot_trajectories(plot, [line], true, title)
     return result
 
 
-def table(e: Evaluation) -> str:
-    """The errors as a few lines of text."""
-    fitted = {
+def _fitted(e: Evaluation) -> str:
+    """How the estimate was aligned with the truth."""
+    return {
         "se3": "rotation and translation fitted",
         "sim3": f"scale {e.scale:.4f} fitted too",
         "origin": "on the first pose",
     }[e.alignment]
+
+
+def table(e: Evaluation) -> str:
+    """The errors as a few lines of text."""
     a = e.ate_m
     lines = [
         f"poses      {e.matched} of {e.estimated} matched; {e.coverage:.1%} of the time covered; path {e.path_m:.1f} m",
-        f"ATE        rmse {a.rmse:.4f} m   mean {a.mean:.4f} m   max {a.max:.4f} m   ({fitted})",
+        f"ATE        rmse {a.rmse:.4f} m   mean {a.mean:.4f} m   max {a.max:.4f} m   ({_fitted(e)})",
         _relative_line("RPE/frame", e.rpe_frame),
         _relative_line("RPE/s", e.rpe_second),
     ]

@@ -2,6 +2,7 @@ import errno
 import json
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -188,3 +189,48 @@ def test_a_plot_is_a_png_whatever_its_name_and_the_old_one_stays_on_a_full_disk(
     with pytest.raises(OSError, match="No space"):
         plot.plot_trajectories(tmp_path / "a.plot", line, title="new")
     assert [path.read_bytes() for path in tmp_path.iterdir()] == [content]
+
+
+def test_lines_in_a_unit_of_their_own_are_drawn_by_scale_and_say_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A flight of one camera without a scale was drawn beside the truth, with another error than in the report."""
+    drawn: dict[str, list[str]] = {"titles": [], "names": []}
+    monkeypatch.setattr(plot, "_style", lambda axes, title, x: drawn["titles"].append(title))
+    monkeypatch.setattr(plot, "_as_text", lambda name: (drawn["names"].append(name), name)[1])
+    poses = np.stack(arc(30))
+    truth = Trajectory(np.arange(30, dtype=np.int64) * 10**8, poses)
+    half = Trajectory(truth.t_ns, poses.copy())
+    half.T_w_b[:, :3, 3] *= 0.5
+    plot.plot_trajectories(tmp_path / "a.png", [plot.Line("live", half, own_unit=True)], truth, align=True)
+    assert drawn["names"] == ["live  (ATE 0.0 mm, scale fitted)"]
+    assert drawn["titles"][0] == "from above, m; dot: start"
+    plot.plot_trajectories(tmp_path / "a.png", [plot.Line("live", half, own_unit=True)])
+    assert drawn["titles"][3:] == ["from above, own unit of length; dot: start", "height, own unit of length"]
+
+
+def test_colours_of_lines_differ_for_colour_blind_readers() -> None:
+    """Red and green were one colour to one man in twelve."""
+    # Machado, Oliveira and Fernandes, 2009: red-, green- and blue-blind, on linear RGB.
+    blind = np.array(
+        [
+            [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]],
+            [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]],
+            [[1.255528, -0.076749, -0.178779], [-0.078411, 0.930809, 0.147602], [0.004733, 0.691367, 0.303900]],
+        ]
+    )
+    rgb = np.array([[int(colour[i : i + 2], 16) for i in (1, 3, 5)] for colour in plot.COLOURS]) / 255.0
+    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+    for seen in np.clip(np.einsum("bij,nj->bni", blind, linear), 0.0, 1.0):
+        coded = np.where(seen <= 0.0031308, 12.92 * seen, 1.055 * seen ** (1 / 2.4) - 0.055)
+        lab = cv2.cvtColor(np.asarray(coded[None], np.float32), cv2.COLOR_RGB2Lab)[0]
+        apart = np.linalg.norm(lab[:, None] - lab[None], axis=2)[np.triu_indices(len(lab), 1)]
+        assert apart.min() > 12.0
+
+
+def test_long_titles_are_not_cut_off(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[str] = []
+    monkeypatch.setattr(plot, "_as_text", lambda name: (told.append(name), name)[1])
+    line = [plot.Line("live", Trajectory(np.arange(3), np.tile(np.eye(4), (3, 1, 1))))]
+    plot.plot_trajectories(tmp_path / "a.png", line, title="mcap:" + 40 * "folder/" + "flight.mcap")
+    assert told[-1].startswith("…") and told[-1].endswith("/flight.mcap") and len(told[-1]) <= 101

@@ -17,7 +17,7 @@ from kiteline_lab.flights.flight_report import statistic, table, without_timing,
 from kiteline_lab.flights.fly import fly
 from kiteline_lab.flights.plan import Options
 from kiteline_lab.flights.refined_path import refined_path
-from kiteline_lab.flights.results import in_unit_of_end
+from kiteline_lab.flights.results import in_unit_of_end, live_line
 
 
 @dataclass(frozen=True)
@@ -208,3 +208,24 @@ def test_poses_in_another_unit_than_at_the_end_are_not_judged() -> None:
     assert [e.t_ns for e in in_unit_of_end(flown, own)] == [0, 1, 2, 6, 7]
     assert in_unit_of_end(flown, {"scale": "metric", "own_unit_submaps": []}) is flown
     assert in_unit_of_end(flown, {}) is flown
+
+
+@dataclass(frozen=True)
+class LivePose:
+    t_ns: int
+    T_m_b: F64
+    T_w_b: F64 | None
+    tracked: bool = True
+
+
+def test_live_poses_in_a_frame_of_their_own_are_not_drawn_among_those_in_the_world() -> None:
+    """A second agent's path led from where it began, in its own map, straight to where it was recognised."""
+    own, world = at(0, 0, 0, 0, 0, 0), at(5, 0, 0, 0, 0, 0)
+    late = [LivePose(t, own, world if t >= 60 else None) for t in range(100)]
+    line = live_line("agent 1 live", late, own_unit=False)  # type: ignore[arg-type]
+    assert line.name == "agent 1 live, the 40% in w" and line.trajectory.t_ns.tolist() == list(range(60, 100))
+    lone = [LivePose(t, own, None) for t in range(9)]
+    never = live_line("live", lone, own_unit=False)  # type: ignore[arg-type]
+    assert never.name == "live" and len(never.trajectory.t_ns) == 9
+    soon = live_line("live", late[59:], own_unit=True)  # type: ignore[arg-type]
+    assert soon.name == "live" and len(soon.trajectory.t_ns) == 41 and soon.own_unit
