@@ -131,6 +131,14 @@ def test_split_maps_are_not_merged_again(pair: Base, make_flight: MakeFlight) ->
     assert "nothing to be undone" in pair.ask("split", map="1.1.0")["error"]
 
 
+def test_split_maps_are_merged_again_where_a_user_asks_for_it(pair: Base) -> None:
+    """The search of `merge` passed over all that a split keeps apart, so that it never found anything."""
+    pair.ask("split", map="1.1.0")
+    assert pair.ask("merge", map="1.1.0", into="0.1.0") == {"merged": False, "looking": 20}
+    pair.rest()
+    assert ids(pair.ask("list")) == ["0.1.0"]
+
+
 def test_user_merges_maps_by_a_transform(make_flight: MakeFlight, words: Any) -> None:
     base = Base(words)
     a = make_flight(keyframes=14, turns=0.3)

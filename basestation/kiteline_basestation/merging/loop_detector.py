@@ -233,6 +233,13 @@ class LoopDetector:
         """True if a user has split the maps of two submaps."""
         return any((a in x and b in y) or (b in x and a in y) for x, y in self.kept_apart)
 
+    def stop_keeping_apart(self, a: Collection[SubmapId], b: Collection[SubmapId]) -> None:
+        """Let the submaps of two maps be matched again."""
+        one, other = frozenset(a), frozenset(b)
+        self.kept_apart = [
+            (x, y) for x, y in self.kept_apart if not ((x & one and y & other) or (x & other and y & one))
+        ]
+
     # -- acceptance --------------------------------------------------------------------------------------------------
 
     def _weigh(self, match: LoopMatch) -> LoopClosure | Contradiction | None:

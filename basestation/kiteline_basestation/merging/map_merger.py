@@ -175,15 +175,21 @@ class MapMerger:
 
     def search_overlap(self, newer: SubmapId, older: SubmapId) -> None:
         """Search the older map for every keyframe of the newer one; one match then suffices (a user's command)."""
+        self._allow(newer, older)
         self.detector.requested.add((min(newer, older), max(newer, older)))
         self._requery = list(dict.fromkeys([*self._requery, *keyframes_of(self._map, newer)]))
 
     def merge(self, newer: SubmapId, older: SubmapId, S_older_newer: F64) -> MergeResult:
         """Merge two maps as a user says: S_older_newer (4,4) moves the newer map in w."""
+        self._allow(newer, older)
         result = self._merge(LoopClosure(newer, older, S_older_newer))
         self._corrections.cancel_pending(older)
         self._corrections.request_bundle(older)
         return result
+
+    def _allow(self, newer: SubmapId, older: SubmapId) -> None:
+        """Forget that a user has split two maps."""
+        self.detector.stop_keeping_apart(self._map.submaps_of_map(newer), self._map.submaps_of_map(older))
 
     def merge_tied(self, tie: InertialTie) -> MergeResult:
         """Merge two maps between which inertial steps lead."""
