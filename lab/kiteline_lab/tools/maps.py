@@ -37,8 +37,8 @@ def parser() -> argparse.ArgumentParser:
     verbs = p.add_subparsers(dest="verb", required=True, metavar="VERB")
     verbs.add_parser("list", help="all maps", parents=[anywhere])
     one = {
-        "get": "one map, with the poses of its keyframes",
-        "split": "take a submap out of the map into which it was merged, for good",
+        "get": "one map; with --json the poses of its keyframes too",
+        "split": "take a submap out of the map into which it was merged, until `merge` asks for it",
         "delete": "delete a map",
     }
     for verb, what in one.items():
@@ -82,9 +82,12 @@ def query(a: argparse.Namespace) -> dict[str, Any]:
 
 
 def table(answer: Mapping[str, Any]) -> str:
-    """A reply as a table of text."""
-    if "maps" not in answer and "id" not in answer:
-        return json.dumps(answer)
+    """A reply as text: maps in a table."""
+    if "looking" in answer:
+        searched = f"{answer['looking']} keyframes are searched for in the other map"
+        return f"{searched}; `kiteline maps list` shows one map once a place is found"
+    if "deleted" in answer:
+        return f"deleted: {' '.join(answer['deleted'])}"
     rows = [("map", "name", "agents", "keyframes", "points", "placed", "unit", "submaps")]
     for m in answer.get("maps", [answer]):
         agents, submaps = ",".join(map(str, m["agents"])), " ".join(map(_submap, m["submaps"]))

@@ -125,3 +125,10 @@ def test_maps_are_listed_in_columns() -> None:
     for title, value in (("name", "hangar"), ("keyframes", "26"), ("unit", "metre")):
         assert head.index(title) == rows[0].index(value)
     assert names[1] in rows[1]
+
+
+def test_replies_about_maps_are_sentences() -> None:
+    assert maps.table({"deleted": ["0.1.0", "0.2.1"]}) == "deleted: 0.1.0 0.2.1"
+    assert maps.table({"merged": False, "looking": 60}).startswith("60 keyframes are searched for in the other map")
+    with pytest.raises(KeyError):
+        maps.table({"what": "else"})
