@@ -13,4 +13,5 @@ def map_files(mapper: Mapper) -> dict[str, bytes]:
     placed = placed_map(mapper.map, mapper.placements)
     labels = mapper.labels(mapper.map.find_landmarks(placed.landmark_ids))
     views = np.bincount(placed.observations[:, 1], minlength=len(placed.points)).astype(np.int64)
-    return {"map.ply": map_ply(placed.points, labels, views), **grid_files(mapper.settled_grid())}
+    metric = bool(placed.metric.any()) or not len(placed.metric)
+    return {"map.ply": map_ply(placed.points, labels, views, metric=metric), **grid_files(mapper.settled_grid())}

@@ -17,9 +17,10 @@ LABEL_COLOURS: U8 = np.array([[150, 150, 150], [88, 160, 96], [214, 96, 60]], np
 _VERTEX = np.dtype([("xyz", "<f4", 3), ("rgb", "u1", 3), ("label", "u1"), ("observations", "<u2")])
 
 
-def map_ply(points: F64, labels: U8, observations: I64, colours: U8 | None = None) -> bytes:
-    """Map points as a binary PLY. points: (n,3) in w, m. labels: (n,) 0 unlabelled, 1 ground, 2 obstacle.
+def map_ply(points: F64, labels: U8, observations: I64, colours: U8 | None = None, *, metric: bool = True) -> bytes:
+    """Map points as a binary PLY. points: (n,3) in w, m or, if not metric, in the map's own unit.
 
+    labels: (n,) 0 unlabelled, 1 ground, 2 obstacle.
     observations: (n,) how many keyframes see each point. colours: (n,3) RGB; by label when not given. Raises ValueError
     when the lengths differ.
     """
@@ -31,9 +32,10 @@ def map_ply(points: F64, labels: U8, observations: I64, colours: U8 | None = Non
     vertex["rgb"] = LABEL_COLOURS[np.minimum(labels, 2)] if colours is None else colours
     vertex["label"] = labels
     vertex["observations"] = np.minimum(observations, 65535)
+    unit = "metres" if metric else "own unit of length"
     header = (
         "ply\nformat binary_little_endian 1.0\n"
-        "comment map points in w, metres, z up; label 0 unlabelled, 1 ground, 2 obstacle\n"
+        f"comment map points in w, {unit}, z up; label 0 unlabelled, 1 ground, 2 obstacle\n"
         f"element vertex {n}\n"
         "property float x\nproperty float y\nproperty float z\n"
         "property uchar red\nproperty uchar green\nproperty uchar blue\n"

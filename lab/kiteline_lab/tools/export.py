@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from kiteline_basestation.config import BaseConfig
+from kiteline_basestation.management import submap_name
 from kiteline_basestation.mapper import Mapper
 from kiteline_basestation.runtime.flight_summary import keyframe_poses
 from kiteline_basestation.runtime.map_files import map_files
@@ -27,7 +28,9 @@ from kiteline_core.ids import (
     NO_KEYFRAME,
     AgentId,
     KeyframeId,
+    SubmapId,
     agent_of_keyframe,
+    agent_of_submap,
     boot_of_submap,
     submap_of_keyframe,
 )
@@ -79,6 +82,8 @@ def _trajectory(mapper: Mapper, agent: int | None, boot: int | None) -> bytes:
     here = sorted({int(agent_of_keyframe(k)) for k in poses})
     if agent is None and len(here) > 1:
         raise ExportError(f"the map holds agents {here}: choose one with --agent")
+    if agent is not None and agent not in here and any(agent_of_submap(s) == agent for s in mapper.map.submaps):
+        raise ExportError(f"no map of agent {agent} has a place in w: it has not matched the one that has")
     if agent is not None and agent not in here:
         raise ExportError(f"the map holds agents {here}, none with number {agent}")
     mine = [k for k in poses if agent is None or agent_of_keyframe(k) == AgentId(agent)]
@@ -118,6 +123,18 @@ def _graph(mapper: Mapper) -> bytes:
     return g2o(np.array(list(poses), np.int64), rigid, edges, scale=scale)
 
 
+def _left_out(mapper: Mapper) -> list[str]:
+    """Maps that are in no file, as nothing tells where they lie; a line each."""
+    sparse_map, lost = mapper.map, dict[SubmapId, int]()
+    for submap in sorted(sparse_map.submaps.keys() - mapper.placements.keys()):
+        map_id = sparse_map.map_id(submap)
+        lost[map_id] = lost.get(map_id, 0) + len(sparse_map.submaps[submap])
+    return [
+        f"left out: map {submap_name(map_id)} ({n} keyframe{'s' * (n != 1)}) has no place in w"
+        for map_id, n in lost.items()
+    ]
+
+
 def main(argv: Sequence[str]) -> int:
     """Run `kiteline export`; the exit status. Raises KitelineError."""
     parser = argparse.ArgumentParser(prog="kiteline export", description="A base's map in the formats of other tools.")
@@ -130,7 +147,12 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("--boot", type=int, help="tum: of which start; needed if a recording was flown several times")
     parser.add_argument("--force", action="store_true", help="overwrite F, and the file beside it")
     args = parser.parse_args(argv)
-    made = files(load(args.store), args.format, args.out.name, args.agent, args.boot)
+    mapper = load(args.store)
+    if not len(mapper.map):
+        raise ExportError(f"{args.store}: the map is empty: there is nothing to export")
+    for line in _left_out(mapper):
+        print(f"{args.store}: {line}", file=sys.stderr)
+    made = files(mapper, args.format, args.out.name, args.agent, args.boot)
     for path in write_files(args.out.parent, made, force=args.force):
         print(path)
     return 0

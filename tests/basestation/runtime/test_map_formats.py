@@ -42,7 +42,9 @@ def test_ply_wants_one_label_a_point() -> None:
 
 def test_ply_of_nothing_is_a_ply() -> None:
     data = map_formats.map_ply(np.zeros((0, 3)), np.zeros(0, np.uint8), np.zeros(0, np.int64))
-    assert data.startswith(b"ply\n") and data.endswith(b"end_header\n")
+    assert data.startswith(b"ply\n") and data.endswith(b"end_header\n") and b" metres," in data
+    own = map_formats.map_ply(np.zeros((0, 3)), np.zeros(0, np.uint8), np.zeros(0, np.int64), metric=False)
+    assert b"metres" not in own and b"own unit of length" in own
 
 
 @given(st.lists(st.integers(0, 2**62), min_size=1, max_size=4, unique=True))

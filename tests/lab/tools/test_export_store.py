@@ -22,7 +22,7 @@ from kiteline_core.ids import NO_KEYFRAME, AgentId, keyframe_id, submap_id
 from kiteline_hw.ports import SourceError
 from kiteline_lab.evaluation import trajectories
 from kiteline_lab.grids.files import read_grid
-from kiteline_lab.tools.export import ExportError, files, main
+from kiteline_lab.tools.export import FORMATS, ExportError, files, main
 from tests.basestation.conftest import fly, room
 
 LEVEL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # a camera that looks along x
@@ -105,14 +105,35 @@ def test_ply_and_grid_are_readable(mapper: Mapper, tmp_path: Path) -> None:
     assert b"element vertex 0\n" in made["a.ply"]  # each landmark has one observation
 
 
-def test_command_reads_a_store(mapper: Mapper, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    codes = {messages.key(r): messages.encode(r) for r in records(0)}
-    placed = SubmapPlacement(submap_id(0, 1, 0), np.eye(4))
-    own = {messages.key(placed): messages.encode(placed)}
-    state = MapperState(placements=PlacementState({submap_id(0, 1, 0): np.eye(4)}))
-    store = Store(tmp_path)
-    store.write(batch_of(SavedMap({AgentId(0): SavedValues(codes, own)}, texts_of(state)), SavedMap()))
+def keep(folder: Path, *agents: int) -> None:
+    """Write a store with the keyframes of agents; the map of the first one is placed."""
+    saved = {}
+    for agent in agents:
+        codes = {messages.key(r): messages.encode(r) for r in records(agent)}
+        placed = [SubmapPlacement(submap_id(agent, 1, 0), np.eye(4))] if agent == agents[0] else []
+        saved[AgentId(agent)] = SavedValues(codes, {messages.key(p): messages.encode(p) for p in placed})
+    state = MapperState(placements=PlacementState({submap_id(agent, 1, 0): np.eye(4) for agent in agents[:1]}))
+    store = Store(folder)
+    store.write(batch_of(SavedMap(saved, texts_of(state)), SavedMap()))
     store.close()
+
+
+def test_what_no_file_can_hold_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Maps without a place were left out, and an empty map was written, without a word."""
+    keep(tmp_path / "two", 0, 3)
+    assert main([str(tmp_path / "two"), "--format", "tum", "--out", str(tmp_path / "a.tum")]) == 0
+    assert "left out: map 3.1.0 (3 keyframes) has no place in w" in capsys.readouterr().err
+    with pytest.raises(ExportError, match="no map of agent 3 has a place in w"):
+        main([str(tmp_path / "two"), "--format", "tum", "--agent", "3", "--out", str(tmp_path / "b.tum")])
+    keep(tmp_path / "none")
+    for kind in FORMATS:
+        with pytest.raises(ExportError, match="the map is empty"):
+            main([str(tmp_path / "none"), "--format", kind, "--out", str(tmp_path / "none.pgm")])
+    assert not (tmp_path / "none.pgm").exists()
+
+
+def test_command_reads_a_store(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    keep(tmp_path, 0)
     assert main([str(tmp_path), "--format", "tum", "--out", str(tmp_path / "new" / "a.tum")]) == 0
     assert capsys.readouterr().out.strip() == str(tmp_path / "new" / "a.tum")
     found = trajectories.read(str(tmp_path / "new" / "a.tum")).trajectory.T_w_b[:, :3, 3]
@@ -135,9 +156,7 @@ def test_a_picture_of_any_name_is_found_again(name: str, mapper: Mapper, tmp_pat
 def test_what_no_disk_takes_leaves_the_file_as_it_was(
     mapper: Mapper, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    store = Store(tmp_path)
-    store.write(batch_of(SavedMap({AgentId(0): SavedValues({}, {})}, texts_of(MapperState())), SavedMap()))
-    store.close()
+    keep(tmp_path, 0)
     out = tmp_path / "out" / "map.ply"
     assert main([str(tmp_path), "--format", "ply", "--out", str(out)]) == 0
     before = out.read_bytes()
