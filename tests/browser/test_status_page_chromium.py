@@ -188,7 +188,7 @@ def test_units_places_and_troubles_are_written(browser: Browser) -> None:
     first, second = now.agents
     now = replace(
         now, agents=(replace(first, own_unit=True), replace(second, T_w_c=None, path=second.path[:0])),
-        troubles=("store maps: not written: the disk is full",), own_unit=True,
+        troubles=("store maps: not written: the disk is full",), own_unit=True, grid=replace(now.grid, others=1),
     )  # fmt: skip
     handle = serve("127.0.0.1", 0, lambda: now)
     try:
@@ -197,6 +197,7 @@ def test_units_places_and_troubles_are_written(browser: Browser) -> None:
         browser.wait("document.getElementById('troubles').innerText", "store maps: not written: the disk is full")
         browser.wait("[...document.querySelectorAll('.pose dt')].map(n => n.textContent).slice(0, 5).join()",
                      "x,y,z,heading,x, m")  # fmt: skip
+        browser.wait("document.getElementById('storeys').innerText", "grid: the main one of 2 storeys")
         browser.wait("document.querySelectorAll('.note')[0].textContent.startsWith('Own unit of length')", "True")
         browser.wait("document.querySelectorAll('.note')[1].textContent.startsWith('Not placed')", "True")
         now = replace(now, agents=now.agents[1:], points=now.points[:0], labels=now.labels[:0], grid=GridView(0.05),

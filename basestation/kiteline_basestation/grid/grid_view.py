@@ -32,13 +32,14 @@ class CodedTile(NamedTuple):
 class GridView:
     """The grid at one instant, for other threads. Its tiles are those with known cells.
 
-    storey: the one with most scans.
+    storey: the one with most scans. others: how many storeys lie apart from it.
     """
 
     cell_m: float
     revision: int = 0
     storey: int = 0
     tiles: Mapping[Place, CodedTile] = field(default_factory=dict)
+    others: int = 0
 
     def known_m2(self) -> float:
         """Area of the known cells of the main storey."""
@@ -86,7 +87,8 @@ class GridViews:
                 record = GridTile(place.column, place.row, place.storey, last.cell_m, cells)
                 new = CodedTile(messages.encode(record), known)
                 tiles[place] = held if held == new and held is not None else new
-        self._last = GridView(last.cell_m, grid.revision, grid.main_storey(), tiles)
+        others = len(grid.separate_storeys())
+        self._last = GridView(last.cell_m, grid.revision, grid.main_storey(), tiles, others)
         return self._last
 
 

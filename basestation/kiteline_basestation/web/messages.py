@@ -39,6 +39,7 @@ def status(now: PageSnapshot, before: PageSnapshot | None = None) -> dict[str, A
         "totals": as_json(TOTALS, now),
         "troubles": list(now.troubles),
         "unit": _unit(now.own_unit),
+        "other_storeys": now.grid.others,
         "map_revision": now.map_revision,
     }
 

@@ -75,6 +75,8 @@ function show(status) {
   $("none").hidden = many > 0;
   for (const agent of status.agents) fill(card(agent.agent), agent);
   showTroubles(status.troubles);
+  $("storeys").hidden = status.other_storeys === 0;
+  write($("storeys"), `grid: the main one of ${status.other_storeys + 1} storeys`);
   view.own_unit = status.unit === "own";
   view.agents(status.agents);
 }

@@ -8,7 +8,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from kiteline_basestation.grid import scan_kernels as kernels
-from kiteline_basestation.grid.grid_view import dense, grid_files
+from kiteline_basestation.grid.grid_view import GridViews, dense, grid_files
 from kiteline_basestation.grid.kept_scan import keep
 from kiteline_basestation.grid.scan_grid import ScanGrid, ViewWeights
 from kiteline_core.arrays import F64, I64, U8, U16
@@ -121,6 +121,7 @@ def test_storeys_lie_apart_and_a_ramp_joins_them() -> None:
         grid.put(100 + k, kept(scan_of(np.array(box(-2.0, -2.0, 2.0, 2.0)), 0.0, 0.0, k)), camera(0.0, 0.0, k, z=2.8))
     assert {p.storey for p in grid.places} == {0, 1}
     assert grid.main_storey() == 0 and grid.separate_storeys() == [1]
+    assert GridViews(grid).take().others == 1
     alone = drawn(scans)
     for place in alone.places:
         assert np.array_equal(grid.log_odds(place), alone.log_odds(place))
