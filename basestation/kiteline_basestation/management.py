@@ -5,7 +5,7 @@ named AGENT.BOOT.NUMBER; a map by any of its submaps, or by a name that a user g
 """
 
 import json
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -71,8 +71,17 @@ class MapManager:
         self._merger = merger
         self._delete_submaps = delete
 
-    def answer(self, command: Command, now_ns: int) -> tuple[Answer, MergeResult]:
-        """Carry a command out, or refuse it with a reason. Returns what it changed in whole maps as well."""
+    def carry_out(
+        self, commands: Sequence[Command], now_ns: int
+    ) -> tuple[Callable[[], tuple[Answer, ...]], MergeResult]:
+        """Carry commands out, or refuse them with a reason.
+
+        Returns what tells the answers once the step's changes are applied, and what the commands changed in whole maps.
+        """
+        done = [self._carry_out(command, now_ns) for command in commands]
+        return lambda: tuple(tell() for tell, _ in done), sum((changes for _, changes in done), NOTHING)
+
+    def _carry_out(self, command: Command, now_ns: int) -> tuple[Callable[[], Answer], MergeResult]:
         try:
             if command.verb not in VERBS:
                 raise _Refused(f"no command {command.verb!r}; there are: {', '.join(VERBS)}")
@@ -88,11 +97,12 @@ class MapManager:
             if unknown := sorted(given.keys() - set(allowed)):
                 raise _Refused(f"unknown key {unknown[0]!r}; {command.verb} takes: {', '.join(allowed) or 'nothing'}")
             out, changes = verb(self, given, now_ns)
-            return Answer(command.id, True, json.dumps(out)), changes
+            return lambda: Answer(command.id, True, json.dumps(out() if callable(out) else out)), changes
         except _Refused as error:
-            return Answer(command.id, False, json.dumps({"error": str(error)})), NOTHING
+            refusal = Answer(command.id, False, json.dumps({"error": str(error)}))
+            return lambda: refusal, NOTHING
 
-    # -- verbs: arguments and the time in ns -> JSON value, changes ----------------------------------------------------
+    # -- verbs: arguments and the time in ns -> JSON value, or what makes it after the step; changes ---------------
 
     def _list(self, given: Mapping[str, Json], now_ns: int) -> tuple[Json, MergeResult]:
         points = self._map.live_by_submap()
@@ -146,7 +156,7 @@ class MapManager:
             raise _Refused(f"{submap_name(other)} is in metres: it is merged without a scale")
         into_pose, other_pose = self._map.submap_pose(into), self._map.submap_pose(other)
         changes = merger.merge(other, into, sim3.normalise(into_pose @ S @ sim3.inverse(other_pose)))
-        return {"merged": True, **self._overview(into, self._map.live_by_submap())}, changes
+        return lambda: {"merged": True, **self._overview(into, self._map.live_by_submap())}, changes
 
     def _split(self, given: Mapping[str, Json], now_ns: int) -> tuple[Json, MergeResult]:
         merger = self._required_merger()
@@ -155,8 +165,8 @@ class MapManager:
         changes = merger.split(submap)
         if changes is None:
             raise _Refused(f"{submap_name(submap)} was not merged into another map: there is nothing to be undone")
-        points = self._map.live_by_submap()
-        return {"maps": [self._overview(m, points) for m in (map_id, self._map.map_id(submap))]}, changes
+        both = (map_id, self._map.map_id(submap))
+        return lambda: {"maps": [self._overview(m, self._map.live_by_submap()) for m in both]}, changes
 
     def _delete(self, given: Mapping[str, Json], now_ns: int) -> tuple[Json, MergeResult]:
         submaps = self._map.submaps_of_map(self._named_map(given, "map"))
@@ -221,7 +231,7 @@ class MapManager:
         }
 
 
-_Verb = Callable[[MapManager, Mapping[str, Json], int], tuple[Json, MergeResult]]
+_Verb = Callable[[MapManager, Mapping[str, Json], int], tuple[Json, MergeResult]]  # Json: or a function that makes it
 # Verbs, and the keys that each takes.
 VERBS: dict[str, tuple[_Verb, tuple[str, ...]]] = {
     "list": (MapManager._list, ()),

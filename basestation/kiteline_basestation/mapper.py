@@ -127,11 +127,8 @@ class Mapper:
                 changed = self._finish[done.kind](done, now_ns)
                 self._local_bundles.void(changed.moved, changed.bent)  # whose results may be the next ones
                 changes += changed
-        answers = []
-        for command in given.commands:
-            answer, changed = self._manager.answer(command, now_ns)
-            answers.append(answer)
-            changes += changed
+        tell, changed = self._manager.carry_out(given.commands, now_ns)
+        changes += changed
         # 3. Refine the map with each new keyframe, and search for loop closures and merges.
         ready = self._intake.ready(now_ns)
         self._placements.tell_rooted()
@@ -154,7 +151,7 @@ class Mapper:
             jobs += self.merger.jobs(now_ns)
         # 7. Publish the values that changed and for which there is room.
         urgent, published = self._publisher.take_urgent(), self._publisher.collect(dict(given.room_bytes))
-        return MapperOutput(published, tuple(jobs), tuple(answers), withdrawn, self._publisher.unfinished, urgent)
+        return MapperOutput(published, tuple(jobs), tell(), withdrawn, self._publisher.unfinished, urgent)
 
     def adopt(self, record: Record) -> None:
         """Replace a published value by its quantised code, as the agent will hold it, unless it changed meanwhile."""

@@ -131,6 +131,24 @@ def test_split_maps_are_not_merged_again(pair: Base, make_flight: MakeFlight) ->
     assert "nothing to be undone" in pair.ask("split", map="1.1.0")["error"]
 
 
+def test_replies_tell_what_the_command_made_of_the_maps(pair: Base) -> None:
+    """The reply to a split called the map placed, and that to a merge told where its submaps lay before."""
+    assert pair.ask("split", map="1.1.0") == pair.ask("list")
+    merged = pair.ask("merge", map="1.1.0", into="0.1.0", T_into_map=ELSEWHERE.ravel().tolist())
+    (told,) = pair.ask("list")["maps"]
+    assert merged == {"merged": True, **told}
+
+
+def test_a_map_that_is_deleted_in_the_step_of_its_split_does_no_harm(pair: Base) -> None:
+    commands = [Command(1, "split", '{"map": "1.1.0"}'), Command(2, "delete", '{"map": "1.1.0"}')]
+    split, deleted = pair.step(commands=commands)
+    assert split.ok and deleted.ok
+    assert ids(pair.ask("list")) == ["0.1.0"]
+    T = json.dumps({"map": "0.1.0", "into": "1.1.0"})
+    (refused,) = pair.step(commands=[Command(3, "merge", T)])
+    assert not refused.ok
+
+
 def test_split_maps_are_merged_again_where_a_user_asks_for_it(pair: Base) -> None:
     """The search of `merge` passed over all that a split keeps apart, so that it never found anything."""
     pair.ask("split", map="1.1.0")
