@@ -261,6 +261,11 @@ def test_nothing_overlaps(browser: Browser, width: int, height: int) -> None:
             browser.text("(() => {" + overlapping.replace("boxes.some((a, i)", "return boxes.some((a, i)") + "})()")
             == "False"
         )
+        browser.text("document.getElementById('state').textContent = 'no connection to the base'")
+        browser.text("document.getElementById('since').textContent = '· data 23 min 12 s old'")
+        for wide in ("#link", "header", "main", ".quality .value"):
+            right = f"document.querySelector('{wide}').getBoundingClientRect().right"
+            assert browser.text(f"{right} <= innerWidth") == "True", wide
         assert browser.text("document.documentElement.scrollWidth <= innerWidth") == "True"
         lowest = "document.getElementById('canvas').getBoundingClientRect().bottom"
         assert width > 820 or browser.text(f"{lowest} < innerHeight - 40") == "True"

@@ -59,7 +59,7 @@ function stale(name, text) {
   if (last_ms) since((performance.now() - last_ms) / 1000);
 }
 
-function since(silent_s) { write($("since"), `: what is shown is ${duration(silent_s)} old`); }
+function since(silent_s) { write($("since"), `· data ${duration(silent_s)} old`); }
 
 function show(status) {
   state("live", "connected");
