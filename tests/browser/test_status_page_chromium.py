@@ -186,20 +186,24 @@ def test_what_is_old_is_shown_as_old_and_another_base_starts_afresh(browser: Bro
 def test_units_places_and_troubles_are_written(browser: Browser) -> None:
     now = room()
     first, second = now.agents
+    failed = replace(second, agent=AgentId(5), last_packet_ns=now.now_ns, path=second.path[:0])
     now = replace(
-        now, agents=(replace(first, own_unit=True), replace(second, T_w_c=None, path=second.path[:0])),
+        now, agents=(replace(first, own_unit=True), replace(second, T_w_c=None, path=second.path[:0]), failed),
         troubles=("store maps: not written: the disk is full",), own_unit=True, grid=replace(now.grid, others=1),
     )  # fmt: skip
     handle = serve("127.0.0.1", 0, lambda: now)
     try:
         browser.call("Page.navigate", url=handle.url)
-        browser.wait("document.querySelectorAll('article').length", "2")
+        browser.wait("document.querySelectorAll('article').length", "3")
         browser.wait("document.getElementById('troubles').innerText", "store maps: not written: the disk is full")
         browser.wait("[...document.querySelectorAll('.pose dt')].map(n => n.textContent).slice(0, 5).join()",
                      "x,y,z,heading,x, m")  # fmt: skip
         browser.wait("document.getElementById('storeys').innerText", "grid: the main one of 2 storeys")
         browser.wait("document.querySelectorAll('.note')[0].textContent.startsWith('Own unit of length')", "True")
         browser.wait("document.querySelectorAll('.note')[1].textContent.startsWith('Not placed')", "True")
+        browser.wait("document.querySelectorAll('.note')[2].textContent", "Tracking failed: the position is a guess.")
+        browser.wait("document.querySelectorAll('.quality .value')[2].clientHeight"
+                     " === document.querySelectorAll('.quality .value')[0].clientHeight", "True")  # fmt: skip
         now = replace(now, agents=now.agents[1:], points=now.points[:0], labels=now.labels[:0], grid=GridView(0.05),
                       map_revision=2)  # fmt: skip
         browser.wait("document.getElementById('empty').innerText", "No map has a place in the world yet")

@@ -154,6 +154,7 @@ function fill({ node, rates }, a) {
   [...node.querySelectorAll(".pose dd")].forEach((dd, i) => write(dd, values[i]));
   const mapped = a.counts.some(({ label, value }) => label === "Keyframes" && value > 0);
   const notes = [];
+  if (failed && a.position) notes.push("Tracking failed: the position is a guess.");
   if (mapped && !a.position) notes.push("Not placed: its map has not matched the one that is shown.");
   if (mapped && own) notes.push("Own unit of length: one camera that knows no scale.");
   write(node.querySelector(".note"), notes.join(" "));
