@@ -16,7 +16,8 @@ Yaml = dict[str, str | list[float]]
 
 _MOST_BYTES = 1 << 28  # of a table: hours of samples
 _MOST_YAML_BYTES = 1 << 16  # sensor files have a few kB
-_MOST_S, _MOST_DIGITS = 9_000_000_000, 10  # of a time: as many as fit 64 bits as ns
+_MOST_NS, _MOST_DIGITS = 9 * 10**18, 18  # of a time: as many as fit 64 bits
+_FINER = ((10**18, 1), (10**15, 1_000))  # least time since 1970 (2001) in ns and in us; ns in the unit
 _NO_LIST = frozenset("[:")
 _KEY = re.compile(r"[A-Za-z_][\w./-]*")
 
@@ -41,10 +42,11 @@ def listed_file(folder: Path, name: str, listing: Path) -> Path:
 
 
 def nanoseconds(text: str) -> int:
-    """A time in whole ns, below 2^63. Raises ValueError."""
-    if not (text.isascii() and text.isdecimal() and len(text) <= 19 and int(text) < 1 << 63):
+    """A time in whole ns, below 2^63; zeros may follow after a decimal point. Raises ValueError."""
+    whole, _, rest = text.partition(".")
+    if not (whole.isascii() and whole.isdecimal() and len(whole) <= 19 and int(whole) < 1 << 63) or rest.strip("0"):
         raise ValueError(f"{text[:40]!r} is no time in nanoseconds")
-    return int(text)
+    return int(whole)
 
 
 def read_rows(path: Path, what: str, separator: str | None = None) -> Iterator[list[str]]:
@@ -67,14 +69,18 @@ def row_values(cells: list[str], path: Path, count: int) -> F64:
 
 
 def seconds_to_ns(text: str) -> int:
-    """Exact nanoseconds of decimal seconds ("1305031102.175304", "1.04e-1"). Raises ValueError."""
+    """Exact nanoseconds of decimal seconds ("1305031102.175304", "1.04e-1"); of ns or us since 1970, which are too
+    large for seconds (ORB-SLAM3 writes ns for EuRoC's flights). Raises ValueError.
+    """
     try:
         value = Decimal(text)
     except InvalidOperation as error:
         raise ValueError(f"{text[:40]!r} is no time in seconds") from error
-    if not value.is_finite() or value.adjusted() > _MOST_DIGITS or abs(value) > _MOST_S:
-        raise ValueError(f"{text[:40]!r} is no time in seconds")
-    return int((value * 1_000_000_000).to_integral_value())
+    if value.is_finite() and value.adjusted() <= _MOST_DIGITS:
+        unit_ns = next((unit for least, unit in _FINER if value >= least), 1_000_000_000)
+        if abs(value) * unit_ns <= _MOST_NS:
+            return int((value * unit_ns).to_integral_value())
+    raise ValueError(f"{text[:40]!r} is no time in seconds")
 
 
 def read_yaml(path: Path, what: str) -> Yaml:

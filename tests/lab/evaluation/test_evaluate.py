@@ -54,9 +54,25 @@ def test_euroc_table(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    "line",
+    [
+        "1403715273262142976.0000000000,0.1,0.2,0.3,0.8,0,0,0.6\n",  # ORB-SLAM3's truth of EuRoC's flights
+        "1403715273262142976.000000 0.1 0.2 0.3 0 0 0.6 0.8\n",  # its trajectories of these
+        "1403715273262142.976 0.1 0.2 0.3 0 0 0.6 0.8\n",  # us, as cameras' own software writes
+    ],
+)
+def test_times_of_other_programs_are_read(line: str, tmp_path: Path) -> None:
+    (tmp_path / "a.txt").write_text(line)
+    t = read(str(tmp_path / "a.txt")).trajectory
+    assert t.t_ns.tolist() == [1403715273262142976]
+    np.testing.assert_allclose(t.T_w_b[0, :3, 0], [0.28, 0.96, 0.0], atol=1e-12)
+
+
+@pytest.mark.parametrize(
     ("text", "words"),
     [
         ("", "holds no pose"),
+        ("1403715273262142976.5,0,0,0,1,0,0,0\n", "no time in nanoseconds"),
         ("a b c\n", "line 1 has 3 columns"),
         (TUM + "1403715273.4 0.1 0.2\n", "line 3 has 3 columns"),
         (TUM + "1403715273.3 0 0 0 0 0 0 1\n", "line 3: its time is not after"),
