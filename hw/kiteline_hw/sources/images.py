@@ -2,8 +2,9 @@
 
 The calibration is read from camera.yaml beside the images or one folder above: fx, fy, cx, cy, width, height, optional
 k1 k2 p1 p2 k3, for a pair baseline_m, and rate_hz (default 10) if the file names are no stamps. A name of 16 or more
-digits is a stamp in ns, one with a decimal point a stamp in seconds. Other images are in the order of the numbers in
-their names. Left and right images are paired by their stamps, else by the numbers that vary in their names.
+digits is a stamp in ns, of 16 or 13 digits one in us or ms since 1970, with a decimal point one in seconds. Other
+images are in the order of the numbers in their names. Left and right images are paired by their stamps, else by the
+numbers that vary in their names.
 """
 
 import glob
@@ -25,6 +26,9 @@ from kiteline_hw.sources.recording import Recording, Stamped, frames_by_key, ima
 from kiteline_hw.sources.text_files import read_yaml, seconds_to_ns, yaml_number
 
 _UNSTAMPED_HZ = 10.0  # rate of images whose names are no stamps
+_STAMP_DIGITS = 16  # of a name that is a stamp in ns, at least
+_UNITS = ((15, 1_000), (12, 1_000_000))  # power of ten of a time since 1970 in us and ms (2001 to 2286); ns in the unit
+_MOST_APART_NS = 10_000_000_000  # ns between two images in the median: farther apart, the unit is a smaller one
 
 
 def open_source(pattern: str, mono: bool, imu: bool, given: FileCalibration | None = None) -> Recording:
@@ -102,10 +106,24 @@ def _list_files(pattern: str) -> list[Path]:
 def _stamped(files: list[Path]) -> Stamped:
     """Files with their stamps in ns, in order of time; empty if a name is no stamp."""
     try:
-        if all(path.stem.isdecimal() and len(path.stem) >= 16 for path in files):
-            return sorted((int(path.stem), path) for path in files)
+        if all(path.stem.isdecimal() for path in files):
+            numbers = sorted((int(path.stem), path) for path in files)
+            unit_ns = _unit_since_1970([number for number, _ in numbers])
+            if unit_ns or all(len(path.stem) >= _STAMP_DIGITS for path in files):
+                return [(number * (unit_ns or 1), path) for number, path in numbers]
         if all("." in path.stem for path in files):
             return sorted((seconds_to_ns(path.stem), path) for path in files)
     except ValueError:
         pass
     return []
+
+
+def _unit_since_1970(numbers: list[int]) -> int:
+    """ns in the unit of these increasing times since 1970, us or ms; 0 if they are none. A smaller unit since a
+    computer's start can have as many digits, but then images would be minutes apart.
+    """
+    apart = float(np.median(np.diff(numbers))) if len(numbers) > 1 else 0.0
+    for power, unit_ns in _UNITS:
+        if 10**power <= numbers[0] and numbers[-1] < 10 ** (power + 1) and apart * unit_ns < _MOST_APART_NS:
+            return unit_ns
+    return 0
