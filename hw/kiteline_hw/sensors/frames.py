@@ -23,6 +23,7 @@ DEPTH_TOLERANCE_NS = 20_000_000  # ns; what the TUM tools use: free-running dept
 
 _END_NS = 2**63 - 1  # ns; no sample is later
 _SKEWS = 100  # pairs over which the skew is measured
+_LEAST_APART_NS, _MOST_APART_NS = 200_000, 10_000_000_000  # ns; images of no camera are nearer or farther apart
 _GOOD_SKEW_NS = 500_000  # ns; at a turn of 1 rad/s an image of 450 px focal length is a quarter of a pixel off
 
 T = TypeVar("T")
@@ -129,7 +130,7 @@ def decode_frames(
     delivered without its right one, or its depth, where that is missing. Raises SourceError if no frame, or none with
     both images of a stereo or depth camera, is usable. grey: the bits of images of 16, where they are known.
     """
-    last_ns = -(2**63)
+    first_ns = last_ns = -(2**63)
     delivered = paired = sampled = 0
     report.notes += doubts(rig.left, "left") + ([] if rig.right is None else doubts(rig.right, "right"))
     grey = SensorBits() if grey is None else grey
@@ -148,6 +149,7 @@ def decode_frames(
         if (note := grey.take_note()) is not None:
             report.notes.append(note)
         last_ns = encoded.t_ns
+        first_ns = last_ns if delivered == 0 else first_ns
         batch = imu.take_until(encoded.t_ns)
         if batch is not None:
             sampled += 1
@@ -159,6 +161,11 @@ def decode_frames(
         why = "; ".join(report.notes) or "it holds no images"
         pair = "pair of images" if rig.right is not None else "image with its depth"
         raise SourceError(f"{name}: not one usable {'frame' if delivered == 0 else pair} ({why})")
+    apart_ns = (last_ns - first_ns) / max(delivered - 1, 1)
+    if delivered > 1 and not _LEAST_APART_NS <= apart_ns <= _MOST_APART_NS:
+        report.notes.append(
+            f"images: {1e-6 * apart_ns:.6g} ms apart by their stamps: are these in the unit that the format expects?"
+        )
     if sampled == 0 and (late := imu.take_until(_END_NS)) is not None:
         report.notes.append(
             f"imu: its samples begin {1e-9 * (int(late.t_ns[0]) - last_ns):.1f} s after the last image by their "

@@ -13,7 +13,7 @@ from kiteline_hw.logs.mcap_log import ODOMETER, LogReader, LogWriter
 from kiteline_hw.ports import SourceError, SourceReport
 from kiteline_hw.sensors.frames import PAIR_TOLERANCE_NS, EncodedFrame, decode_frames, pair_by_time, pair_tolerance_ns
 from kiteline_hw.sensors.images import encode_image
-from kiteline_hw.sensors.imu_buffer import ImuStream, ImuTable
+from kiteline_hw.sensors.imu_buffer import ImuStream, ImuTable, NoImu
 from kiteline_hw.sensors.odometry_buffer import OdometerStream, insert_before_frames, reported_covariance
 
 STAMPS = st.lists(st.integers(0, 300), max_size=25, unique=True).map(sorted)
@@ -104,6 +104,17 @@ def test_samples_that_are_all_stamped_after_the_images_are_told() -> None:
         table = ImuTable(times + shift_ns, np.zeros((200, 3)), np.ones((200, 3)), report)
         assert sum(isinstance(item, Frame) for item in decode_frames(frames, table, rig, report, "made")) == 20
         assert len(report.notes) == notes and all("begin 60.0 s after the last image" in note for note in report.notes)
+
+
+@pytest.mark.parametrize(("period_ns", "told"), [(50_000_000, ""), (50_000, "0.05"), (50_000_000_000, "50000")])
+def test_stamps_in_another_unit_are_told(period_ns: int, told: str) -> None:
+    camera = CameraModel(8, 4, 5.0, 5.0, 3.5, 1.5)
+    rig, image = CameraRig(camera, None, np.eye(4), None), encode_image(np.zeros((4, 8), np.uint8))
+    report, frames = SourceReport(), [EncodedFrame(period_ns * k, image) for k in range(20)]
+    assert len(list(decode_frames(frames, NoImu(), rig, report, "made"))) == 20
+    assert report.notes == [
+        f"images: {told} ms apart by their stamps: are these in the unit that the format expects?"
+    ] * (told != "")
 
 
 @pytest.mark.parametrize(("skew_ns", "told"), [(0, False), (300_000, False), (2_000_000, True), (-2_000_000, True)])
