@@ -9,6 +9,7 @@ _LEAST_FOLLOWED = 0.08  # share of the corners that an image must show: fewer, a
 _JUMP_PX = 8.0  # px by which the motion of a corner changes from image to image: parallax of no vehicle does
 _TORN = 0.2  # share of the corners that jump in a torn image, at least
 _FITS = 5  # of a linear motion, each with the weights of the one before
+_FEW_FOUND = 0.75  # share of the corners; with fewer found the motion is at the reach of flow, and guides the others
 _LEAST_KNOWN = 20  # corners whose motion into the image before is known, to tell jumps
 
 
@@ -58,6 +59,8 @@ class FrameFlow:
         good = np.zeros(len(self.uv), np.bool_)
         if self.image is not None and len(self.uv):
             uv, good = follow(self.image, image, self.uv, self._flow)
+            if np.count_nonzero(good) < _FEW_FOUND * len(good):
+                self._find_others(image, uv, good)
             step = (uv - self.uv) / (self._bad.in_a_row + 1)
             torn = is_torn(uv[good], step[good] - self._step[good])
             if self._bad.leaves_out(good, torn=torn is True and self.smooth):  # else the image before may be torn
@@ -66,6 +69,16 @@ class FrameFlow:
             self.uv, self._step = uv[good], step[good]
         self.image = image
         return good
+
+    def _find_others(self, image: U8, uv: F64, good: Bool) -> None:
+        """Search corners that were not found (n,) again, from where the motion of the others puts them; write both."""
+        lost = np.flatnonzero(~good)
+        if self.image is None or len(good) - len(lost) < _LEAST_KNOWN:
+            return
+        middle = self.uv[good].mean(axis=0)
+        fit = _linear_fit(self.uv[good] - middle, (uv - self.uv)[good])[0]
+        guess = self.uv[lost] + np.column_stack([np.ones(len(lost)), self.uv[lost] - middle]) @ fit
+        uv[lost], good[lost] = follow(self.image, image, self.uv[lost], self._flow, guess=guess)
 
 
 def is_torn(uv: F64, change: F64) -> bool | None:
@@ -79,10 +92,17 @@ def is_torn(uv: F64, change: F64) -> bool | None:
     known = np.isfinite(change).all(axis=1)
     if np.count_nonzero(known) < _LEAST_KNOWN:
         return None
-    change, A = change[known], np.column_stack([np.ones(np.count_nonzero(known)), uv[known] - uv[known].mean(axis=0)])
-    off_px = np.linalg.norm(change - np.median(change, axis=0), axis=1)
+    _, off_px = _linear_fit(uv[known] - uv[known].mean(axis=0), change[known])
+    return bool(np.mean(off_px > _JUMP_PX) > _TORN)
+
+
+def _linear_fit(uv: F64, motion: F64) -> tuple[F64, F64]:
+    """The linear function (3,2) of 1 and the place (n,2) that most motions (n,2) follow, and how far each is off."""
+    A = np.column_stack([np.ones(len(uv)), uv])
+    off_px = np.linalg.norm(motion - np.median(motion, axis=0), axis=1)
+    fit = np.zeros((3, 2))
     for _ in range(_FITS):
         weight = 1.0 / (1.0 + (2.0 * off_px / _JUMP_PX) ** 2)
-        fit = np.linalg.lstsq(A * weight[:, None], change * weight[:, None], rcond=None)[0]
-        off_px = np.linalg.norm(change - A @ fit, axis=1)
-    return bool(np.mean(off_px > _JUMP_PX) > _TORN)
+        fit = np.linalg.lstsq(A * weight[:, None], motion * weight[:, None], rcond=None)[0]
+        off_px = np.linalg.norm(motion - A @ fit, axis=1)
+    return fit, off_px
