@@ -71,11 +71,18 @@ def table(report: Report) -> str:
 
 
 def _agent_notes(agents: Sequence[Report]) -> Iterator[str]:
-    """What each agent's source skipped, by reason, and its other notes. What was skipped once is told in full."""
+    """How each agent's map began, what its source skipped, by reason, and its other notes. What was skipped once is
+    told in full.
+    """
     for k, agent in enumerate(agents):
         skipped, told = agent.get("skipped", {}), agent.get("notes", ())
         examples = {note.partition(": ")[0]: note for note in told}
-        notes = [f"{n} skipped: {examples.get(reason, reason) if n == 1 else reason}" for reason, n in skipped.items()]
+        notes = []
+        if waited := agent.get("initialising", 0):
+            notes.append(f"{waited} of the lost frames came before there was a map")
+        if agent.get("scale") == "own" and agent["tracked"]:
+            notes.append("lengths are in a unit of their own, as nothing told the metre; ATE with the scale fitted")
+        notes += [f"{n} skipped: {examples.get(reason, reason) if n == 1 else reason}" for reason, n in skipped.items()]
         notes += [note for note in told if note.partition(": ")[0] not in skipped]  # no examples
         yield from (f"agent {k}: {note}" if len(agents) > 1 else note for note in notes)
 

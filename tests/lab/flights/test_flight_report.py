@@ -229,3 +229,15 @@ def test_live_poses_in_a_frame_of_their_own_are_not_drawn_among_those_in_the_wor
     assert never.name == "live" and len(never.trajectory.t_ns) == 9
     soon = live_line("live", late[59:], own_unit=True)  # type: ignore[arg-type]
     assert soon.name == "live" and len(soon.trajectory.t_ns) == 41 and soon.own_unit
+
+
+def test_the_table_tells_what_one_camera_alone_does_not_know() -> None:
+    agent = {
+        "frames": 9, "tracked": 7, "lost": 2, "initialising": 2, "dropped": 0, "keyframes": 1, "scale": "own",
+        "bytes_per_keyframe": 0.0, "timing": {"cpu_ms_per_frame": statistic([]), "rss_mib": 1.0},
+    }  # fmt: skip
+    assert table({"agents": [agent], "base": None}).splitlines()[-2:] == [
+        "note: 2 of the lost frames came before there was a map",
+        "note: lengths are in a unit of their own, as nothing told the metre; ATE with the scale fitted",
+    ]
+    assert "note" not in table({"agents": [{**agent, "scale": "metric", "initialising": 0}], "base": None})
