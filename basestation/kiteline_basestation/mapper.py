@@ -104,8 +104,7 @@ class Mapper:
             SCAN.name: self._finish_scan,
         }
         if self.merger is not None:
-            self._finish[POSE_GRAPH.name] = self.merger.finish_graph
-            self._finish[FULL_BUNDLE.name] = self.merger.finish_bundle
+            self._finish |= {POSE_GRAPH.name: self.merger.finish_graph, FULL_BUNDLE.name: self.merger.finish_bundle}
 
     def step(self, given: MapperInput, now_ns: int) -> MapperOutput:
         """Take inputs in; return records to publish and jobs to run."""
@@ -174,6 +173,10 @@ class Mapper:
         """Submaps that a user deleted."""
         return self._intake.deleted
 
+    def has_no_place(self, submap: SubmapId) -> bool:
+        """True if a submap is deleted, or in use without a place in w. Where one lies that did not come is open."""
+        return submap in self.deleted or (submap not in self.placements and self._intake.is_used(submap))
+
     @property
     def grid(self) -> ScanGrid:
         """The occupancy grid."""
@@ -211,9 +214,7 @@ class Mapper:
             MergerState() if self.merger is None else self.merger.state(), dict(self.image_scans.made),
         )  # fmt: skip
 
-    def restore(
-        self, agent: AgentId, received: tuple[Record, ...], own: tuple[Record, ...], now_ns: int
-    ) -> None:  # fmt: skip
+    def restore(self, agent: AgentId, received: tuple[Record, ...], own: tuple[Record, ...], now_ns: int) -> None:
         """Restore an agent's values: `received` by an earlier base process, and its `own`, written for the agent."""
         self._intake.take(agent, received, now_ns, in_contact=False)
         for record in own:
@@ -281,9 +282,8 @@ class Mapper:
         if is_confirmed(self.map, keyframe):
             self._confirmed[agent_of_keyframe(keyframe)] += 1
         self.counts.found += landmark_matching.match_landmarks(self.map, keyframe, config.landmark_matching, publisher)
-        self.counts.triangulated += triangulation.triangulate_landmarks(
-            self.map, keyframe, config.triangulation, publisher
-        )
+        triangulated = triangulation.triangulate_landmarks(self.map, keyframe, config.triangulation, publisher)
+        self.counts.triangulated += triangulated
         self.counts.culled += culling.cull_weak_landmarks(self.map, keyframe, publisher)
         culled = culling.cull_redundant_keyframes(self.map, keyframe, publisher)
         self.counts.keyframes_culled += len(culled)

@@ -15,7 +15,7 @@ from kiteline_basestation.mapper import Mapper, MapperInput
 from kiteline_codec.channel import CodedChannel, RecordChannel
 from kiteline_codec.schema import PASSING_KINDS, Key, KeyframeHeader, LivePose, Record, WireError, messages
 from kiteline_codec.schema.owners import KEYFRAME_BYTES, submap_of
-from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId
+from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, SubmapId
 from kiteline_core.places.place_index import Vocabulary
 
 
@@ -131,7 +131,7 @@ class Station:
             self.join(agent)
             numbered, unfinished = self._batches[agent].numbered, agent in output.unfinished
             self._put(agent, numbered(published.get(agent, ()), now_ns, unfinished=unfinished))
-        for agent, key in output.withdrawn:
+        for agent, key in (*output.withdrawn, *self._placements_that_ended()):
             self.join(agent).remove(key)
             if self.changed is not None:
                 self.changed[agent, True, key] = None
@@ -150,6 +150,16 @@ class Station:
         for record in records:
             self.mapper.adopt(self.channels[agent].put(record))  # the base computes on with what the agent will hold
         self._track(agent, True, records)
+
+    def _placements_that_ended(self) -> list[tuple[AgentId, Key]]:
+        """Placements that agents hold of earlier starts of this base, of submaps without a place in the world now."""
+        return [
+            (agent, key)
+            for agent, channel in sorted(self.channels.items())
+            if isinstance(channel, CodedChannel)
+            for key in channel.endpoint.standing
+            if self.mapper.has_no_place(SubmapId(key.id))
+        ]
 
     def restore(self, agent: AgentId, own: Sequence[Record], now_ns: int) -> None:
         """Share again the values that an earlier process had written for an agent."""

@@ -151,6 +151,10 @@ class Intake:
         self._partial.difference_update(late)
         return sorted(out + late)
 
+    def is_used(self, submap: SubmapId) -> bool:
+        """True if a keyframe of a submap is used."""
+        return any(keyframe not in self._waiting for keyframe in self._map.submaps.get(submap, ()))
+
     @property
     def backlog(self) -> bool:
         """True if a keyframe is ready and not used yet."""

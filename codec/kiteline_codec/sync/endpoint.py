@@ -5,7 +5,6 @@ packet is filled, when it may be sent, with the values of highest priority that 
 No message is queued. Packets are described in SPEC.md, states in `agreement`.
 """
 
-import contextlib
 from collections.abc import Callable, Mapping, Sequence
 
 from kiteline_codec.coding.packing import Writer
@@ -61,7 +60,7 @@ class Endpoint:
         self._own_values = OwnValues()
         self._peer_values = PeerValues()
         self._may_write = may_write
-        self._resumable: dict[Key, int] = {}  # checksums of what the peer holds of earlier sessions of this side
+        self._resumable = resumption.Resumable()
         self._overtaken_below = 0  # packets with lower numbers have been overtaken by enough acknowledged ones
         self._unanswered = 0  # packets to acknowledge, and news to send
         self._unanswered_since_ns = 0
@@ -82,10 +81,16 @@ class Endpoint:
         if len(code) > self.config.max_value_bytes:
             raise ValueError(f"{key}: {len(code)} bytes, expected at most {self.config.max_value_bytes}")
         self._out.put(key, code, self.config.order(key) if priority is None else priority)
+        self._resumable.replaced(key)
 
     def remove(self, key: Key) -> None:
-        """Remove a value; unknown keys are ignored."""
-        self._out.remove(key)
+        """Remove a value, also one that the peer holds of an earlier session of this side; others are ignored."""
+        self._out.remove(key, is_held=self._resumable.removed(key))
+
+    @property
+    def standing(self) -> Sequence[Key]:
+        """Placements of earlier sessions of this side that the peer holds, and this one has not shared since."""
+        return tuple(self._resumable.standing)
 
     def arrived(self, key: Key) -> bool:
         """True if the peer is known to hold the newest version of an own value, or if there is none."""
@@ -210,7 +215,7 @@ class Endpoint:
     def _compress(self, key: Key, code: bytes, known: Known) -> bytes | None:
         """A shorter form of an own value. The peer holds what it wrote, and what of ours is `known` to have arrived."""
         assert self._coder is not None
-        reference = resumption.reference_to(key, code, self._resumable)
+        reference = self._resumable.reference_to(key, code)
         if reference is not None:
             return reference
         return self._coder.compress(key, code, lambda k: self._in.held(k) or known(k), self._out.held)
@@ -239,15 +244,7 @@ class Endpoint:
         for update in changed:
             if update.key.kind in PREDICTOR_KINDS:
                 self._out.predictors_changed()
-            if update.key.kind == resumption.SUMMARY_KIND:
-                self._take_summary(update.code or b"")
-
-    def _take_summary(self, code: bytes) -> None:
-        """Take in what the peer holds of earlier sessions of this side; a summary that cannot be read is ignored."""
-        with contextlib.suppress(WireError):
-            summary = resumption.read_summary(code)
-            if len(self._resumable) + len(summary) <= resumption.MOST_LISTED:
-                self._resumable.update(summary)
+            if update.key.kind == resumption.SUMMARY_KIND and self._resumable.take(update.code or b""):
                 self._out.predictors_changed()
 
     def _refuse(self, reason: str) -> list[Update]:

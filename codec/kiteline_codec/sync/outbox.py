@@ -103,13 +103,13 @@ class Outbox:
         self._change(key, code, order)
         self._make_room()
 
-    def remove(self, key: Key) -> None:
-        """Remove a value. If nothing of it was ever sent, the peer need not know."""
+    def remove(self, key: Key, *, is_held: bool = False) -> None:
+        """Remove a value. The peer need not know if nothing of it was ever sent, nor is held of an earlier session."""
         entry = self._resident_entry(key)
-        if entry is None or entry.code is None:
+        if is_held or (entry is not None and entry.code is not None and entry.sent):
+            self._change(key, None, self._order(key) if entry is None else entry.order)
             return
-        if entry.sent:
-            self._change(key, None, entry.order)
+        if entry is None or entry.code is None:
             return
         self.digest.discard(entry.hashed)
         self.newest += 1

@@ -1,9 +1,11 @@
 """Session resumption: values of earlier sessions that a side still holds are not sent again.
 
 After a restart of either side, each lists short checksums of what it holds of the peer, under `SUMMARY_KIND`. The peer
-then sends a checksum in place of such a code. See SPEC.md, "Session resumption".
+then sends a checksum in place of such a code, and removes what does not hold any more. See SPEC.md, "Session
+resumption".
 """
 
+import contextlib
 from collections.abc import Callable, Mapping, Sequence
 from struct import pack
 from zlib import crc32
@@ -11,7 +13,7 @@ from zlib import crc32
 from kiteline_codec.coding.packing import Reader, WireError, Writer
 from kiteline_codec.residuals.predictors import Held
 from kiteline_codec.residuals.residual_coding import ResidualCoder
-from kiteline_codec.schema import AGENT_KINDS, KEYFRAME_KINDS, Key
+from kiteline_codec.schema import AGENT_KINDS, KEYFRAME_KINDS, Key, SubmapPlacement
 from kiteline_codec.schema.owners import submap_of
 from kiteline_codec.transport.packet import MAX_KIND, Item
 from kiteline_core.ids import SEQUENCE_BITS, SUBMAP_BITS
@@ -19,9 +21,11 @@ from kiteline_core.ids import SEQUENCE_BITS, SUBMAP_BITS
 SUMMARY_KIND = MAX_KIND  # of the values that hold the checksums; no record has it
 REFERENCE_BYTES = 4
 _MIN_CODE_BYTES = 16  # shorter codes are sent as they are
+_STANDING_KINDS = frozenset({SubmapPlacement.KIND})  # listed whatever their length: they hold until they are removed
 _VALUES_PER_PART = 60  # fit a packet of a thin link in a few pieces
 _MAX_PARTS = 1 << 16
 MOST_LISTED = 1 << 17  # values that are remembered of what a peer lists: 25 MB
+_MOST_STANDING = 1 << 10  # of these, placements, which are looked at in each step; the newest are listed first
 _SHORT_CHECKSUM = 0xFFFFFF
 _FROM_AGENT = KEYFRAME_KINDS & AGENT_KINDS
 MAX_SESSION = 1 << 56
@@ -61,13 +65,14 @@ def order_of(session: int) -> int:
 
 
 def summaries(values: Mapping[Key, bytes], session: int) -> dict[Key, bytes]:
-    """Summaries of the values held of earlier sessions, newest ids first, for a session of the peer.
+    """Summaries of the values held of earlier sessions for a session of the peer: placements, then newest ids first.
 
     Of an agent's keyframes only those of its present boot, as far as its session tells: it holds no others.
     """
-    keys = [key for key, code in values.items() if len(code) >= _MIN_CODE_BYTES and key.kind != SUMMARY_KIND]
+    listed = {key for key, code in values.items() if len(code) >= _MIN_CODE_BYTES or key.kind in _STANDING_KINDS}
+    keys = [key for key in listed if key.kind != SUMMARY_KIND]
     keys = [key for key in keys if key.kind not in _FROM_AGENT or is_of_start(key.id, session)]
-    keys.sort(key=lambda key: (-key.id, key.kind, key.part))
+    keys.sort(key=lambda key: (key.kind not in _STANDING_KINDS, -key.id, key.kind, key.part))
     out: dict[Key, bytes] = {}
     for part, begin in enumerate(range(0, min(len(keys), _MAX_PARTS * _VALUES_PER_PART), _VALUES_PER_PART)):
         writer, last_id = Writer(), 0
@@ -113,12 +118,48 @@ def read_summary(code: bytes) -> dict[Key, int]:
     return out
 
 
-def reference_to(key: Key, code: bytes, held: Mapping[Key, int]) -> bytes | None:
-    """The checksum to send in place of a code that the peer holds by its summaries; None if it does not."""
-    if not held or key not in held:
-        return None
-    checksum = crc32(code)
-    return pack("<I", checksum) if held[key] == checksum & _SHORT_CHECKSUM else None
+class Resumable:
+    """What the peer holds of earlier sessions of this side, by its summaries.
+
+    standing: keys of placements that this session has neither replaced nor removed.
+    """
+
+    def __init__(self) -> None:
+        self._checksums: dict[Key, int] = {}
+        self.standing: dict[Key, None] = {}
+
+    def clear(self) -> None:
+        """Forget all as another session of the peer begins."""
+        self._checksums.clear()
+        self.standing.clear()
+
+    def take(self, code: bytes) -> bool:
+        """Take in a summary; one that cannot be read is ignored. Returns True if values may have a reference now."""
+        with contextlib.suppress(WireError):
+            summary = read_summary(code)
+            if len(self._checksums) + len(summary) <= MOST_LISTED:
+                self._checksums.update(summary)
+                standing = [key for key in summary if key.kind in _STANDING_KINDS]
+                self.standing |= dict.fromkeys(standing[: _MOST_STANDING - len(self.standing)])
+                return True
+        return False
+
+    def replaced(self, key: Key) -> None:
+        """Note that a value of this session stands in place of an earlier one."""
+        self.standing.pop(key, None)
+
+    def removed(self, key: Key) -> bool:
+        """Note that a value is removed. Returns True if the peer holds it, or something in its place."""
+        self.standing.pop(key, None)
+        return self._checksums.pop(key, None) is not None
+
+    def reference_to(self, key: Key, code: bytes) -> bytes | None:
+        """The checksum to send in place of a code that the peer holds; None if it does not."""
+        held = self._checksums.get(key)
+        if held is None:
+            return None
+        checksum = crc32(code)
+        return pack("<I", checksum) if held == checksum & _SHORT_CHECKSUM else None
 
 
 def resolve(reference: bytes, code: bytes | None) -> bytes:

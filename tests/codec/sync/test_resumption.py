@@ -8,7 +8,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kiteline_codec.residuals.residual_coding import ResidualCoder
-from kiteline_codec.schema import AGENT_KINDS, KEYFRAME_KINDS, Key, NewLandmarks, RefinedLandmarks, WireError
+from kiteline_codec.schema import (
+    AGENT_KINDS,
+    KEYFRAME_KINDS,
+    CameraIntrinsics,
+    Key,
+    NewLandmarks,
+    RefinedLandmarks,
+    SubmapPlacement,
+    WireError,
+)
 from kiteline_codec.schema.owners import submap_of
 from kiteline_codec.sync import resumption
 from kiteline_codec.sync.config import SyncConfig
@@ -121,16 +130,56 @@ def test_another_boot_gets_no_summary() -> None:
 def test_summaries_are_read_as_written(known: dict[Key, bytes]) -> None:
     summaries = resumption.summaries(known, 1)
     read: dict[Key, int] = {}
+    held = resumption.Resumable()
     for code in summaries.values():
         read.update(resumption.read_summary(code))
+        assert held.take(code)
     assert read.keys() == known.keys()
+    assert held.standing.keys() == {key for key in known if key.kind == SubmapPlacement.KIND}
     for key, code in known.items():
-        form = resumption.reference_to(key, code, read)
+        form = held.reference_to(key, code)
         assert form is not None
         assert resumption.resolve(form, code) == code
-        assert resumption.reference_to(key, code + b"!", read) is None
+        assert held.reference_to(key, code + b"!") is None
         with pytest.raises(WireError):
             resumption.resolve(form, code + b"!")
+
+
+def test_placements_are_listed_first_however_short_they_are() -> None:
+    placements = {Key(SubmapPlacement.KIND, submap): b"short" for submap in range(3)}
+    known = {**values(boot=4), Key(CameraIntrinsics.KIND, 1): b"short", **placements}
+    listed = list(resumption.read_summary(resumption.summaries(known, OF_BOOT_4)[Key(resumption.SUMMARY_KIND, 0)]))
+    assert listed[:3] == sorted(placements, reverse=True)
+    assert all(len(known[key]) >= 16 for key in listed[3:])
+
+
+def test_placements_that_are_looked_at_in_each_step_are_bounded() -> None:
+    known = {Key(SubmapPlacement.KIND, submap): b"" for submap in range(3000)}
+    held = resumption.Resumable()
+    assert all(held.take(code) for code in resumption.summaries(known, 1).values())
+    assert list(held.standing) == sorted(known, reverse=True)[:1024]
+
+
+@pytest.mark.parametrize("lose", [0.0, 0.4])
+@pytest.mark.parametrize("shares_first", [False, True])
+def test_a_session_removes_what_an_earlier_one_shared(lose: float, shares_first: bool) -> None:
+    """One that had put the value and sent nothing of it yet told nobody: the peer went on with it."""
+    base, agent, key = end(1), end(OF_BOOT_4), Key(SubmapPlacement.KIND, 5)
+    base.put(key, b"here")
+    talk(base, agent, 0, 60, lose)
+    second = end(2)
+    talk(second, agent, 60 * STEP_NS, 60, lose, seed=1)
+    assert second.standing == (key,) and agent.earlier_values() == {key: b"here"}
+    if shares_first:
+        second.put(key, b"here")
+    second.remove(key)
+    talk(second, agent, 120 * STEP_NS, 400, lose, seed=2)
+    assert not second.standing and not agent.earlier_values() and not agent.peer_values()
+    assert second.digest_equal and agent.digest_equal
+    second.put(key, b"here")  # whole: the agent holds it no more
+    talk(second, agent, 520 * STEP_NS, 400, lose, seed=3)
+    assert agent.peer_values() == {key: b"here"} and second.digest_equal
+    assert agent.stats.rejected == 0
 
 
 @given(st.binary(max_size=60))
