@@ -321,6 +321,9 @@ class AgentRuntime:
         if self._budget is not None and self._budget.deleted:
             limit = f"--log-mib {self.options.log_mib}, or a disk that is nearly full"
             self._notices.say("budget", f"log: the oldest logs are deleted: {limit}")
+        if isinstance(self.channel, CodedChannel) and self.channel.endpoint.given_up:
+            self._notices.say("spill", "link: old values wait for the base, and neither memory nor disk takes more: it "
+                              "will lack some; the flight goes on")  # fmt: skip
         return self._notices.take()
 
     def _save_rig(self) -> None:
@@ -356,6 +359,5 @@ def opened(options: AgentOptions) -> FrameSource:
 
 def channel_with_spill(options: AgentOptions) -> RecordChannel:
     """The channel to the base; beside a log, values that wait while the link is down are moved to a file."""
-    return channel_for(
-        options, link_traits(options.link), SpillFile(Path(options.folder)) if options.log_name else None
-    )
+    spill = SpillFile(Path(options.folder), beside=options.log_optional) if options.log_name else None
+    return channel_for(options, link_traits(options.link), spill)

@@ -154,6 +154,11 @@ class Endpoint:
         )  # fmt: skip
 
     @property
+    def given_up(self) -> int:
+        """Own values that were dropped for want of memory."""
+        return self._out.dropped
+
+    @property
     def backlog_bytes(self) -> int:
         """Bytes of own values that the peer is not known to hold."""
         return self._out.pending_bytes

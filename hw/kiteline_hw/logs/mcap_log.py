@@ -45,7 +45,7 @@ from kiteline_hw.logs.log_budget import LogBudget
 from kiteline_hw.logs.mcap_log_read import LogMessage, LogReader, read_frame
 from kiteline_hw.logs.mcap_write import McapWriter
 from kiteline_hw.logs.rig_json import LENS_NAMES, rig_to_json
-from kiteline_hw.logs.whole_file import BesideFile, WholeFile
+from kiteline_hw.logs.whole_file import BesideFile, FileToCome, WholeFile
 from kiteline_hw.ports import SourceError
 from kiteline_hw.system.closing import Closing
 
@@ -86,10 +86,14 @@ class LogWriter(Closing):
         self._part = 0
         self._beside = beside
         self._ended: list[BesideFile] = []  # earlier parts for which the disk may not have had the time yet
+        self._coming: FileToCome | None = None  # the next part, while it is created
         self._rig: tuple[CameraRig, ImuCalibration | None] | None = None
         if budget is not None:
             budget.make_room()
-        self._open(self.path)
+        try:
+            self._begin(self.path, BesideFile(self.path) if beside else WholeFile(self.path))
+        except OSError as error:
+            raise SourceError(f"{self.path}: cannot write the log: {error.strerror}") from error
 
     # Data of a source
 
@@ -250,6 +254,8 @@ class LogWriter(Closing):
     def _finish(self) -> None:
         if self._stream.closed:
             return
+        if self._coming is not None:
+            self._coming.remove()
         try:
             self._writer.finish()
         except OSError as error:
@@ -276,12 +282,9 @@ class LogWriter(Closing):
         if self._budget is not None:
             self._budget.make_room_beside(self._path)
 
-    def _open(self, path: Path) -> None:
-        self._path = path  # of the file that is being written
-        try:
-            self._stream: WholeFile | BesideFile = BesideFile(path) if self._beside else WholeFile(path)
-        except OSError as error:
-            raise SourceError(f"{path}: cannot write the log: {error.strerror}") from error
+    def _begin(self, path: Path, stream: WholeFile | BesideFile) -> None:
+        """Write to a new file from now on."""
+        self._path, self._stream = path, stream
         self._writer = McapWriter(self._stream, CHUNK_BYTES, "kiteline")
         self._writer.add_metadata("kiteline", {**self._metadata, **({"part": str(self._part)} if self._part else {})})
         self._channels: dict[str, tuple[int, object]] = {}  # number and kind, by topic
@@ -341,14 +344,13 @@ class LogWriter(Closing):
         """Go on in another file, if one can begin with this message and can be made; else in this one."""
         if not self._bytes or (self._part_topic is not None and topic != self._part_topic):
             return
-        writer, stream, path = self._writer, self._stream, self._path
-        self._part += 1
-        try:
-            self._open(self.path.with_name(f"{self.path.stem}_{self._part}{self.path.suffix}"))
-        except SourceError:
-            self._part -= 1
-            self._path = path
+        path = self.path.with_name(f"{self.path.stem}_{self._part + 1}{self.path.suffix}")
+        created = self._created(path)
+        if created is None:
             return
+        writer, stream = self._writer, self._stream
+        self._part += 1
+        self._begin(path, created)
         try:
             writer.finish()
         except OSError as error:
@@ -358,6 +360,19 @@ class LogWriter(Closing):
         budget.make_room_beside(self._path)
         if self._rig is not None:
             self.rig(t_ns, *self._rig)
+
+    def _created(self, path: Path) -> WholeFile | BesideFile | None:
+        """A new file; None if it cannot be created, or is not yet: beside the caller, that is asked again."""
+        if not self._beside:
+            try:
+                return WholeFile(path)
+            except OSError:
+                return None
+        coming = self._coming = self._coming or FileToCome(path)
+        if not coming.done:
+            return None
+        self._coming = None
+        return coming.take()
 
 
 def _name(kind: Any) -> str:

@@ -145,6 +145,43 @@ class BesideFile:
         self._file.close()
 
 
+class FileToCome:
+    """A BesideFile that a thread creates: a disk that stalls lets that wait, too.
+
+    done: whether it is created, or cannot be. file: None if it cannot.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.done = False
+        self.file: BesideFile | None = None
+        self._path = path
+        self._unused = threading.Event()
+        self._decided = threading.Event()  # whether it is used or not
+        self._thread = threading.Thread(target=self._run, name="kiteline-log-part", daemon=True)
+        self._thread.start()
+
+    def take(self) -> BesideFile | None:
+        """The file, once it is done. The caller ends it."""
+        self._decided.set()
+        return self.file
+
+    def remove(self) -> None:
+        """Remove the file, which is not used: now, or once it is created. Waits for the disk for some seconds."""
+        self._unused.set()
+        self._decided.set()
+        self._thread.join(_CLOSE_S)
+
+    def _run(self) -> None:
+        with contextlib.suppress(OSError):
+            self.file = BesideFile(self._path)
+        self.done = True
+        self._decided.wait()
+        if self.file is not None and self._unused.is_set():
+            self.file.end()
+            with contextlib.suppress(OSError):
+                self._path.unlink()
+
+
 class LineFile:
     """A new file of text lines. Never raises: lines that are not written are counted.
 

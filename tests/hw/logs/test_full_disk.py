@@ -1,10 +1,6 @@
-"""Logs on a small or full disk: budgets, spill files, whole pieces."""
+"""Logs on a small or full disk: budgets, whole pieces."""
 
-import errno
 import os
-import tempfile
-import threading
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,37 +8,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from kiteline_hw.logs import whole_file
 from kiteline_hw.logs.log_budget import LogBudget
-from kiteline_hw.logs.log_parts import WholeLog
 from kiteline_hw.logs.mcap_log import LogReader, LogWriter
-from kiteline_hw.logs.spill_file import SpillFile
-from kiteline_hw.logs.whole_file import BesideFile, LineFile, WholeFile
-
-
-class SmallDisk:
-    """Takes so many bytes, also of a write that does not fit, and then no more until there is room again."""
-
-    def __init__(self, room: int) -> None:
-        self.room = room
-        self._pwrite = os.pwrite
-
-    def pwrite(self, fd: int, data: bytes, offset: int) -> int:
-        if self.room <= 0:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        n = self._pwrite(fd, bytes(data)[: self.room], offset)
-        self.room -= n
-        return n
-
-
-@pytest.fixture
-def small_disk(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], SmallDisk]:
-    def make(room: int) -> SmallDisk:
-        disk = SmallDisk(room)
-        monkeypatch.setattr(os, "pwrite", disk.pwrite)
-        return disk
-
-    return make
+from kiteline_hw.logs.whole_file import LineFile, WholeFile
+from tests.hw.logs.disks import SmallDisk
 
 
 def test_a_piece_is_written_whole_or_not_at_all(tmp_path: Path, small_disk: Callable[[int], SmallDisk]) -> None:
@@ -108,83 +77,6 @@ def test_a_log_that_is_full_to_the_end_keeps_what_was_written(
     with LogReader(tmp_path / "log.mcap") as read:
         found = [int.from_bytes(m.blob()[:2], "little") for m in read.messages()]
     assert found == list(range(len(found))) and len(found) >= 30
-
-
-class StalledDisk:
-    """Answers no write until it is let go."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.go = threading.Event()
-        self._pwrite = os.pwrite
-        monkeypatch.setattr(os, "pwrite", self.pwrite)
-
-    def pwrite(self, fd: int, data: bytes, offset: int) -> int:
-        assert threading.current_thread() is not threading.main_thread()
-        self.go.wait(10.0)
-        return self._pwrite(fd, data, offset)
-
-
-def test_a_log_beside_waits_for_no_disk_and_is_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with LogWriter(tmp_path / "plain.mcap", {}) as plain:
-        disk = StalledDisk(monkeypatch)
-        log, lines = LogWriter(tmp_path / "log.mcap", {}, beside=True), LineFile(tmp_path / "a.tum", beside=True)
-        for k in range(200):
-            log.blob("/a", k, bytes([k]) * 2000)
-            lines.write(f"{k}\n")
-        assert not log.waits_for and log.dropped == lines.lost == 0
-        disk.go.set()
-        log.close()
-        lines.close()
-        monkeypatch.undo()
-        for k in range(200):
-            plain.blob("/a", k, bytes([k]) * 2000)
-    assert (tmp_path / "log.mcap").read_bytes() == (tmp_path / "plain.mcap").read_bytes()
-    assert (tmp_path / "a.tum").read_text().split() == [str(k) for k in range(200)]
-
-
-def test_what_a_stalled_disk_does_not_take_is_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(whole_file, "_CLOSE_S", 0.2)
-    disk, file = StalledDisk(monkeypatch), BesideFile(tmp_path / "file", most_bytes=10)
-    file.write(b"123456")
-    assert file.waits_for == "the disk does not answer"
-    with pytest.raises(OSError, match="does not answer"):
-        file.write(b"abcdef")
-    file.close()
-    assert file.closed and file.unwritten == 1
-    disk.go.set()
-
-
-def test_a_log_beside_goes_on_once_the_full_disk_has_room(
-    tmp_path: Path, small_disk: Callable[[int], SmallDisk], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(whole_file, "_RETRY_S", 0.01)
-    disk, budget = small_disk(100_000), LogBudget(tmp_path, "log", 800_000, 0)
-    log = LogWriter(tmp_path / "log00001.mcap", {}, budget=budget, beside=True)
-    for k in range(100):
-        log.blob("/a", k, k.to_bytes(2, "little") * 1000)
-    end_s = time.monotonic() + 5.0
-    while log.waits_for != os.strerror(errno.ENOSPC):
-        assert time.monotonic() < end_s
-        time.sleep(0.01)
-    disk.room = 10**9
-    log.close()
-    assert log.dropped == 0 and log.why == ""
-    with WholeLog(tmp_path / "log00001.mcap") as read:
-        assert [int.from_bytes(m.blob()[:2], "little") for m in read.messages()] == list(range(100))
-
-
-def test_a_log_beside_on_a_disk_that_stays_full_says_so(tmp_path: Path, small_disk: Callable[[int], SmallDisk]) -> None:
-    small_disk(100_000)
-    log, lines = LogWriter(tmp_path / "log.mcap", {}, beside=True), LineFile(tmp_path / "a.tum", beside=True)
-    for k in range(200):
-        log.blob("/a", k, k.to_bytes(2, "little") * 1000)
-    log.close()
-    lines.write("one\n")
-    lines.close()
-    assert log.dropped > 0 and "No space" in log.why and lines.lost == 1 and "No space" in lines.why
-    with LogReader(tmp_path / "log.mcap") as read:
-        found = [int.from_bytes(m.blob()[:2], "little") for m in read.messages()]
-    assert found == list(range(len(found))) and found
 
 
 def put(folder: Path, name: str, size: int, age: int) -> None:
@@ -282,59 +174,3 @@ def test_a_log_goes_on_in_parts_that_stand_alone_while_the_oldest_go(tmp_path: P
             assert messages[0].topic == "/step"  # no step is cut in two
             steps += [m.json()["k"] for m in messages if m.topic == "/step"]
     assert steps == list(range(steps[0], 300))
-
-
-def test_stored_bytes_are_read_back_and_leave_no_file(tmp_path: Path) -> None:
-    spill = SpillFile(tmp_path / "agent0")
-    places = [spill.put(bytes([i]) * (100 * i)) for i in range(5)]
-    for i, where in reversed(list(enumerate(places))):
-        assert where is not None
-        assert spill.get(where, 100 * i) == bytes([i]) * (100 * i)
-    assert list((tmp_path / "agent0").iterdir()) == []
-    assert spill.get(10**6, 4) is None
-    assert spill.failures == 1
-    spill.close()
-    spill.close()
-    assert spill.put(b"late") is None
-    assert spill.get(0, 0) is None
-
-
-def test_an_unwritable_folder_is_counted(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("not a folder")
-    spill = SpillFile(tmp_path / "file" / "agent0")
-    assert spill.put(b"x") is None
-    assert spill.failures == 2
-    gone = SpillFile(tmp_path)
-    assert gone._file is not None
-    os.close(gone._file)
-    assert gone.put(b"x") is None
-    assert gone.get(0, 1) is None
-    assert gone.failures == 2
-    gone._file = None
-
-
-@given(st.lists(st.tuples(st.integers(0, 5000), st.integers(0, 9)), max_size=60))
-def test_freed_places_serve_again_and_none_holds_two_things(sizes: list[tuple[int, int]]) -> None:
-    spill, held = SpillFile(Path(tempfile.gettempdir())), dict[int, tuple[int, bytes]]()
-    for i, (size, replaced) in enumerate(sizes):
-        if (old := held.pop(replaced, None)) is not None:
-            spill.free(old[0], len(old[1]))
-        data = bytes([i]) * size
-        where = spill.put(data)
-        assert where is not None
-        held[replaced] = where, data
-        assert all(spill.get(where, len(data)) == data for where, data in held.values())
-    spill.close()
-
-
-def test_a_file_whose_contents_change_does_not_grow(tmp_path: Path) -> None:
-    spill, held, sizes = SpillFile(tmp_path), dict[int, tuple[int, int]](), list[int]()
-    for i in range(4000):
-        if (old := held.pop(i % 50, None)) is not None:
-            spill.free(*old)
-        size = 4000 + (i * 7919) % 1000
-        where = spill.put(bytes(size))
-        assert where is not None
-        held[i % 50] = where, size
-        sizes.append(spill._size)
-    assert sizes[-1] == sizes[2000] < 2 * 50 * 5000
