@@ -10,6 +10,7 @@ import numpy as np
 
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.exchange.corrections import Corrections
+from kiteline_agent.frame_order import FrameOrder
 from kiteline_agent.governor.cost_model import Work
 from kiteline_agent.governor.effort import FULL, governed
 from kiteline_agent.governor.governor import Governor
@@ -121,6 +122,7 @@ class Agent:
             monocular=not self._has_depth,
         )  # fmt: skip
         self._report = PoseReport(identity.agent, self._camera, self._corrections, channel, has_depth=self._has_depth)
+        self._order = FrameOrder()
         self._skipped_imu: list[ImuBatch] = []  # since the last processed frame
         self._frame_number = 0
         self._last_t_ns: int | None = None  # of the last processed frame
@@ -134,7 +136,10 @@ class Agent:
             self.right_camera.begin_with(config.known_rig)
 
     def step(self, step_input: StepInput, now_ns: int) -> StepOutput:
-        """Take in what arrived, track the frame if there is one, return what is to be sent. Never waits."""
+        """Take in what arrived, track the frame if there is one, return what is to be sent. Never waits.
+
+        A frame that is not newer than those before is left out, which an event says; there is no estimate then.
+        """
         self.work.clear()
         self.work.steps = 1
         events = self._take_corrections(self._channel.receive(step_input.packets, now_ns))
@@ -143,15 +148,17 @@ class Agent:
         imu = self._camera.motion.timed(step_input.imu)
         if imu is not None:
             self._skipped_imu.append(imu)
-        if step_input.frame is not None:
-            self._camera.motion.see(step_input.frame.t_ns)
-            tracked, more = self._govern(step_input.frame, step_input)
+        frame, late = self._order.newer(step_input.frame)
+        events += late
+        if frame is not None:
+            self._camera.motion.see(frame.t_ns)
+            tracked, more = self._govern(frame, step_input)
             events += more
             if tracked:
-                estimate, more = self._process_next(step_input.frame)
+                estimate, more = self._process_next(frame)
                 events += more
             elif self._full_config.governor.cpu_percent >= LEAST_PREDICTION_PERCENT:
-                predicted = self.predict(step_input.frame.t_ns)
+                predicted = self.predict(frame.t_ns)
         elif step_input.predict_ns is not None:
             predicted = self.predict(step_input.predict_ns)
         return StepOutput(estimate, tuple(self._channel.poll(now_ns)), tuple(events), predicted)
@@ -358,6 +365,11 @@ class Agent:
         T_w_b, bands_m = self._report.in_base_map(pose.T_o_b), self._full_config.ground.bands_m
         T_w_f = None if T_w_b is None else T_w_b @ T_b_f
         return self._local_grid.around(pose.T_o_b @ T_b_f, T_w_f, self.tiles, bands_m)
+
+    @property
+    def left_out(self) -> int:
+        """Frames that were left out, as they were not newer than those before."""
+        return self._order.left_out
 
     @property
     def metric(self) -> bool:

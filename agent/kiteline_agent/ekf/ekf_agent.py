@@ -10,6 +10,7 @@ from kiteline_agent.ekf.corner_flow import CornerFlow
 from kiteline_agent.ekf.ekf_slam import EkfSlam
 from kiteline_agent.ekf.odometer_motion import OdometerMotion
 from kiteline_agent.ekf.shared_keyframes import FilteredFrame, SharedKeyframes
+from kiteline_agent.frame_order import FrameOrder
 from kiteline_agent.governor.cost_model import Work
 from kiteline_agent.governor.governor import Governor
 from kiteline_agent.imaging.features import build_pyramid
@@ -51,28 +52,34 @@ class EkfAgent:
         self._motion = OdometerMotion(camera.T_b_c, config.ekf, config.odometer.keep_s, config.odometer.max_gap_s)
         self._governor = Governor(config.governor)
         self._keyframes = SharedKeyframes(camera, config, identity, channel, self._governor, self.work)
+        self._order = FrameOrder()
         self._last: Estimate | None = None
         self._frame_number = 0
         self._measured_ns: int | None = None  # the last frame whose motion the odometer measured, or the first one
         self._told = False  # that it has measured none since for a while
 
     def step(self, step_input: StepInput, now_ns: int) -> StepOutput:
-        """Take in what arrived, track the frame if there is one and time for it. Never waits."""
+        """Take in what arrived, track the frame if there is one and time for it. Never waits.
+
+        A frame that is not newer than those before is left out, as in Agent.
+        """
         self.work.clear()
         self.work.steps = 1
         records = self._channel.receive(step_input.packets, now_ns)
         events = self._keyframes.take(records, self._channel.take_removed())
         self._motion.add(step_input.odometry)
         estimate = predicted = None
-        if step_input.frame is not None:
+        frame, late = self._order.newer(step_input.frame)
+        events += late
+        if frame is not None:
             # Odometry bridges skipped frames as an IMU does.
-            decision = self._governor.frame(step_input.frame.t_ns, step_input.cpu_ns, carried=True)
+            decision = self._governor.frame(frame.t_ns, step_input.cpu_ns, carried=True)
             events += decision.events
             if decision.track:
-                estimate, more = self._process(step_input.frame)
+                estimate, more = self._process(frame)
                 events += more
             elif self._config.governor.cpu_percent >= LEAST_PREDICTION_PERCENT:
-                predicted = self.predict(step_input.frame.t_ns)
+                predicted = self.predict(frame.t_ns)
         elif step_input.predict_ns is not None:
             predicted = self.predict(step_input.predict_ns)
         return StepOutput(estimate, tuple(self._channel.poll(now_ns)), tuple(events), predicted)
@@ -150,6 +157,11 @@ class EkfAgent:
     def submap(self) -> SubmapId:
         """The submap in which the camera is tracked."""
         return self._keyframes.submap
+
+    @property
+    def left_out(self) -> int:
+        """Frames that were left out, as they were not newer than those before."""
+        return self._order.left_out
 
     @property
     def tiles(self) -> dict[tuple[int, int], GridTile]:
