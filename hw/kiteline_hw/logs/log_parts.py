@@ -1,5 +1,7 @@
 """A log and the parts that it goes on in, NAME_1.mcap, NAME_2.mcap…, read as one."""
 
+import glob
+import re
 from collections.abc import Collection, Iterator
 from pathlib import Path
 
@@ -7,6 +9,8 @@ from kiteline_hw.logs.mcap_file import McapFile
 from kiteline_hw.logs.mcap_log_read import LogMessage, LogReader
 from kiteline_hw.logs.mcap_repair import REPAIRED
 from kiteline_hw.ports import SourceError
+
+_NAME = re.compile(r"(.*?)(?:_(\d+))?", re.DOTALL)
 
 
 class WholeLog(LogReader):
@@ -40,7 +44,7 @@ class WholeLog(LogReader):
     def _part(self, path: Path, number: int) -> LogReader | None:
         """A part of this log; None where the file is not there, holds nothing yet, or is another log's."""
         try:
-            part = LogReader(path.with_name(f"{path.stem}_{number}{path.suffix}"))
+            part = LogReader(path_of_part(path, number))
         except (SourceError, OSError):
             return None
         named = {**self.metadata, "part": str(number)}
@@ -53,7 +57,18 @@ class WholeLog(LogReader):
             yield from part.messages(topics)
 
 
+def path_of_part(path: Path, number: int) -> Path:
+    """The file in which a log goes on as this part."""
+    return path.with_name(f"{path.stem}_{number}{path.suffix}")
+
+
+def log_and_part(path: Path) -> tuple[str, int]:
+    """The log that a file belongs to by its name, without the ending, and its number; 0: it is the first."""
+    match = _NAME.fullmatch(path.stem)
+    return (match[1], int(match[2] or 0)) if match else (path.stem, 0)
+
+
 def numbers_of_parts(path: Path) -> list[int]:
-    """Numbers of the files beside a log that are named as its parts."""
-    ends = [other.stem.removeprefix(f"{path.stem}_") for other in path.parent.glob(f"{path.stem}_*{path.suffix}")]
-    return sorted(int(end) for end in ends if end.isdecimal())
+    """Numbers of the files beside a log that are named as its later parts."""
+    named = (log_and_part(other) for other in path.parent.glob(f"*{glob.escape(path.suffix)}"))
+    return sorted(number for log, number in named if log == path.stem and number)

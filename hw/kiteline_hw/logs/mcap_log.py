@@ -42,8 +42,9 @@ from kiteline_core.geometry.cameras import CameraModel, CameraRig
 from kiteline_hw.logs import mcap_schemas as schemas
 from kiteline_hw.logs.image_encoder import ENCODE_ALL, ImageEncoder
 from kiteline_hw.logs.log_budget import LogBudget
+from kiteline_hw.logs.log_parts import path_of_part
 from kiteline_hw.logs.mcap_log_read import LogMessage, LogReader, read_frame
-from kiteline_hw.logs.mcap_write import McapWriter
+from kiteline_hw.logs.mcap_write import CHUNK_BYTES, McapWriter
 from kiteline_hw.logs.rig_json import LENS_NAMES, rig_to_json
 from kiteline_hw.logs.whole_file import BesideFile, FileToCome, WholeFile
 from kiteline_hw.ports import SourceError
@@ -57,7 +58,6 @@ __all__ = [
 LEFT, RIGHT, DEPTH = "/left/image", "/right/image", "/depth/image"
 IMU, ODOMETER, RIG, GROUND_TRUTH = "/imu", "/odometer", "/rig", "/ground_truth"
 
-CHUNK_BYTES = 64 * 1024  # bytes; a cut loses one unfinished chunk at most
 FLUSH_NS = 1_000_000_000  # ns of flight time after which an unfinished chunk is written
 LEVELS = {"debug": 1, "info": 2, "warning": 3, "error": 4, "fatal": 5}
 _JSON = json.JSONEncoder(separators=(",", ":"), allow_nan=False)
@@ -344,7 +344,7 @@ class LogWriter(Closing):
         """Go on in another file, if one can begin with this message and can be made; else in this one."""
         if not self._bytes or (self._part_topic is not None and topic != self._part_topic):
             return
-        path = self.path.with_name(f"{self.path.stem}_{self._part + 1}{self.path.suffix}")
+        path = path_of_part(self.path, self._part + 1)
         created = self._created(path)
         if created is None:
             return

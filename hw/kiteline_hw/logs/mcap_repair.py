@@ -5,7 +5,7 @@ from pathlib import Path
 from mcap.writer import CompressionType, Writer
 
 from kiteline_hw.logs.mcap_file import McapFile
-from kiteline_hw.logs.mcap_log import CHUNK_BYTES
+from kiteline_hw.logs.mcap_write import CHUNK_BYTES
 
 BEGINS = "begins"  # metadata key of a log whose beginning was cut off; its value says where it begins
 REPAIRED = "mended"  # metadata key of a repaired log; its value says what was wrong

@@ -13,6 +13,8 @@ from mcap import records
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 
+CHUNK_BYTES = 64 * 1024  # of a log: a cut loses one unfinished chunk at most
+
 _MAGIC = b"\x89MCAP0\r\n"
 _MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time
 _CHUNK = struct.Struct("<BQQQQIIQ")  # opcode, length, first and last time, size, CRC-32, no compression, size

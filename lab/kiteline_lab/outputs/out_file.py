@@ -27,11 +27,17 @@ def expect_nothing_lost(log: LogWriter, path: Path) -> None:
 
 def write_whole(path: Path, content: bytes) -> None:
     """Write a file that is complete, or stays what it was; into a pipe or a device as it comes. Raises OSError."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    if path.exists() and not path.is_file():
-        path.write_bytes(content)
-    else:
+    if not _written_as_it_comes(path, content):
         write_atomically(path.resolve(), content)  # of a link, what it leads to
+
+
+def _written_as_it_comes(path: Path, content: bytes) -> bool:
+    """Write into a pipe or a device; False if there is none. Makes the folder if need be. Raises OSError."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if path.is_file() or not path.exists():
+        return False
+    path.write_bytes(content)
+    return True
 
 
 def write_files(folder: Path, contents: Mapping[str, bytes], *, force: bool) -> list[Path]:
@@ -46,10 +52,7 @@ def write_files(folder: Path, contents: Mapping[str, bytes], *, force: bool) -> 
         raise SourceError(f"{', '.join(there)} {exist} already: name another place, or overwrite with --force")
     with ExitStack() as stack:
         for path, content in paths.items():
-            path.parent.mkdir(parents=True, exist_ok=True)
-            if path.exists() and not path.is_file():  # a pipe or a device
-                path.write_bytes(content)
-            else:
+            if not _written_as_it_comes(path, content):
                 write_atomically(stack.enter_context(whole_file(path.resolve(), force=True)), content)
     return list(paths)
 

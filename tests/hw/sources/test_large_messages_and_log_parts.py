@@ -128,6 +128,14 @@ def test_the_first_part_of_a_log_is_read_with_the_later_ones(tmp_path: Path) -> 
     assert source.report.notes == ["file cut: its part 1 is missing"]
 
 
+@pytest.mark.parametrize("name", ["flight [1]", "flight_7", "a*b?", "line\nbreak"])
+def test_the_parts_of_a_log_of_any_name_are_read(name: str, tmp_path: Path) -> None:
+    """Brackets in the name hid the later parts."""
+    log_in_parts(tmp_path / "a", name)
+    assert len(list((tmp_path / "a").iterdir())) > 2
+    assert frames_of(open_source(str(tmp_path / "a" / f"{name}.mcap"))) == list(range(20))
+
+
 def test_a_log_without_images_says_why(tmp_path: Path) -> None:
     with LogWriter(tmp_path / "a.mcap", {"role": "agent"}) as log:
         log.rig(0, CameraRig(CameraModel(64, 48, 60.0, 60.0, 31.5, 23.5), None, np.eye(4), None, has_body=False), None)

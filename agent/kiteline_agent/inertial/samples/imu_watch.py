@@ -11,9 +11,9 @@ _OTHER_CLOCK = "and are not used, the images alone carry the pose: expected stam
 SILENT_S = 3.0  # s without a sample, after which an event is logged
 
 
-def has_recent(imu: ImuBatch | None, t_ns: int, within_s: float = SILENT_S) -> bool:
-    """True if there are samples, and the newest one is stamped less than `within_s` before the frame at t_ns."""
-    return imu is not None and len(imu.t_ns) > 0 and t_ns - int(imu.t_ns[-1]) < round(within_s * 1e9)
+def has_recent(imu: ImuBatch | None, t_ns: int, within_ns: int = round(SILENT_S * 1e9)) -> bool:
+    """True if there are samples, and the newest one is stamped less than `within_ns` before the frame at t_ns."""
+    return imu is not None and len(imu.t_ns) > 0 and t_ns - int(imu.t_ns[-1]) < within_ns
 
 
 class ImuWatch:
@@ -24,7 +24,7 @@ class ImuWatch:
 
     def __init__(self, silent_s: float, gravity_m_s2: float) -> None:
         """silent_s: time without a sample after which silence is reported."""
-        self._silent_s, self._silent_ns = silent_s, round(silent_s * 1e9)
+        self._silent_ns = round(silent_s * 1e9)
         self._gravity_m_s2 = gravity_m_s2
         self._last_ns: int | None = None  # of the last frame with samples, or of the first frame before any
         self._silent = False
@@ -37,7 +37,7 @@ class ImuWatch:
         """Process a frame; returns the events for the log."""
         if imu is not None and len(imu.t_ns):
             self._newest_ns = int(imu.t_ns[-1])
-        if imu is not None and has_recent(imu, t_ns, self._silent_s):
+        if imu is not None and has_recent(imu, t_ns, self._silent_ns):
             was_silent, self._silent, self._last_ns = self._silent, False, t_ns
             return [*(["imu: samples again"] if was_silent else []), *self._weigh(imu)]
         if self._last_ns is None:

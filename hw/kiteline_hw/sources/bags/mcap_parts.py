@@ -9,6 +9,7 @@ from pathlib import Path
 
 from mcap.records import Channel, Schema
 
+from kiteline_hw.logs.log_parts import log_and_part
 from kiteline_hw.logs.mcap_file import McapFile, RawMessage
 from kiteline_hw.ports import SourceError
 
@@ -16,7 +17,6 @@ _OVERLAP_NS = 200_000_000  # ns; topics are written by threads of their own, so 
 _MOST_METADATA_BYTES = 1 << 20
 _MOST_PARTS = 1000  # higher numbers in names are dates or times
 _NUMBERED = re.compile(r"(.*)_(\d+)")
-_LOG_PART = re.compile(r"(.*?)(_\d+)?")
 
 
 class McapParts:
@@ -118,8 +118,8 @@ def are_parts(folder: Path, paths: list[Path]) -> bool:
 
 def _are_of_log(files: list[McapFile]) -> bool:
     """True if files are named as a kiteline log and its later parts, and are logs."""
-    names = {match[1] for file in files if (match := _LOG_PART.fullmatch(file.path.stem))}
-    return len(names) == 1 and all(any(m.name == "kiteline" for m in file.metadata) for file in files)
+    logs = {log_and_part(file.path)[0] for file in files}
+    return len(logs) == 1 and all(any(m.name == "kiteline" for m in file.metadata) for file in files)
 
 
 def _numbered(paths: list[Path]) -> bool:
@@ -130,9 +130,9 @@ def _numbered(paths: list[Path]) -> bool:
 
 def _missing(paths: list[Path]) -> list[str]:
     """A line on the parts that are missing between others, by the numbers in their names; the oldest may have gone."""
-    names = [match for path in paths if (match := _LOG_PART.fullmatch(path.stem))]
-    numbers = {int((name[2] or "_0")[1:]) for name in names}
-    if len(numbers) < len(paths) or len({name[1] for name in names}) > 1 or max(numbers) >= _MOST_PARTS:
+    named = [log_and_part(path) for path in paths]
+    numbers = {number for _, number in named}
+    if len(numbers) < len(paths) or len({log for log, _ in named}) > 1 or max(numbers) >= _MOST_PARTS:
         return []
     missing = sorted(set(range(min(numbers), max(numbers))) - numbers)
     if not missing:
