@@ -4,7 +4,6 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -94,7 +93,6 @@ class AgentRuntime:
         self.reader: FrameReader | CameraReader = (
             FrameReader(source, until_ns, time.process_time_ns) if self.camera is None else CameraReader(self.camera)
         )
-        self._files = ExitStack()
         self._log_shift_ns = options.start_ns  # log time minus the time handed to the agent: log times are source times
         self._log_config = config.log
         self._encoder = ImageEncoder(EncodingPolicy(config.log.compressed, _IMAGES_WAITING))
@@ -145,17 +143,14 @@ class AgentRuntime:
                 raise
             self._notices.say("log", f"no log of this flight: {error}")
             return None
-        self._files.enter_context(log)
         self._log, self._budget = log, budget
         log.rig(self._log_shift_ns, source.rig, source.imu)
         log.flush()  # an agent that dies at once leaves a log that can be read
         paths = [folder / f"{options.trajectory_prefix}{name}" for name in ("live.tum", "odometry.tum")]
         live, odometry = [LineFile(path, beside=options.log_optional) for path in paths]
         self._lines = live, odometry
-        for file, path in zip(self._lines, paths, strict=True):
-            self._files.callback(file.close)
-            if options.trajectory_prefix:
-                link_newest(folder / path.name.removeprefix(options.trajectory_prefix), path)
+        for path in paths if options.trajectory_prefix else ():
+            link_newest(folder / path.name.removeprefix(options.trajectory_prefix), path)
         return FlightRecord(log, live, odometry, options.agent, self.channel, config.log.every)
 
     @property
@@ -341,14 +336,25 @@ class AgentRuntime:
             self._notices.say("rig", f"rig: {error}")
 
     def close(self) -> None:
-        """Finish the files. A disk that does not answer is awaited for some seconds."""
+        """Finish the files. A disk that does not answer is awaited for some seconds, for all of them at once."""
+        beside = [self._finish_rig, *(file.close for file in self._lines)]
+        threads = [threading.Thread(target=finish, name="closing", daemon=True) for finish in beside]
+        for thread in threads:
+            thread.start()
+        if self._log is not None:
+            self._log.close()
+        for thread in threads:
+            thread.join()
+
+    def _finish_rig(self) -> None:
+        """Write the rig file once more, after the save that may be under way."""
+        until_s = time.monotonic() + _SAVE_S
         if self._saving is not None:
             self._saving.join(_SAVE_S)
         self._save_rig()
         if self._saving is not None:
-            self._saving.join(_SAVE_S)
+            self._saving.join(max(0.0, until_s - time.monotonic()))
             self._rig_waits = self._saving.is_alive()
-        self._files.close()
 
 
 def opened(options: AgentOptions) -> FrameSource:

@@ -254,18 +254,18 @@ class LogWriter(Closing):
     def _finish(self) -> None:
         if self._stream.closed:
             return
-        if self._coming is not None:
-            self._coming.remove()
         try:
             self._writer.finish()
         except OSError as error:
             self._count_lost(error)
         finally:
             self._end(self._stream)
+        BesideFile.close_all(self._ended)
         for stream in self._ended:
-            stream.close()
             if stream.unwritten:
                 self._count_lost(stream.fault, stream.unwritten)
+        if self._coming is not None and not self.why:  # a disk that does not answer is not awaited once more
+            self._coming.remove()
 
     def _end(self, stream: WholeFile | BesideFile) -> None:
         """End a part without waiting for the disk."""

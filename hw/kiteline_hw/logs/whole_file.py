@@ -4,7 +4,9 @@ import contextlib
 import errno
 import os
 import threading
+import time
 from collections import deque
+from collections.abc import Sequence
 from pathlib import Path
 
 _MOST_BYTES = 32 << 20  # bytes that wait for a disk: 5 to 10 s of a stereo camera's images
@@ -119,9 +121,17 @@ class BesideFile:
 
     def close(self) -> None:
         """End the file, and wait for the disk for some seconds. May be called twice."""
-        self.end()
-        self._closing.set()
-        self._thread.join(_CLOSE_S)
+        self.close_all([self])
+
+    @staticmethod
+    def close_all(files: "Sequence[BesideFile]") -> None:
+        """Close files of one disk, which is awaited for some seconds in all."""
+        until_s = time.monotonic() + _CLOSE_S
+        for file in files:
+            file.end()
+            file._closing.set()
+        for file in files:
+            file._thread.join(max(0.0, until_s - time.monotonic()))
 
     def _run(self) -> None:
         while True:
