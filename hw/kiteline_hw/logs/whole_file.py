@@ -30,6 +30,11 @@ class WholeFile:
         """True after `close`."""
         return self._fd < 0
 
+    @property
+    def deleted(self) -> bool:
+        """True if the file has no name any more."""
+        return self._fd < 0 or os.fstat(self._fd).st_nlink == 0
+
     def write(self, data: bytes) -> int:
         """Append a piece. Raises OSError if the disk does not take all of it."""
         view, at = memoryview(data), self.size
@@ -62,8 +67,8 @@ class WholeFile:
 class BesideFile:
     """A WholeFile that is written by a thread of its own: a loop that flies does not wait for a disk that stalls.
 
-    Pieces wait in memory in their order, one that the disk refuses until it is taken. Raises OSError if the file cannot
-    be created.
+    Pieces wait in memory in their order, one that the disk refuses until it is taken, or the file was ended and is
+    deleted. Raises OSError if the file cannot be created.
     """
 
     def __init__(self, path: Path, most_bytes: int = _MOST_BYTES) -> None:
@@ -144,7 +149,8 @@ class BesideFile:
                 self._file.write(data)
             except OSError as error:
                 self._fault = error.errno or 0, error.strerror or str(error)
-                if self._closing.is_set():
+                # An ended file that was deleted to make room gives it only once it is closed.
+                if self._closing.is_set() or (self._ended and self._file.deleted):
                     break
                 self._closing.wait(_RETRY_S)
                 continue

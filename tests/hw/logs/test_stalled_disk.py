@@ -137,3 +137,20 @@ def test_a_part_that_was_not_begun_when_the_log_ends_is_removed(
     folder.go.set()
     until(lambda: not coming._thread.is_alive())
     assert steps_of(path) == list(range(150)) and [p.name for p in tmp_path.iterdir()] == ["boot00008.mcap"]
+
+
+def test_a_part_that_is_deleted_on_a_full_disk_is_closed_and_leaves_its_room(
+    tmp_path: Path, small_disk: Callable[[int], SmallDisk], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It waited for the room that it took itself, and so did the part that the log went on in: both were lost."""
+    monkeypatch.setattr(whole_file, "_RETRY_S", 0.01)
+    small_disk(5)
+    file = BesideFile(tmp_path / "log.mcap")
+    file.write(b"123456")
+    until(lambda: bool(file.waits_for))
+    (tmp_path / "log.mcap").unlink()
+    time.sleep(0.05)
+    assert not file._file.closed, "what comes may still find room"
+    file.end()
+    until(lambda: file._file.closed)
+    assert file.unwritten == 1 and "No space" in str(file.fault)
