@@ -72,7 +72,7 @@ class RecordChannel(Protocol):
         ...
 
     def take_removed(self) -> list[Key]:
-        """The keys that the other side removed since the last call."""
+        """The keys that the other side removed since the last call, and did not put again."""
         ...
 
     def poll(self, now_ns: int) -> list[bytes]:
@@ -87,7 +87,7 @@ class PlainChannel:
 
     def __init__(self) -> None:
         self._arrived: list[Record] = []
-        self._removed: list[Key] = []
+        self._removed: dict[Key, None] = {}
         self._partner: PlainChannel = self
 
     def keyframe_gap_ns(self) -> int:
@@ -105,12 +105,13 @@ class PlainChannel:
     def put(self, record: Record) -> Record:
         """Hand over a record."""
         self._partner._arrived.append(record)
+        self._partner._removed.pop(messages.key(record), None)
         return record
 
     def remove(self, key: Key) -> None:
         """Remove a record."""
         self._partner._arrived = [r for r in self._partner._arrived if messages.key(r) != key]
-        self._partner._removed.append(key)
+        self._partner._removed[key] = None
 
     def receive(self, packets: Sequence[bytes], now_ns: int) -> list[Record]:
         """What the partner put since the last call; there are no packets."""
@@ -119,8 +120,8 @@ class PlainChannel:
 
     def take_removed(self) -> list[Key]:
         """What the partner removed since the last call."""
-        removed, self._removed = self._removed, []
-        return removed
+        removed, self._removed = self._removed, {}
+        return list(removed)
 
     def poll(self, now_ns: int) -> list[bytes]:
         """Nothing."""
@@ -159,7 +160,7 @@ class CodedChannel:
         self.undecodable = 0  # values whose code is no valid record: the other side has another schema
         self.noting = False  # whether `take_noted` is used
         self._noted: dict[Key, bytes] = {}
-        self._removed: list[Key] = []
+        self._removed: dict[Key, None] = {}
         self._pacer = Pacer(profile, config.budget_bytes)
         self._live_t_ns: int | None = None  # of the last pose that was shared
 
@@ -254,10 +255,11 @@ class CodedChannel:
         for packet in packets:
             for update in self.endpoint.receive(packet, now_ns):
                 if update.code is None:
-                    self._removed.append(update.key)
+                    self._removed[update.key] = None
                     continue
                 try:
                     records.append(messages.decode(update.key, update.code))
+                    self._removed.pop(update.key, None)  # applied after the records, it would remove this newer one
                 except WireError:
                     self.undecodable += 1
         if self._from_base:
@@ -286,12 +288,12 @@ class CodedChannel:
         if any(isinstance(record, SubmapPlacement) for record in records):
             self._placed_by, earlier.compared = session, False
         elif self._placed_by == session:
-            self._removed += earlier.take_ended()
+            self._removed |= dict.fromkeys(earlier.take_ended())
 
     def take_removed(self) -> list[Key]:
-        """The keys that the other side removed since the last call."""
-        removed, self._removed = self._removed, []
-        return removed
+        """The keys that the other side removed since the last call, and did not put again."""
+        removed, self._removed = self._removed, {}
+        return list(removed)
 
     def poll(self, now_ns: int) -> list[bytes]:
         """All packets that may be sent now."""

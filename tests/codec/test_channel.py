@@ -180,6 +180,26 @@ def test_what_a_base_that_lost_its_map_wrote_ends_once_the_next_one_has_placed_a
     assert held == {placed, *keys} and not agent.undecodable and agent.stats.rejected == 0
 
 
+@pytest.mark.parametrize("coded", [False, True])
+def test_what_is_removed_and_put_again_between_two_looks_is_not_removed(coded: bool) -> None:
+    """Who looks applies removals last: a map that lost its place and was merged again at once had none for good."""
+    placement = SubmapPlacement(SubmapId(0), np.eye(4))
+    key = messages.key(placement)
+    base, agent = (coded_channel(1, peer=AgentId(0)), coded_channel(agent_session(1, 0))) if coded else plain_pair()
+    cross(base, agent)
+    base.put(placement)
+    assert len(cross(base, agent)[0]) == 1
+    base.remove(key)
+    packets = base.poll(10**9)
+    base.put(replace(placement, recognised=True))
+    records = agent.receive([*packets, *base.poll(10**9 + 1)], 10**9 + 2)
+    assert [(r.KIND, getattr(r, "recognised", None)) for r in records][-1] == (SubmapPlacement.KIND, True)
+    assert agent.take_removed() == []
+    base.remove(key)
+    agent.receive(base.poll(10**9 + 3), 10**9 + 4)
+    assert agent.take_removed() == [key]
+
+
 def test_a_new_start_of_an_agent_gets_nothing_of_keyframes_that_earlier_ones_made() -> None:
     """It holds none of them. The base keeps what it said of them, for its store."""
     base = coded_channel(1, peer=AgentId(3))
