@@ -45,8 +45,12 @@ class LogBudget:
         self._deleting: threading.Thread | None = None
 
     def make_room(self, writing: Path | None = None) -> None:
-        """Delete the oldest logs until there is room for another part. writing: the newest one, which stays."""
+        """Delete the oldest logs until there is room for another part. writing: the newest one, which stays.
+
+        So does the part that is created to follow it.
+        """
         logs = self._logs(writing)
+        part = 0 if writing is None else _numbers(writing, self._stem)[1]
         lines = self._trajectories()
         parts = Counter(log.start for log in logs)
         used = sum(log.size for log in logs) + sum(size for of_start in lines.values() for _, size in of_start)
@@ -56,7 +60,7 @@ class LogBudget:
         for log in logs:
             if used <= allowed:
                 break
-            if log.path == writing:
+            if log.path == writing or (log.in_flight and log.part > part):
                 continue
             try:
                 log.path.unlink()

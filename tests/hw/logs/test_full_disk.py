@@ -111,6 +111,14 @@ def test_a_clock_that_was_set_back_does_not_make_the_flight_under_way_the_oldest
     assert {path.stem for path in tmp_path.iterdir()} == {f"boot{number:05d}_{part}" for part in range(5, 12)}
 
 
+def test_the_part_that_is_about_to_be_written_is_not_deleted(tmp_path: Path) -> None:
+    """The log would go on in a file without a name."""
+    for name, size in (("boot00008.mcap", 5000), ("boot00008_1.mcap", 5000), ("boot00008_2.mcap", 0)):
+        put(tmp_path, name, size, 100)
+    LogBudget(tmp_path, "boot", 10**9, reserve_bytes=10**18).make_room(tmp_path / "boot00008_1.mcap")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["boot00008_1.mcap", "boot00008_2.mcap"]
+
+
 def test_trajectories_are_deleted_with_the_last_part_of_their_log(tmp_path: Path) -> None:
     names = ["boot00007.mcap", "boot00007_1.mcap", "boot00008.mcap"]
     lines = [f"boot{number:05d}.{kind}.tum" for number in (7, 8) for kind in ("live", "odometry")]
