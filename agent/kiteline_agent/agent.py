@@ -108,7 +108,7 @@ class Agent:
         )  # fmt: skip
         self._submaps = SubmapStage(
             self._camera, self.map, tracker, maker, self._keyframes, self._relocaliser, self._depth,
-            self._two_view_start, inertial_start, self._governor, channel, self._rectifier,
+            self._two_view_start, inertial_start, self._governor, channel, self._rectifier, self._corrections,
         )  # fmt: skip
         self._scans = None
         if self._has_depth and config.scan.on:

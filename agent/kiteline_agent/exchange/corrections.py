@@ -181,6 +181,17 @@ class Corrections:
         """A submap began in a tracked frame: odometry places it well, and its merge is a correction like others."""
         self._continued = submap
 
+    def continue_in_metres(self, submap: SubmapId, old: SubmapId, unit_m: float) -> None:
+        """A submap in metres began where the old one is tracked, with its axes. unit_m: metres, one unit of that.
+
+        Live poses go on where the base will place it: it scales w as long as the old one is its first submap.
+        """
+        for state in (self._smoothing, self._filter, self._whole):
+            state.clear()
+        S_w_old, self._own_world = self._S_w_m.get(old), None
+        if S_w_old is not None:
+            self._S_w_m[submap] = sim3.with_scaled_translation(sim3.rigid(S_w_old), unit_m / sim3.scale_of(S_w_old))
+
     def is_recognised(self, submap: SubmapId) -> bool:
         """True if the base merged a submap with another one: its pose there rests on more than odometry."""
         return submap in self._recognised

@@ -210,11 +210,18 @@ class CameraState:
         self.pose.T_m_c = se3.from_rt(level_rotation(-gravity_b), np.zeros(3)) @ se3.inverse(self.T_c_b)
 
     def continue_in_metres(self, unit_m: float) -> F64:
-        """Begin a new submap in this tracked frame. unit_m: m, one unit of the old one. Returns T_new_old (4,4)."""
+        """Begin a new submap in this tracked frame. unit_m: m, one unit of the old one. Returns T_new_old (4,4).
+
+        One that follows a map in a unit of its own lies as that one does, which the base scales alike: live poses are
+        in the base's world at once.
+        """
         self.leave_map()
         if self.submaps.opened == 1:
             self._T_o_first = self.pose.T_o_m.copy()
-        return self.pose.rescale(unit_m)
+        if self.motion.metric or unit_m == 1.0:
+            return self.pose.rescale(unit_m)
+        self.pose.rescale_map(unit_m)
+        return np.eye(4)
 
     def leave_submap(self) -> None:
         """Leave the active submap for a new one that begins here."""

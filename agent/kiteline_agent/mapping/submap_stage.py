@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from kiteline_agent.exchange.corrections import Corrections
 from kiteline_agent.governor.governor import Extra, Governor
 from kiteline_agent.inertial.imu_initialisation import InertialStartState
 from kiteline_agent.inertial.inertial_tracker import InertialTracker
@@ -68,9 +69,11 @@ class SubmapStage:
         self, camera: CameraState, local_map: LocalMap, tracker: Tracker, maker: KeyframeMaker,
         keyframes: KeyframeStage, relocaliser: Relocaliser, depth: DepthFromMotion, two_view_start: TwoViewStart | None,
         inertial_start: InertialStart | None, governor: Governor, channel: RecordChannel, rectifier: Rectifier,
+        corrections: Corrections,
     ) -> None:  # fmt: skip
         self._camera = camera
         self._rectifier = rectifier
+        self._corrections = corrections
         self._map = local_map
         self._tracker = tracker
         self._maker = maker
@@ -277,8 +280,11 @@ class SubmapStage:
     def _restart(self, ctx: FrameContext, unit_m: float, metric: MetricPoints) -> F64:
         """Begin a submap in metres here. Returns T_new_old (4,4)."""
         camera = self._camera
-        self._channel.put(SubmapScale(camera.submaps.active, unit_m))
+        old, own_unit = camera.submaps.active, not camera.motion.metric
+        self._channel.put(SubmapScale(old, unit_m))
         T_new_old = self._begin_at_track(ctx, unit_m, metric, tells_scale=True)
+        if own_unit:
+            self._corrections.continue_in_metres(camera.submaps.active, old, unit_m)
         camera.motion.set_scale(ctx.t_ns, unit_m, T_new_old)
         if self._two_view_start is not None:
             self._two_view_start.rescale(unit_m)

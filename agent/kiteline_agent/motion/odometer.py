@@ -58,6 +58,7 @@ class Odometer:
         self._anchor: tuple[int, F64] | None = None  # stamp and T_m_c at the start of the window
         self._last: tuple[int, F64] | None = None  # stamp and T_m_c of the last frame
         self._velocity, self._rate = np.zeros(3), np.zeros(3)  # in b
+        self._accel = np.zeros(3)  # m/s^2, by which the velocity changed last
         self._velocity_cov, self._rate_cov = np.eye(3), np.eye(3)
         self._velocity_slow, self._rate_slow = np.eye(3), np.eye(3)  # correlated part of the covariances
         self._jump = 0.0  # m/s, largest rejected change of velocity; 0: none since it was last used
@@ -152,8 +153,9 @@ class Odometer:
         c, dt = self._config, (t_ns - before_ns) * 1e-9
         growth = dt * (dt + 2.0 * self._alone_s) * np.eye(3)  # of unmeasured velocity, by acceleration
         prior, rate_prior = self._velocity_cov + c.accel_m_s2**2 * growth, self._rate_cov + c.turn_rad_s2**2 * growth
-        if mean is None or not self._correct_velocity(mean, prior, rate_prior):
+        if mean is None or not self._correct_velocity(mean, prior, rate_prior, dt):
             self._alone_s += dt
+            self._accel = np.zeros(3)
             self._velocity_cov = self._velocity_slow = prior
             self._rate_cov = self._rate_slow = rate_prior
             self._gain = np.zeros((3, 3))
@@ -176,29 +178,31 @@ class Odometer:
         twist = np.concatenate([update.value, rate.value])
         return along_twist(T_m_b, twist, dt, growth, MotionSource.ODOMETER)
 
-    def _correct_velocity(self, mean: MeanVelocity, prior: F64, rate_prior: F64) -> bool:
-        """Kalman update of the velocity; False if the sample is rejected: a wheel slips or the sensor is dead."""
+    def _correct_velocity(self, mean: MeanVelocity, prior: F64, rate_prior: F64, dt_s: float) -> bool:
+        """Kalman update of the velocity; False if the sample is rejected: a wheel slips or the sensor is dead.
+
+        A vehicle that speeds up goes on doing so: a slip begins at once.
+        """
         update = self._updated_velocity(mean, prior)
+        if not update.accepted:
+            update = self._updated_velocity(mean, prior, self._velocity + dt_s * self._accel)
         jump = float(np.linalg.norm(self.scale * mean.velocity - self._velocity))
         if not update.accepted or jump > _SETTLED * self._jump > 0.0:
             self._jump = max(self._jump, jump) if self.image_loss_s > 0.0 else 0.0
             return False
         self._jump = self._alone_s = 0.0
-        self._velocity, self._velocity_cov, self._velocity_slow, self._gain = (
-            update.value,
-            update.cov,
-            update.slow,
-            update.gain,
-        )
+        self._accel = (update.value - self._velocity) / dt_s
+        self._velocity, self._velocity_cov, self._velocity_slow = update.value, update.cov, update.slow
+        self._gain = update.gain
         update = self._updated_rate(mean, rate_prior)
         self._rate, self._rate_cov, self._rate_slow = update.value, update.cov, update.slow
         return True
 
-    def _updated_velocity(self, mean: MeanVelocity, prior: F64) -> "_KalmanUpdate":
-        """The velocity (3,) in b by a sample. prior: (3,3) its covariance before."""
+    def _updated_velocity(self, mean: MeanVelocity, prior: F64, expected: F64 | None = None) -> "_KalmanUpdate":
+        """The velocity (3,) in b by a sample. prior: (3,3) its covariance before. expected: (3,); None: as it was."""
         c, z = self._config, self.scale * mean.velocity
         slow = (self._noise + c.floor_m_s**2) * np.eye(3) + self._scale_var * np.outer(z, z)
-        return _blend(self._velocity, prior, z, mean.velocity_cov, slow, _SURPRISE)
+        return _blend(self._velocity if expected is None else expected, prior, z, mean.velocity_cov, slow, _SURPRISE)
 
     def _updated_rate(self, mean: MeanVelocity, prior: F64) -> "_KalmanUpdate":
         """The same of the rate (3,), never rejected: a gust turns the vehicle at once."""
@@ -303,6 +307,7 @@ class Odometer:
     def _set_velocity(self, before: F64, after: F64, dt_s: float) -> None:
         """Set the velocity to that between two frames placed by images."""
         twist = se3.log(self._T_b_c @ se3.inverse(before) @ after @ self._T_c_b) / dt_s
+        self._accel = (twist[:3] - self._velocity) / dt_s
         self._velocity, self._rate = twist[:3], twist[3:]
         self._velocity_cov, self._rate_cov = _SEEN_M_S**2 * np.eye(3), _SEEN_RAD_S**2 * np.eye(3)
 

@@ -119,6 +119,17 @@ class PoseState:
         self.T_m_c = self.T_o_m @ self.T_m_c
         self.T_o_m, self._last_measured, self._by_sensor = np.eye(4), None, False
 
+    def rescale_map(self, metres: float) -> None:
+        """Begin a submap in metres here whose axes are those of the old one. metres: one unit of it.
+
+        All that was flown in it is longer by that, so the camera is where the old map has it.
+        """
+        T_o_c = self.T_o_m @ self.T_m_c
+        self.T_m_c, self._step_T = scaled(self.T_m_c, metres), scaled(self._step_T, metres)
+        self.velocity = metres * self.velocity
+        self.T_o_m = se3.orthonormalise(T_o_c @ se3.inverse(self.T_m_c))
+        self._last_measured, self._by_sensor = None, False
+
     def rescale(self, metres: float) -> F64:
         """Begin a submap in metres here. metres: one unit of the old submap. Returns T_new_old (4,4), lengths in m."""
         T_m_c = scaled(self.T_m_c, metres)
