@@ -263,13 +263,13 @@ def test_a_loop_may_be_off_by_as_much_as_its_scale_says(make_flight: MakeFlight,
 
 def test_depths_that_do_not_say_one_length_say_none() -> None:
     rng = np.random.default_rng(0)
-    config, own = BaseConfig().loops, rng.uniform(1.0, 8.0, 60)
-    told = depth_scale(own, 2.5 * own * np.exp(rng.normal(0.0, 0.05, 60)), config)
+    own = rng.uniform(1.0, 8.0, 60)
+    told = depth_scale(own, 2.5 * own * np.exp(rng.normal(0.0, 0.05, 60)))
     assert abs(told / 2.5 - 1.0) < 0.03
-    assert depth_scale(own[:10], 2.5 * own[:10], config) is None
-    assert depth_scale(own, own * np.exp(rng.normal(0.0, 0.4, 60)), config) is None
+    assert depth_scale(own[:10], 2.5 * own[:10]) is None
+    assert depth_scale(own, own * np.exp(rng.normal(0.0, 0.4, 60))) is None
     halves = np.where(np.arange(60) < 31, 1.0, 2.0)
-    assert depth_scale(own, halves * own, config) is None
+    assert depth_scale(own, halves * own) is None
 
 
 def test_what_a_base_remembers_of_units_is_known_to_the_next(met: Met, words: Any) -> None:

@@ -7,7 +7,6 @@ filter knows it, by its distance.
 
 import numpy as np
 
-from kiteline_agent.config import AlignConfig
 from kiteline_agent.ekf_config import EkfConfig
 from kiteline_agent.imaging import alignment_kernels, features, optical_flow
 from kiteline_agent.imaging.alignment_kernels import ALIGN_ITERATIONS, MIN_NCC, TEMPLATE, TEMPLATE_LEVELS
@@ -25,11 +24,9 @@ _REPLENISH = 0.75  # share of the option `corners` below which new ones are sear
 class CornerFlow:
     """Follows corners; ids increase and are never used again."""
 
-    def __init__(
-        self, camera: RectifiedCamera, detector: DetectorConfig, align: AlignConfig, config: EkfConfig
-    ) -> None:
+    def __init__(self, camera: RectifiedCamera, detector: DetectorConfig, config: EkfConfig) -> None:
         self._focal, self._centre = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
-        self._detector, self._align, self._config = detector, align, config
+        self._detector, self._config = detector, config
         self._last: Pyramid | None = None
         self._next_id = 0
         self.ids: I64 = np.zeros(0, np.int64)  # (n,) increasing

@@ -48,7 +48,7 @@ class EkfAgent:
         self._slam = EkfSlam(camera, config.ekf, T_o_b)
         self._T_c_b = se3.inverse(camera.T_b_c)
         self._R_l_o = np.eye(3)
-        self._flow = CornerFlow(camera, config.detector, config.align, config.ekf)
+        self._flow = CornerFlow(camera, config.detector, config.ekf)
         self._motion = OdometerMotion(camera.T_b_c, config.ekf, config.odometer.keep_s, config.odometer.max_gap_s)
         self._governor = Governor(config.governor)
         self._keyframes = SharedKeyframes(camera, config, identity, channel, self._governor, self.work)

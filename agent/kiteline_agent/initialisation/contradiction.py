@@ -25,9 +25,7 @@ _LENS_CHI2 = 26.0  # squared deviations of the eight errors of a lens: 99.9 % of
 _GYRO_NOISE = 5.0  # times that of single samples, as rotations by images show it
 
 
-def contradicts(
-    solution: WindowSolution, gyro_noise: float, prior: BiasPrior, lens_info: F64, config: ContradictionConfig
-) -> bool:
+def contradicts(solution: WindowSolution, gyro_noise: float, prior: BiasPrior, lens_info: F64) -> bool:
     """True if a window fits only with errors of lens, gyro or accelerometer that no calibrated sensor has.
 
     gyro_noise: factor on the noise of single samples that the rotations show. lens_info: (8,8) inverse covariance of
@@ -43,9 +41,7 @@ def contradicts(
     )
 
 
-def exceeds_lens_errors(
-    solution: WindowSolution, gyro_noise: float, prior: BiasPrior, config: ContradictionConfig
-) -> bool:
+def exceeds_lens_errors(solution: WindowSolution, gyro_noise: float, prior: BiasPrior) -> bool:
     """True if a window that contradicts does so by more than its lens: a lens may be off beside a true IMU."""
     off = (solution.bias[3:] - prior.bias[3:]) / prior.sigma[3:]
     return bool(gyro_noise > _BOTH_GYRO_NOISE or np.abs(off).max() > _ACCEL_BIAS)

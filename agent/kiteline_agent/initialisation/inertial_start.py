@@ -261,9 +261,7 @@ class InertialStart:
         noise, sigma = self._seen_noise(solution)
         if sigma < _NEARLY * _SCALE_SIGMA:
             self._work.alignments += int(np.count_nonzero(observations.seen))
-            aligned = realigned(
-                keyframes, observations, solution.state, found.xyz, found.first, self._camera, self._config.align
-            )
+            aligned = realigned(keyframes, observations, solution.state, found.xyz, found.first, self._camera)
             all_corners = corner_tracks.with_found(all_corners, columns, aligned)
             yield
             keep = aligned.seen.sum(axis=0) >= _MIN_VIEWS
@@ -372,10 +370,9 @@ class InertialStart:
 
     def _contradicts(self, solution: WindowSolution, noise: WindowNoise) -> tuple[bool, bool]:
         """Whether a window contradicts, and whether it does so by more than its lens."""
-        gyro_noise, limits = noise.gyro / self._measured_noise().gyro, self._config.inertial_start.contradiction
-        prior = self._default_prior()
-        wrong = contradicts(solution, gyro_noise, prior, self._lens_prior, limits)
-        return wrong, wrong and exceeds_lens_errors(solution, gyro_noise, prior, limits)
+        gyro_noise, prior = noise.gyro / self._measured_noise().gyro, self._default_prior()
+        wrong = contradicts(solution, gyro_noise, prior, self._lens_prior)
+        return wrong, wrong and exceeds_lens_errors(solution, gyro_noise, prior)
 
     def _note_contradiction(self, t_ns: int, *, contradicts: bool | None, by_imu: bool = True) -> None:
         self._warnings += self._contradiction.note(t_ns, contradicts=contradicts, by_imu=by_imu)

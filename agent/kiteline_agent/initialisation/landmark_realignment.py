@@ -5,7 +5,6 @@ Optical flow drifts from keyframe to keyframe; an alignment with one template, w
 
 import numpy as np
 
-from kiteline_agent.config import AlignConfig
 from kiteline_agent.imaging import alignment_kernels
 from kiteline_agent.imaging.alignment_kernels import ALIGN_ITERATIONS, MIN_NCC, TEMPLATE, TEMPLATE_LEVELS
 from kiteline_agent.initialisation.corner_tracks import CornerObservations, TrackedKeyframe
@@ -24,7 +23,7 @@ _MAX_SCALE = 3.0  # of areas
 
 def realigned(
     keyframes: list[TrackedKeyframe], observations: CornerObservations, state: WindowState, xyz: F64, first: I64,
-    camera: RectifiedCamera, config: AlignConfig,
+    camera: RectifiedCamera,
 ) -> CornerObservations:  # fmt: skip
     """Observations by alignment. xyz: (P,3) m landmarks in w. first: (P,) keyframe that saw each first."""
     f, c = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])

@@ -76,7 +76,7 @@ def keyframe_need(situation: Situation, config: KeyframeConfig) -> KeyframeNeed 
 
 
 def situation(
-    track: Track, camera: RectifiedCamera, T_m_k: F64, frames_since: int, seconds_since: float, reference_inliers: int,
+    track: Track, T_m_k: F64, frames_since: int, seconds_since: float, reference_inliers: int,
     cover: float, reference_cover: float,
 ) -> Situation:  # fmt: skip
     """Measure what the rules read. T_m_k: (4,4) of the reference keyframe. cover, reference_cover: see Situation."""

@@ -87,9 +87,7 @@ class ReferenceKeyframe:
         T_m_k = self._pose_of(self.keyframe) if T_m_k is None else T_m_k
         assert T_m_k is not None
         age_s = (ctx.t_ns - self._newest.t_ns) * 1e-9
-        now = situation(
-            track, self._map.camera, T_m_k, frames, age_s, self._newest.inliers, cover, self._newest.cover
-        )  # fmt: skip
+        now = situation(track, T_m_k, frames, age_s, self._newest.inliers, cover, self._newest.cover)
         need = keyframe_need(now, ctx.config.keyframe)
         if need is None or not unshared:
             return need

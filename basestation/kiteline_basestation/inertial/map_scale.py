@@ -88,11 +88,11 @@ def map_scale(
         return None
     path = path_along(segments, T_w_c)
     drift = drift_along(segments, path, T_w_c, shared, config)
-    state, weight = _start(path, drift, config), np.ones(len(path.begin))
+    state, weight = _start(path, drift), np.ones(len(path.begin))
     agent_units = told_units(segments, T_w_c)
     for _ in range(_ITERATIONS):
-        J, e, chi2 = _linearised(path, drift, state, weight, config)
-        solved = _solve(path, drift, state, J, e, agent_units, config)
+        J, e, chi2 = _linearised(path, drift, state, weight)
+        solved = _solve(path, drift, state, J, e, agent_units)
         if solved is None:
             return None
         state, variance = solved
@@ -110,7 +110,7 @@ def map_scale(
 _MEDIAN_3 = 2.366  # of a chi-square with three degrees of freedom
 
 
-def _start(path: MapPath, drift: ScaleDrift, config: InertialScaleConfig) -> _State:
+def _start(path: MapPath, drift: ScaleDrift) -> _State:
     a, dt = path.begin, path.dt_s
     place = path.camera - path.lever
     velocity = np.zeros_like(place)
@@ -130,9 +130,7 @@ def _tangent(gravity: F64) -> F64:
     return np.asarray(np.column_stack([x, np.cross(u, x)]) * np.linalg.norm(gravity))
 
 
-def _linearised(
-    path: MapPath, drift: ScaleDrift, state: _State, weight: F64, config: InertialScaleConfig
-) -> tuple[F64, F64, F64]:  # fmt: skip
+def _linearised(path: MapPath, drift: ScaleDrift, state: _State, weight: F64) -> tuple[F64, F64, F64]:
     """Jacobians (n,12,20+m) of whitened errors by two nodes and the shared unknowns, errors (n,12), and the squared
     errors (n,) of the images in deviations.
     """
@@ -178,7 +176,7 @@ def _linearised(
 
 
 def _solve(
-    path: MapPath, drift: ScaleDrift, state: _State, J: F64, e: F64, agent_units: float, config: InertialScaleConfig
+    path: MapPath, drift: ScaleDrift, state: _State, J: F64, e: F64, agent_units: float
 ) -> tuple[_State, float] | None:
     """A Gauss-Newton step, and the variance of the mean unit; None if the system has no solution."""
     k, shared = len(path.fresh), _SHARED + len(drift.mean)

@@ -145,7 +145,7 @@ def verify_loop(
         if not same_unit(sparse_map, new, mine, which, depth):
             return None
         return LoopMatch(new, old, T_old_new, len(which), float(np.median(depth)), 1.0, *ids)
-    scale = depth_scale(_depths_in_own_map(sparse_map, new, mine, which), depth[mine.known[which]], config)
+    scale = depth_scale(_depths_in_own_map(sparse_map, new, mine, which), depth[mine.known[which]])
     if scale is None:
         return None
     unit_new, unit_old = (float(sparse_map.keyframes.scale[sparse_map.rows[k]]) for k in (new, old))
@@ -228,7 +228,7 @@ def _depths_in_own_map(sparse_map: SparseMap, new: KeyframeId, mine: KeyframeObs
     return se3.transform(se3.inverse(sparse_map.keyframes.T_w_k[sparse_map.rows[new]]), xyz)[:, 2]
 
 
-def depth_scale(own: F64, other: F64, config: LoopConfig) -> float | None:
+def depth_scale(own: F64, other: F64) -> float | None:
     """Scale of the other map over its own, from depths (n,) of the same points; None if it is too uncertain."""
     if len(own) < _MIN_SCALE_POINTS:
         return None

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from kiteline_agent.config import AgentConfig, AlignConfig
+from kiteline_agent.config import AgentConfig
 from kiteline_agent.ekf.corner_flow import CornerFlow
 from kiteline_agent.ekf.ekf_agent import EkfAgent
 from kiteline_agent.ekf.odometer_motion import OdometerMotion
@@ -137,7 +137,7 @@ def _flow(config: EkfConfig | None = None) -> tuple[CornerFlow, U8]:
     image = np.kron(rng.integers(0, 256, (60, 80)), np.ones((4, 4))).astype(np.uint8)
     image = cv2.GaussianBlur(image, (5, 5), 1.0)
     camera = RectifiedCamera(320, 240, 200.0, 200.0, 159.5, 119.5, 0.1, False, np.eye(4))
-    flow = CornerFlow(camera, DetectorConfig(levels=1), AlignConfig(), config or EkfConfig())
+    flow = CornerFlow(camera, DetectorConfig(levels=1), config or EkfConfig())
     flow.replenish(build_pyramid(image, 3), np.eye(4))
     assert len(flow.ids) > 20
     return flow, image

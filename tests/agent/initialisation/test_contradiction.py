@@ -116,7 +116,7 @@ def test_what_calibrated_and_worn_rigs_show_is_no_contradiction(
     solution: Any = SimpleNamespace(
         state=SimpleNamespace(lens=lens), bias=np.array([0.0, 0.0, 0.0, 0.0, accel_bias_m_s2, 0.0])
     )
-    assert contradicts(solution, gyro_noise, PRIOR, info, ContradictionConfig()) is wrong
+    assert contradicts(solution, gyro_noise, PRIOR, info) is wrong
 
 
 def test_the_imu_is_given_up_for_what_it_shows_and_for_a_lens_alone_much_later() -> None:
@@ -141,7 +141,7 @@ def test_the_imu_is_given_up_for_what_it_shows_and_for_a_lens_alone_much_later()
     # windows as starts show them: the real flight backward, whose lens is off; two axes negated; accelerations in g
     for gyro_noise, bias_m_s2, imu in ((0.2, 0.16, False), (7.4, 0.1, True), (0.2, 8.3, True)):
         solution: Any = SimpleNamespace(bias=np.array([0.0, 0.0, 0.0, 0.0, bias_m_s2, 0.0]))
-        assert exceeds_lens_errors(solution, gyro_noise, PRIOR, config) is imu
+        assert exceeds_lens_errors(solution, gyro_noise, PRIOR) is imu
 
 
 def test_a_contradiction_is_told_once_it_lasts_and_again_after_an_end() -> None:
