@@ -262,11 +262,8 @@ class FixedLagSmoother:
         cov = np.zeros((17, 17))
         cov[:6, :6] = _BY_DEFINITION**2 * np.eye(6)
         cov[6:, 6:] = carry @ old.cov @ carry.T
-        T_new_old = T_m_b @ se3.inverse(old.T_m_b)
-        self.start(old.T_m_b, old.velocity, old.bias, gravity, StartDeviations())
-        self._cov = 0.5 * (cov + cov.T)
-        self._prior_h[:] = np.linalg.inv(self._cov)
-        self.move_map(T_new_old)
+        self.start(old.T_m_b, old.velocity, old.bias, gravity, StartDeviations(), 0.5 * (cov + cov.T))
+        self.move_map(T_m_b @ se3.inverse(old.T_m_b))
 
     def move_map(self, T_new_old: F64) -> None:
         """Transform all states after the map moved: `p_new = T_new_old p_old`."""
@@ -299,12 +296,15 @@ class FixedLagSmoother:
         self._ray[:n] = self._ray[:n] @ r.T
 
     def scale_map(self, factor: float, centre: F64) -> None:
-        """Scale all states after lengths in the map were multiplied by `factor` about centre (3,)."""
-        n = self._n
-        for block in (self._state[:n], self._prior_s[None, :]):
-            block[:, :3] = centre + factor * (block[:, :3] - centre)
-            block[:, 3:6] *= factor
-        self._vis_p[:n] = centre + factor * (self._vis_p[:n] - centre)
+        """Scale all states after lengths in the map were multiplied by `factor` about centre (3,).
+
+        The camera's positions scale; its lever arm in the body does not.
+        """
+        n, p_b_c = self._n, -self._r_cb.T @ self._t_cb
+        states = (self._state[:n], self._rot[:n]), (self._prior_s, self._prior_r), (self._vis_p[:n], self._vis_r[:n])
+        for block, rotation in states:  # of position, velocity and biases; the last of position alone
+            block[..., :3] = centre + factor * (block[..., :3] - centre) + (factor - 1.0) * (rotation @ p_b_c)
+            block[..., 3:6] *= factor
         self._xyz[:n] = centre + factor * (self._xyz[:n] - centre)
         self._ray[:n] *= factor
         q = np.ones(17)
