@@ -1,5 +1,7 @@
 """Preintegration against exact motion, against a plain reference, and its Jacobians against differences."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -27,7 +29,7 @@ def wavy(rng: np.random.Generator, n: int, dt_s: float = 0.005) -> Samples:
 
 
 def reference(samples: Samples, bias: F64, density: F64) -> tuple[F64, F64, F64]:
-    """Turn, changes of velocity and position, and covariance, written with whole matrices."""
+    """Turn, changes of velocity and position, and covariance, written with whole matrices. density: (n-1,2)."""
     r, v, p, cov = np.eye(3), np.zeros(3), np.zeros(3), np.zeros((9, 9))
     for k in range(len(samples.t_s) - 1):
         dt = samples.t_s[k + 1] - samples.t_s[k]
@@ -42,7 +44,7 @@ def reference(samples: Samples, bias: F64, density: F64) -> tuple[F64, F64, F64]
         f[:3, :3], f[3:6, :3], f[6:, :3], f[6:, 3:6] = turn.T, by_turn * dt, 0.5 * by_turn * dt**2, dt * np.eye(3)
         b[:3, :3], b[3:6, :3], b[6:, :3] = -jr * dt, by_gyro * dt, 0.5 * by_gyro * dt**2
         b[3:6, 3:], b[6:, 3:] = -0.5 * (r + after) * dt, -0.25 * (r + after) * dt**2
-        cov = f @ cov @ f.T + b @ np.diag(np.repeat(density**2 / dt, 3)) @ b.T
+        cov = f @ cov @ f.T + b @ np.diag(np.repeat(density[k] ** 2 / dt, 3)) @ b.T
         mean = 0.5 * (r @ a0 + after @ a1)
         p, v, r = p + v * dt + 0.5 * mean * dt**2, v + mean * dt, after
     return r, np.concatenate([v, p]), cov
@@ -52,9 +54,11 @@ def reference(samples: Samples, bias: F64, density: F64) -> tuple[F64, F64, F64]
 @settings(max_examples=20)
 def test_kernel_agrees_with_the_reference(seed: int, n: int) -> None:
     rng = np.random.default_rng(seed)
-    samples, bias = wavy(rng, n), 0.1 * rng.normal(size=6)
+    calibrated = 2.0 * np.array([CALIBRATION.gyro_noise, CALIBRATION.accel_noise])
+    measured = calibrated * rng.uniform(0.1, 5.0, (n - 1, 2))  # of each step
+    samples, bias = replace(wavy(rng, n), density=measured), 0.1 * rng.normal(size=6)
     got = preintegrate(samples, bias, CALIBRATION, inflation=2.0)
-    turn, vp, cov = reference(samples, bias, 2.0 * np.array([CALIBRATION.gyro_noise, CALIBRATION.accel_noise]))
+    turn, vp, cov = reference(samples, bias, np.maximum(measured, calibrated))
     np.testing.assert_allclose(got.turn, turn, atol=1e-12)
     np.testing.assert_allclose(got.vp, vp, atol=1e-12)
     np.testing.assert_allclose(got.cov, cov, rtol=1e-4, atol=1e-16)
@@ -133,6 +137,18 @@ def test_so3_kernels(w: list[float], size: float) -> None:
     np.testing.assert_allclose(j @ i, np.eye(3), atol=1e-9)
     d = 1e-6 * np.array([1.0, -2.0, 0.5])
     np.testing.assert_allclose(se3.so3_exp(v + d), se3.so3_exp(v) @ se3.so3_exp(j @ d), atol=1e-11)
+
+
+@pytest.mark.parametrize("angle", [3e-5, 9e-5, 2e-4, 9.9e-4, 1.1e-3])
+def test_series_of_small_angles_meet_the_closed_forms(angle: float) -> None:
+    w = angle * np.array([0.6, -0.64, 0.48])
+    k, r, j, i = se3.skew(w), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    imu_kernels.so3_exp(w, r)
+    np.testing.assert_allclose(r, np.eye(3) + k + k @ k / 2.0 + k @ k @ k / 6.0, atol=1e-13)
+    from_python(imu_kernels.right_jacobian)(w, j)
+    np.testing.assert_allclose(j, np.eye(3) - k / 2.0 + k @ k / 6.0 - k @ k @ k / 24.0, atol=1e-12)
+    from_python(imu_kernels.right_jacobian_inverse)(w, i)
+    np.testing.assert_allclose(i, np.eye(3) + k / 2.0 + k @ k / 12.0, atol=1e-10)
 
 
 def batch(t_ns: list[int], value: float = 1.0) -> ImuBatch:
