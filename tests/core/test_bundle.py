@@ -1,5 +1,7 @@
 """Bundle adjustment against numeric differences, plain numpy and an independent solver."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -236,3 +238,42 @@ def test_the_same_problem_gives_the_same_bytes_and_is_left_alone() -> None:
     assert a.cost_ops == b.cost_ops > 0
     assert np.array_equal(problem.points, before[0])
     assert np.array_equal(problem.T_c_m, before[1])
+
+
+def test_a_point_behind_a_camera_tells_nothing_and_leaves_no_rubbish() -> None:
+    problem, _, _ = scene(3, 12, 0.5, 2)
+    n, m = len(problem.points), len(problem.camera)
+    poses = problem.T_c_m.copy()
+    poses[2, :3] *= -1.0  # all points are behind the third camera
+    blocks = tuple(np.full_like(block, np.nan) for block in normal_blocks(n, m, 2))
+    model = (problem.starts, problem.camera, problem.measured, 1.0 / np.square(problem.sigma))
+    kernels.linearise(
+        pack(poses), problem.lens, problem.points, *model, np.ones(m, np.uint8), np.array([5.99, 7.81]),
+        np.array([-1, 0, 1], np.int32), *blocks,
+    )  # fmt: skip
+    hcc, bc, hpp, bp, hcp = blocks
+    assert np.isfinite(hpp).all() and np.isfinite(bp).all() and hcc[0].any()
+    assert not hcp[problem.camera == 2].any() and not hcc[1].any() and not bc[1].any()
+
+
+def test_an_observation_from_behind_counts_neither_as_cost_nor_as_inlier() -> None:
+    problem, _, _ = scene(4, 40, 0.4, 3, fixed=3)
+    poses = problem.T_c_m.copy()
+    poses[0] = np.diag([-1.0, 1.0, -1.0, 1.0]) @ poses[0]  # a fixed camera that looks away
+    result = bundle(replace(problem, T_c_m=poses), BundleConfig())
+    assert not result.inlier[problem.camera == 0].any() and result.inlier[problem.camera != 0].mean() > 0.7
+    assert result.initial_cost < 1e5
+
+
+@pytest.mark.parametrize("noise_px", [0.45, 2.0])
+def test_the_outlier_test_is_that_of_each_kind_and_wider_where_all_residuals_are_large(noise_px: float) -> None:
+    problem, _, _ = scene(6, 80, noise_px, 13, fixed=2)
+    config = BundleConfig(robust_trials=8, final_trials=0)
+    result = bundle(problem, config)
+    squared = np.square(residuals(problem, result.T_c_m, result.points)).sum(1)
+    has_disparity = problem.measured[:, 2] >= 0
+    scale = float(np.median(squared / np.where(has_disparity, 2.366, 1.386)))  # medians of chi-squares
+    assert (scale > 1.0) == (noise_px > 1.0)
+    assert np.array_equal(result.inlier, squared <= bounds(problem, config) * max(scale, 1.0))
+    for kind in (has_disparity, ~has_disparity):
+        assert 0 < np.count_nonzero(result.inlier[kind]) < np.count_nonzero(kind)

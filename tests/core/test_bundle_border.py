@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from kiteline_core.arrays import F64
+from kiteline_core.arrays import F64, U8
 from kiteline_core.geometry import se3
-from kiteline_core.optimisation.bundle import Border, BundleConfig, BundleProblem, BundleResult, bundle
+from kiteline_core.optimisation.bundle import Border, BundleConfig, BundleProblem, BundleResult, _BorderSolver, bundle
 
 LENS = np.array([400.0, 410.0, 320.0, 240.0, 44.0])
 TRUE = np.array([[0.3, -0.4], [-0.2, 0.0]])  # px: constant, and by the x of the image; of two agents
@@ -173,3 +173,91 @@ def test_a_prior_about_what_is_known_holds_there() -> None:
         bundle(far, EASY).offset,
         atol=1e-4,
     )
+
+
+@pytest.mark.parametrize("chi2", [1e9, 4.0])
+def test_a_step_is_that_of_the_dense_system(chi2: float) -> None:
+    """One trial from a start where some observations are beyond the knee, and one disparity is less than its offset."""
+    problem = passage(0.5)
+    assert problem.border is not None
+    measured = problem.measured.copy()
+    low = int(np.flatnonzero(problem.border.group == 0)[0])
+    measured[low, 2] = 0.05
+    border = replace(problem.border, start=0.5 * TRUE, mean=0.2 * TRUE)
+    problem = replace(problem, measured=measured, border=border)
+    assert border.terms[low] @ border.start[0] > 0.05  # no disparity is negative: it is taken for 0
+    f, n, damping = int(problem.free.sum()), len(problem.points), 1e-4
+
+    def unpacked(x: F64) -> tuple[F64, F64, F64]:
+        poses = problem.T_c_m.copy()
+        moved = x[: 6 * f].reshape(f, 6)
+        poses[problem.free] = [se3.from_rt(se3.so3_exp(d[3:]), d[:3]) @ T for d, T in zip(moved, poses[problem.free])]
+        return poses, problem.points + x[6 * f : -4].reshape(-1, 3), border.start + x[-4:].reshape(2, 2)
+
+    def whitened(x: F64) -> F64:
+        poses, points, c = unpacked(x)
+        r = residuals(problem, poses, points, c)
+        r[-4:] -= (border.mean / border.sigma).ravel()
+        return r
+
+    size, e = 6 * f + 3 * n + 4, 1e-6
+    j = np.stack([(whitened(e * v) - whitened(-e * v)) / (2 * e) for v in np.eye(size)], 1)
+    r = whitened(np.zeros(size))
+    r[3 * low + 2] -= (border.terms[low] @ border.start[0] - 0.05) / problem.sigma[low, 1]
+    squared = np.square(r[:-4].reshape(-1, 3)).sum(1)
+    weight = np.append(np.repeat(np.sqrt(np.minimum(1.0, np.sqrt(chi2 / squared))), 3), np.ones(4))
+    assert (weight < 1.0).any() == (chi2 < 1e3)
+    j, r = weight[:, None] * j, weight * r
+    h = j.T @ j
+    x = np.linalg.solve(h + np.diag(damping * np.diag(h) + 1e-9), -j.T @ r)
+    poses, points, c = unpacked(x)
+    ours = bundle(problem, BundleConfig(robust_trials=1, final_trials=0, stop=0.0, chi2_mono=chi2, chi2_stereo=chi2))
+    assert ours.final_cost < ours.initial_cost
+    assert np.allclose(ours.T_c_m, poses, atol=1e-5)
+    assert np.allclose(ours.points, points, atol=1e-4)
+    assert np.allclose(ours.offset, c, atol=1e-4)
+
+
+def test_a_prior_is_widened_from_the_distance_on_that_data_and_prior_allow() -> None:
+    """The squared Mahalanobis distance of each group's own estimate to the prior's mean, by both covariances."""
+    own, worn, mean = bundle(passage(1e6), EASY), 100.0, 0.5 * TRUE
+    narrow = passage(0.05)
+    assert narrow.border is not None
+    at_own = replace(
+        narrow, T_c_m=own.T_c_m, points=own.points, border=replace(narrow.border, start=own.offset, mean=mean)
+    )
+    off = own.offset - mean
+    spread = [own.offset_cov[2 * g : 2 * g + 2, 2 * g : 2 * g + 2] + 0.05**2 * np.eye(2) for g in range(2)]
+    distance = np.array([off[g] @ np.linalg.solve(spread[g], off[g]) for g in range(2)])
+    for wide in (0, 1):
+        limit = distance * np.where(np.arange(2) == wide, 0.97, 1.03)
+        judged = replace(at_own, border=replace(at_own.border, worn=worn, contradicts=limit))
+        sigma = np.where(np.arange(2)[:, None] == wide, worn, 1.0) * np.full((2, 2), 0.05)
+        expected = bundle(replace(at_own, border=replace(at_own.border, sigma=sigma)), EASY).offset
+        assert np.allclose(bundle(judged, EASY).offset, expected, atol=1e-9)
+
+
+def test_a_prior_does_not_yield_to_data_that_know_less_than_itself() -> None:
+    """With the prior a term is known better than by it alone, however little the data tell."""
+    by_data = np.sqrt(np.diag(bundle(passage(1e6), EASY).offset_cov)).reshape(2, 2)
+    problem = passage()
+    assert problem.border is not None
+    problem = replace(problem, border=replace(problem.border, sigma=by_data / 3.0))
+    yields = replace(problem, border=replace(problem.border, tail=2.0, determined=0.98))
+    assert np.array_equal(bundle(yields, EASY).offset, bundle(problem, EASY).offset)
+
+
+def test_a_step_that_is_rejected_leaves_disparities_as_they_were() -> None:
+    problem = passage()
+    assert problem.border is not None
+
+    class Overshooting(_BorderSolver):
+        def _solve(self, active: U8, damping: float) -> bool:
+            solved = super()._solve(active, damping)
+            self._rhs *= -50.0
+            return solved
+
+    solver = Overshooting(problem, problem.border, EASY)
+    active, before = np.ones(len(problem.camera), np.uint8), solver.squared_residuals()
+    assert solver.minimise(active, 1) == solver.robust_cost(active)
+    assert np.array_equal(solver.squared_residuals(), before)

@@ -12,10 +12,7 @@ from kiteline_core.arrays import F64, I32, U8, Bool
 from kiteline_core.optimisation import bundle_border_kernels as border_kernels
 from kiteline_core.optimisation import bundle_kernels as kernels
 
-CHI2_2, CHI2_3 = (
-    5.991,
-    7.815,
-)  # 95 % of a chi-square with 2 (a pixel) and 3 (a pixel and a disparity) degrees of freedom
+CHI2_2, CHI2_3 = 5.991, 7.815  # 95 % of chi-squares with 2 (a pixel) and 3 (with a disparity) degrees of freedom
 _DAMPINGS = (0.0, 1e-6, 1e-4)  # of covariances, in order: a point far away may leave the system without a solution
 _MEDIAN_2, _MEDIAN_3 = 1.386, 2.366  # medians of the same
 
@@ -160,8 +157,8 @@ class _Solver:
     def minimise(self, active: U8, trials: int) -> float:
         """Run up to `trials` trials; returns the cost.
 
-        Damping after H. Nielsen, "Damping parameter in Marquardt's method", 1999. Ends early if a step lowers the cost
-        by less than the fraction `stop`.
+        After a step that fails, damping grows as in H. Nielsen, "Damping parameter in Marquardt's method", 1999; after
+        one that succeeds it is a fifth. Ends early if a step lowers the cost by less than the fraction `stop`.
         """
         damping, growth, is_linearised, cost = 1e-4, 2.0, False, 0.0
         for _ in range(trials):

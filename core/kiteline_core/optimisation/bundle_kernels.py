@@ -240,8 +240,7 @@ def solve(s, x):  # type: ignore[no-untyped-def]
 def step(  # type: ignore[no-untyped-def]
     cameras, points, starts, camera, active, free, inv, bp, hcp, dx, new_cameras, new_points
 ):
-    """Apply a camera step dx (6f,) and the resulting point steps. Returns the largest motion of a camera."""
-    largest = 0.0
+    """Apply a camera step dx (6f,) and the resulting point steps."""
     r = np.empty((3, 3))
     for c in range(cameras.shape[0]):
         f = free[c]
@@ -250,8 +249,6 @@ def step(  # type: ignore[no-untyped-def]
                 new_cameras[c, a] = cameras[c, a]
             continue
         d = dx[6 * f : 6 * f + 6]
-        for a in range(6):
-            largest = max(largest, abs(d[a]))
         _rotation(d[3], d[4], d[5], r)
         for a in range(3):
             for b in range(3):
@@ -276,7 +273,6 @@ def step(  # type: ignore[no-untyped-def]
         new_points[i, 0] = points[i, 0] + inv[i, 0] * b0 + inv[i, 1] * b1 + inv[i, 2] * b2
         new_points[i, 1] = points[i, 1] + inv[i, 1] * b0 + inv[i, 3] * b1 + inv[i, 4] * b2
         new_points[i, 2] = points[i, 2] + inv[i, 2] * b0 + inv[i, 4] * b1 + inv[i, 5] * b2
-    return largest
 
 
 @njit

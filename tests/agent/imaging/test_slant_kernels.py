@@ -2,6 +2,7 @@
 
 import cv2
 import numpy as np
+import pytest
 
 from kiteline_agent.imaging import alignment_kernels, slant_kernels
 from kiteline_agent.imaging.alignment_kernels import PATCH, PATCH_RADIUS, TEMPLATE, TEMPLATE_LEVELS
@@ -39,7 +40,7 @@ def plane_image(T_c_k: F64, normal: F64, seed: int = 3) -> U8:
 class Views:
     """Landmarks of one keyframe on a plane, and where a second camera sees them."""
 
-    def __init__(self, octave: int = 0) -> None:
+    def __init__(self, octave: int = 0, T_c_k: F64 = T_C_K) -> None:
         self.n = len(UV)
         self.bearing = ((UV - CAMERA[2:4]) / F)[None]
         homogeneous = np.column_stack([self.bearing[0], np.ones(self.n)])
@@ -47,17 +48,17 @@ class Views:
         self.slant = NORMAL[:2] / self.rho[0][:, None]  # true ones
         self.octave = np.full(self.n, octave, np.uint8)
         self.first = build_pyramid(plane_image(np.eye(4), NORMAL), LEVELS)
-        self.second = build_pyramid(plane_image(T_C_K, NORMAL, seed=4), LEVELS)
+        self.T_c_k, self.second = T_c_k, build_pyramid(plane_image(T_c_k, NORMAL, seed=4), LEVELS)
         self.templates = np.empty((self.n, TEMPLATE_LEVELS, TEMPLATE, TEMPLATE), np.uint8)
         alignment_kernels.cut_templates(self.first, UV, self.octave, self.templates)
-        seen = se3.transform(T_C_K, homogeneous / self.rho[0][:, None])
+        seen = se3.transform(T_c_k, homogeneous / self.rho[0][:, None])
         self.true_uv = seen[:, :2] / seen[:, 2:] * F + CAMERA[2:4]
 
     def seen_with(self, slant: F64) -> tuple[F64, F64]:
         """Warps (n,2,2) and parallaxes (n,2) with slants (n,2)."""
         warp, parallax = np.empty((self.n, 2, 2)), np.empty((self.n, 2))
         projection_kernels.views(
-            T_C_K, CAMERA, np.arange(self.n), np.eye(4)[None], self.bearing, self.rho, slant[None], warp, parallax
+            self.T_c_k, CAMERA, np.arange(self.n), np.eye(4)[None], self.bearing, self.rho, slant[None], warp, parallax
         )  # fmt: skip
         return warp, parallax
 
@@ -114,12 +115,16 @@ def reference(views: Views, slant: F64, uv: F64, i: int) -> F64:
     return np.array([information[0, 0], information[0, 1], information[1, 1], *product]) / variance
 
 
-def test_equations_are_those_of_a_plain_fit() -> None:
-    views = Views()
+@pytest.mark.parametrize(("ahead_m", "level"), [(1.0, 0), (2.4, 1)])
+def test_equations_are_those_of_a_plain_fit(ahead_m: float, level: int) -> None:
+    T_c_k = T_C_K.copy()
+    T_c_k[2, 3] = -ahead_m
+    views = Views(T_c_k=T_c_k)
     flat = np.zeros_like(views.slant)
     uv, found = views.aligned(flat)
     measured = views.equations(flat, uv)
-    compared = np.flatnonzero(found & (measured[:, 0] > 0.0))[::5]
+    scales = np.floor(0.5 * np.log2(np.linalg.det(views.seen_with(flat)[0])) + 0.5)
+    compared = np.flatnonzero(found & (measured[:, 0] > 0.0) & (scales == level))[::3]
     assert len(compared) > 10
     for i in compared:
         plain = reference(views, flat, uv, int(i))
@@ -185,3 +190,24 @@ def test_a_raw_image_says_what_the_rectified_one_says() -> None:
     assert both.mean() > 0.7
     difference = np.abs(solved(out[both]) - solved(rectified[both]))
     assert np.median(difference) < 0.1 * np.median(np.abs(views.slant))
+
+
+def test_contrast_and_focal_lengths_change_equations_as_they_change_shears() -> None:
+    views = Views()
+    flat = np.zeros_like(views.slant)
+    uv, found = views.aligned(flat)
+    before = views.equations(flat, uv)
+    sure = found & (before[:, 0] > 8.0) & (before[:, 2] > 8.0)
+    # A dimmer image tells the same slants.
+    views.second = tuple((0.5 * level.astype(np.float64) + 40.5).astype(np.uint8) for level in views.second)
+    dim = views.equations(flat, uv)
+    difference = np.abs(solved(dim[sure]) - solved(before[sure]))
+    assert np.median(difference) < 0.1 * np.median(np.abs(views.slant)) and sure.mean() > 0.5
+    # A slant along an axis with twice the focal length shears half as much.
+    warp, parallax = views.seen_with(flat)
+    longer = np.empty((views.n, 5))
+    slant_kernels.measure_slants(
+        views.second, RECTIFIED, views.templates, np.arange(views.n), views.octave, warp, parallax, uv, F, 2.0 * F,
+        1.0, longer,
+    )  # fmt: skip
+    np.testing.assert_allclose(longer, dim * [1.0, 0.5, 0.25, 1.0, 0.5], rtol=1e-9)

@@ -59,6 +59,17 @@ def test_slants_converge_to_what_frames_tell() -> None:
     np.testing.assert_allclose(told.frames(40, 4.0), np.tile(TRUE, (LANDMARKS, 1)), rtol=0.03)
 
 
+def test_a_slant_is_the_most_probable_one_after_what_both_axes_tell_together() -> None:
+    told, information = Told(SlantConfig(memory=1.0)), np.array([[5.0, 2.0], [2.0, 3.0]])
+    slants, config = SlantFromMotion(told.map, Work()), SlantConfig(memory=1.0)
+    for frames in (1, 2, 3):
+        product = (TRUE - told.map.slant[0]) @ information
+        rows = np.column_stack([np.tile([5.0, 2.0, 3.0], (LANDMARKS, 1)), product])
+        slants._fuse(ROWS, rows, config)
+        expected = np.linalg.solve(frames * information + np.eye(2) / config.sigma**2, frames * information @ TRUE)
+        np.testing.assert_allclose(told.map.slant[0], np.tile(expected, (LANDMARKS, 1)), rtol=1e-6)
+
+
 def test_frames_count_as_many_as_memory_says() -> None:
     told = Told(SlantConfig(memory=0.9))
     told.frames(200, 4.0)
@@ -121,6 +132,7 @@ def test_what_a_frame_measures(
     )
     SlantFromMotion(told.map, work).update(ctx, track)
     assert np.flatnonzero(told.map.slant_equations[0, :, 0]).tolist() == measured
+    assert not len(measured) or told.map.slant_equations[0, measured, 0] == pytest.approx(1.0 / 16.0)  # inflated
     assert np.flatnonzero(told.map.slant[0, :, 0] > 0.0).tolist() == measured
     assert work.slants == len(measured)
 

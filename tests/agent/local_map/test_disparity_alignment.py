@@ -266,6 +266,19 @@ def test_the_base_s_map_is_left_to_the_base() -> None:
     assert flight.alignment.take_base(NOTHING, 0.001)
     assert flight.fly(80) == []
     assert flight.alignment.worn > 0.95  # the covariance knows
+    assert flight.alignment._rms_px(flight.alignment.expected_cov) == pytest.approx(off_px(WORN), rel=0.2)
+
+
+def test_a_good_calibration_s_offset_is_the_posterior_about_the_expected_one() -> None:
+    alignment, rng = Flight(NOTHING, 0, SIDEWAYS).alignment, np.random.default_rng(1)
+    half = rng.normal(0.0, 8.0, (TERMS, TERMS))
+    h, told, expected = half @ half.T, rng.normal(0.0, 0.1, TERMS), rng.normal(0.0, 0.1, TERMS)
+    alignment.expected_px = expected
+    alignment._solve_good(h, h @ told)
+    posterior = np.linalg.solve(h + alignment._good, h @ told + alignment._good @ expected)
+    np.testing.assert_allclose(alignment._good_estimate, posterior, atol=1e-9)
+    alignment._solve_good(np.zeros_like(h), np.zeros(TERMS))
+    np.testing.assert_allclose(alignment._good_estimate, expected)
 
 
 def test_what_earlier_flights_found_is_where_it_begins() -> None:
