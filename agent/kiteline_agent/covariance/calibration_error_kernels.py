@@ -3,6 +3,7 @@
 import numpy as np
 
 from kiteline_core.arrays import F64, I64, Bool
+from kiteline_core.geometry import se3
 from kiteline_core.jit import helper, njit
 
 CALIBRATION = 10  # error terms of a calibration, see bias_error: those of the disparity, then those of both cameras
@@ -265,6 +266,13 @@ def pose_covariance(
     for i in range(6):
         for k in range(6):
             out[i, k] += e[i, k]
+
+
+def from_body(T: F64) -> F64:
+    """(6,6): perturbation on the left of T = T_a_b by one of [translation in a, rotation about the body's axes]."""
+    out = np.eye(6)
+    out[:3, 3:], out[3:, 3:] = se3.skew(T[:3, 3]) @ T[:3, :3], T[:3, :3]
+    return out
 
 
 def adjoint(T: F64) -> F64:

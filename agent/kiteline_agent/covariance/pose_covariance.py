@@ -21,6 +21,7 @@ from kiteline_agent.covariance.calibration_error_kernels import (
     DISPARITY_SHAPES,
     SHAPES,
     adjoint,
+    from_body,
     pose_covariance,
     sensitivity,
 )
@@ -220,8 +221,7 @@ class PoseCovariance:
 
     def extend_map(self, T_m_b: F64) -> None:
         """Continue the map with a keyframe at T_m_b (4,4), a pose by dead reckoning."""
-        back = np.eye(6)
-        back[:3, 3:], back[3:, 3:] = se3.skew(T_m_b[:3, 3]) @ T_m_b[:3, :3], T_m_b[:3, :3]
+        back = from_body(T_m_b)
         self._noise = self._noise + back @ self._reckoned @ back.T
         self._reset_reckoning()
         self._unmeasured_s = 0.0
@@ -246,9 +246,7 @@ class PoseCovariance:
         self._propagate(pose.T_o_m, T_m_b, np.eye(4), left, out)
         # dead reckoning is perturbed in the body, the rest on the left
         T_o_b = self._T_o_b_left = pose.T_o_m @ T_m_b
-        back = np.eye(6)
-        back[:3, 3:], back[3:, 3:] = se3.skew(T_o_b[:3, 3]) @ T_o_b[:3, :3], T_o_b[:3, :3]
-        turn = np.eye(6)
+        back, turn = from_body(T_o_b), np.eye(6)
         turn[:3, :3] = pose.T_o_m[:3, :3]
         reckoned = back @ turn @ self._reckoned @ turn.T @ back.T
         self._carried, self._same_frame = left + reckoned, False

@@ -44,10 +44,23 @@ def evidence_of(error: F64, noise_px: float = 0.0) -> tuple[CalibrationEvidence,
 def test_errors_of_calibration_are_found_in_the_residuals(shape: int) -> None:
     error = np.zeros(SHAPES)
     error[shape] = 0.2
-    _, information, side = evidence_of(error)
+    evidence, information, side = evidence_of(error)
+    np.testing.assert_allclose(16.0 * evidence._information, information, rtol=1e-3, atol=1e-4 * information.max())
+    np.testing.assert_allclose(16.0 * evidence._side, side, rtol=1e-3, atol=1e-4 * np.abs(side).max())  # inflated
     np.testing.assert_allclose(information, information.T, rtol=1e-9)
     found = np.linalg.solve(information + np.eye(10), side)
     np.testing.assert_allclose(found[shape], 0.2, atol=0.03)
+
+
+def test_evidence_is_what_is_left_of_residuals_once_the_pose_is_free() -> None:
+    rng = np.random.default_rng(1)
+    half, side = rng.normal(size=(30, 16)), rng.normal(size=16)
+    joint, evidence = half.T @ half, CalibrationEvidence(np.full(10, 0.05**2))
+    g = np.column_stack([joint[:6, 6:], np.zeros(6)])
+    evidence.add(joint[:6, :6], g, joint[6:, 6:], side)
+    gain = joint[6:, :6] @ np.linalg.inv(joint[:6, :6])
+    np.testing.assert_allclose(16.0 * evidence._information, joint[6:, 6:] - gain @ joint[:6, 6:], rtol=1e-5, atol=1e-4)
+    np.testing.assert_allclose(16.0 * evidence._side, side[6:] - gain @ side[:6], rtol=1e-5, atol=1e-5)
 
 
 def test_a_worn_calibration_is_told_from_a_good_one() -> None:
