@@ -52,7 +52,7 @@ class GraphInputs:
 class Scaled:
     """Scales of a graph over similarities. free: (n,) keyframes of monocular submaps, whose scale is unknown.
 
-    scale: (m,) of each edge, the scale at a over that at b. sigma: (m,) of its logarithm.
+    scale: (m,) of each edge, the factor on lengths near b over that near a. sigma: (m,) of its logarithm.
     """
 
     free: Bool

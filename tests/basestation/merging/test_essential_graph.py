@@ -12,6 +12,7 @@ from kiteline_basestation.config import GraphConfig
 from kiteline_basestation.mapper import Mapper, MapperInput
 from kiteline_basestation.merging.correction import essential_graph_of
 from kiteline_basestation.merging.essential_graph import GraphInputs, Scaled, optimise, residuals
+from kiteline_basestation.merging.loop_edges import LoopEdge
 from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import submap_of_keyframe
@@ -89,6 +90,39 @@ def test_residuals_are_those_of_the_logarithm() -> None:
         turn = float(np.linalg.norm(se3.so3_log(error[:3, :3])))
         expected = np.hypot(np.linalg.norm(error[:3, 3]) / 0.01, turn / 0.003)
         assert np.isclose(got[i], expected, rtol=1e-6, atol=1e-6)
+
+
+def test_residuals_with_scales_are_those_of_similarities() -> None:
+    rng, (_, _, inputs) = np.random.default_rng(3), drifting_ring(30, 12, 4)
+    assert inputs.scaled is not None
+    scaled = replace(inputs.scaled, scale=np.exp(rng.normal(0.0, 0.1, len(inputs.edges))))
+    T_w_k, scale = inputs.T_w_k @ se3.exp(0.05 * rng.normal(size=6)), np.exp(rng.normal(0.0, 0.2, 30))
+    got = residuals(replace(inputs, scaled=scaled), T_w_k, scale)
+    for i, (a, b) in enumerate(inputs.edges.tolist()):
+        S_a_b = sim3.inverse(sim3.of(scale[a], T_w_k[a])) @ sim3.of(scale[b], T_w_k[b])
+        error = se3.inverse(inputs.T_a_b[i]) @ sim3.rigid(S_a_b)
+        turn = float(np.linalg.norm(se3.so3_log(error[:3, :3])))
+        of_scale = np.log(sim3.scale_of(S_a_b) / scaled.scale[i]) / scaled.sigma[i]
+        expected = np.linalg.norm([np.linalg.norm(error[:3, 3]) / 0.01, turn / 0.003, of_scale])
+        assert np.isclose(got[i], expected, rtol=1e-6)
+
+
+def test_a_chain_of_similarities_is_composed() -> None:
+    rng, n = np.random.default_rng(5), 5
+    steps = np.array([se3.exp(rng.normal(0.0, 0.5, 6)) for _ in range(n - 1)])
+    scale, edges = np.array([1.3, 0.8, 1.1, 0.9]), np.column_stack([np.arange(n - 1), np.arange(1, n)])
+    S_w_k = [se3.exp(rng.normal(0.0, 1.0, 6))]
+    for step, factor in zip(steps, scale, strict=True):
+        S_w_k.append(S_w_k[-1] @ sim3.of(factor, step))
+    start = np.array([sim3.rigid(S) for S in S_w_k])
+    start[1:, :3, 3] += rng.normal(0.0, 0.05, (n - 1, 3))
+    result = optimise(GraphInputs(
+        np.arange(n), start, np.arange(n) == 0, edges, steps, np.tile([0.01, 0.003], (n - 1, 1)),
+        np.zeros(n - 1, np.bool_), replace(GraphConfig(), stop=1e-12),
+        Scaled(np.ones(n, np.bool_), scale, np.full(n - 1, 0.01)),
+    ))  # fmt: skip
+    assert np.allclose(result.scale, [sim3.scale_of(S) for S in S_w_k], atol=1e-5)
+    assert np.allclose(result.T_w_k, [sim3.rigid(S) for S in S_w_k], atol=1e-5)
 
 
 def test_a_thousand_keyframes_take_milliseconds() -> None:
@@ -223,3 +257,20 @@ def test_a_first_keyframe_without_a_pose_is_left_out(make_flight: Callable[..., 
     assert graph is not None
     assert graph.keyframes[graph.held].tolist() == [second]
     optimise(graph)
+
+
+def test_edges_are_as_sure_as_their_length_and_a_loop_as_the_depth_of_its_landmarks(
+    make_flight: Callable[..., Any],
+) -> None:
+    flight = make_flight(keyframes=10, turns=0.2)
+    mapper = Mapper(WITHOUT_GRID)
+    feed(mapper, [flight])
+    first, last = flight.keyframes[0], flight.keyframes[9]
+    loop = LoopEdge(last, first, np.eye(4), 50, 8.0)
+    graph = essential_graph_of(mapper.map, submap_of_keyframe(first), [loop], GraphConfig())
+    assert graph is not None
+    length = np.linalg.norm(graph.T_a_b[:-1, :3, 3], axis=1)
+    assert length.max() > 0.1
+    assert np.allclose(graph.sigma[:-1, 0], 0.005 + 0.01 * length, atol=6e-5)
+    assert np.allclose(graph.sigma[-1], [0.005 + 0.005 * 8.0, 0.003])
+    assert graph.loop.tolist() == [False] * len(length) + [True]
