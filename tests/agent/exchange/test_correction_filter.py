@@ -40,6 +40,24 @@ def test_a_first_scale_counts_by_its_deviation_beside_that_of_the_agent() -> Non
     assert moved[0.3] == pytest.approx(0.01 * whole, rel=0.05)
 
 
+def test_equally_uncertain_scales_are_averaged() -> None:
+    """That of the agent and two of the base, at the same place: each counts a third."""
+    weights = CorrectionFilter(CONFIG)
+    weights.weigh(scaled(1.0), HERE, 0.0)
+    weights.weigh(scaled(1.02), HERE, CONFIG.scale_sigma)
+    told = place(weights.weigh(scaled(0.985), HERE, CONFIG.scale_sigma), HERE)
+    assert np.allclose(told, (1.0 + 1.02 + 0.985) / 3.0 * HERE, atol=6e-4 * np.linalg.norm(HERE))
+
+
+def test_a_relocalisation_is_no_correction() -> None:
+    weights, T_o_n = CorrectionFilter(CONFIG), se3.from_rt(np.eye(3), np.array([0.5, -0.3, 0.1]))
+    weights.weigh(scaled(1.0), HERE, 0.0)
+    withheld = scaled(1.02) - weights.weigh(scaled(1.02), HERE, 0.02)
+    weights.move_odometry(T_o_n)
+    assert withheld.any()
+    assert np.allclose(weights.weigh(scaled(1.02) @ T_o_n, HERE, 0.02), scaled(1.02) @ T_o_n - withheld)
+
+
 def test_lengths_from_now_on_are_those_that_the_base_tells() -> None:
     weights = CorrectionFilter(CONFIG)
     weights.weigh(scaled(1.0), HERE, 0.0)

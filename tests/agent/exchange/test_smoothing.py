@@ -24,18 +24,22 @@ def test_it_keeps_its_pace_and_arrives(seed: int) -> None:
     rng = np.random.default_rng(seed)
     smoothing = Smoothing(SmoothingConfig(snap_m=5.0, max_m_s=0.5, max_rad_s=0.2))
     here = rng.normal(0.0, 10.0, 3)
-    told = smoothing.follow(np.eye(4), here, 0)
+    told = start = se3.exp(np.concatenate([np.zeros(3), rng.normal(0.0, 1.0, 3)]))
+    smoothing.follow(start, here, 0)
     turn = se3.exp(np.concatenate([np.zeros(3), rng.normal(0.0, 0.02, 3)]))
     shift = se3.from_rt(np.eye(3), rng.uniform(-0.5, 0.5, 3))
     # About the vehicle, so that the way is what was drawn.
-    about = se3.from_rt(np.eye(3), here) @ turn @ se3.from_rt(np.eye(3), -here)
-    goal = shift @ about
+    at = se3.transform(start, here[None])[0]
+    about = se3.from_rt(np.eye(3), at) @ turn @ se3.from_rt(np.eye(3), -at)
+    goal = shift @ about @ start
     for n in range(1, 200):
         last, told = told, smoothing.follow(goal, here, n * TICK_NS)
         moved = np.linalg.norm(se3.transform(told, here[None]) - se3.transform(last, here[None]))
         turned = np.linalg.norm(se3.so3_log(told[:3, :3] @ last[:3, :3].T))
         assert moved <= 0.5 * 0.05 + 1e-9
         assert turned <= 0.2 * 0.05 + 1e-9
+        to_goal, to_last = (np.linalg.norm(se3.so3_log(goal[:3, :3] @ R[:3, :3].T)) for R in (told, last))
+        assert to_goal + turned <= to_last + 1e-6  # straight on
     assert np.allclose(told, goal, atol=1e-9)
 
 

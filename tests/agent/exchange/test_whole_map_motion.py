@@ -38,6 +38,17 @@ def test_a_map_that_moves_as_a_whole_moves_no_live_pose(seed: int, scale: float)
     assert np.allclose(whole.leave_out(S_w_m, before[-1, :3, 3]) @ SMALL @ before, S_w_m @ before, atol=1e-9)
 
 
+def test_one_motion_after_the_other_is_left_out() -> None:
+    rng, whole = np.random.default_rng(2), WholeMapMotion(SmoothingConfig(whole_rad=3.0, whole_m=50.0))
+    before, S_w_m = keyframes(rng), sim3.of(0.5, se3.exp(rng.normal(0.0, 0.5, 6)))
+    poses = before
+    for _ in range(3):
+        moved = se3.exp(rng.normal(0.0, 0.3, 6)) @ poses
+        whole.add(poses, moved, S_w_m)
+        poses = moved
+    assert np.allclose(whole.leave_out(S_w_m, poses[-1, :3, 3]) @ poses, S_w_m @ before, atol=1e-9)
+
+
 @given(st.integers(0, 1 << 30))
 def test_several_motions_add_up_to_no_more_than_the_limits(seed: int) -> None:
     rng, config = np.random.default_rng(seed), SmoothingConfig()
