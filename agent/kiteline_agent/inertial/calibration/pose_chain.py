@@ -68,12 +68,10 @@ class PoseChain:
         to IMU time.
         """
         newest, shift = buffer.newest_t_ns, round(offset_s * 1e9)
-        if newest is None or len(self._poses) < 2:
+        if newest is None or not self._poses:
             return False
         begin_ns, begin = self._poses[0]
-        if (self._poses[-1][0] - begin_ns) * 1e-9 < self._window_s:
-            return False
-        ready = (k for k in range(1, len(self._poses)) if (self._poses[k][0] - begin_ns) * 1e-9 >= self._window_s)
+        ready = (k for k, (t_ns, _) in enumerate(self._poses) if (t_ns - begin_ns) * 1e-9 >= self._window_s)
         last = next(ready, None)
         if last is None or self._poses[last][0] + shift + _RATE_NS > newest:
             return False
