@@ -295,8 +295,7 @@ def marginalise(
         for k in range(i, _B):
             prior_h[i, k] = a[_D + i, _D + k]
             prior_h[k, i] = prior_h[i, k]
-    # random walk of gravity: eliminate its old value from the prior plus (new - old)^2 / tilt_walk
-    if tilt_walk > 0.0:
+    if tilt_walk > 0.0:  # eliminate the old tilt from the prior plus (new - old)^2 / tilt_walk
         _add_tilt_walk(1.0 / tilt_walk, prior_h, prior_b)
     copy33(rot[1], prior_r)
     for i in range(12):
@@ -308,6 +307,7 @@ def marginalise(
 
 @njit
 def _add_tilt_walk(q: float, h: F64, b: F64) -> None:
+    """The prior h (17,17), b (17,) on [state, tilt] after a random walk of the tilt, of information q in 1/rad^2."""
     s00, s01, s11 = h[15, 15] + q, h[15, 16], h[16, 16] + q
     det = s00 * s11 - s01 * s01
     i00, i01, i11 = s11 / det, -s01 / det, s00 / det

@@ -48,9 +48,9 @@ def visual_terms(
     """Information h (6,6) and right-hand side b (6,) of [rotation, position] of a body pose from its points.
 
     r (3,3), p (3,): body in m. r_cb, t_cb: body in the camera. camera: fx, fy, cx, cy, bf. xyz, ray, observed,
-    sigma_px: as in pose_kernels.optimise_pose. use: (n,). chi2: squared error of 2 measurements from which on Huber's
-    weight falls is half of it. scale: of the information, below 1 because errors of templates last over frames.
-    Returns the cost.
+    sigma_px: as in pose_kernels.optimise_pose. use: (n,). chi2: twice the squared error of 2 measurements from which
+    on Huber's weight falls; 3 measurements use chi2 * 1.3. scale: of the information, below 1 because errors of
+    templates last over frames. Returns the cost.
     """
     fx, fy, cx, cy, bf = camera[0], camera[1], camera[2], camera[3], camera[4]
     q = np.empty((3, 3))  # R_c_m
