@@ -30,15 +30,18 @@ IDS = [keyframe_id(SUBMAP, k) for k in range(KEYFRAMES)]
 CONFIG = BaseConfig()
 
 
-def flight(noise_px: float, births: int = BIRTHS, unseen: int = -1) -> tuple[SparseMap, list[np.ndarray]]:
+def flight(
+    noise_px: float, births: int = BIRTHS, unseen: int = -1, turn_rad: float = 0.0
+) -> tuple[SparseMap, list[np.ndarray]]:  # fmt: skip
     """Keyframes along x with new landmarks each, seen again by the next; links are exact, pixels are not.
 
-    unseen: a keyframe that sees none of those before it.
+    unseen: a keyframe that sees none of those before it. turn_rad: about y, from each to the next.
     """
     rng = np.random.default_rng(1)
     sparse_map = SparseMap()
     sparse_map.set_camera(AgentId(0), CAMERA)
-    truth = [se3.from_rt(np.eye(3), np.array([0.15 * k, 0.0, 0.0])) for k in range(KEYFRAMES)]
+    turns = [se3.so3_exp(turn_rad * k * np.array([0.0, 1.0, 0.4])) for k in range(KEYFRAMES)]
+    truth = [se3.from_rt(turn, np.array([0.15 * k, 0.0, 0.0])) for k, turn in enumerate(turns)]
     before: tuple[np.ndarray, np.ndarray] = (np.zeros((0, 3)), np.zeros(0, np.int64))
     for k, T in enumerate(truth):
         keyframe = keyframe_id(SUBMAP, k)
@@ -324,3 +327,46 @@ def test_inertial_steps_tie_a_keyframe_without_a_parent() -> None:
     )
     tied = with_odometry_factors(sparse_map, part, CONFIG.odometry_factors)
     assert np.allclose(tied.measured, expected.measured) and np.allclose(tied.points, expected.points)
+
+
+def residuals_of_steps(sparse_map: SparseMap, config: OdometryFactorConfig) -> tuple[np.ndarray, np.ndarray]:
+    """Of the synthetic points where the map lies: pixels (m,2), and deviations (m,)."""
+    part = window(sparse_map)
+    linked, n = with_odometry_factors(sparse_map, part, config), len(part.problem.camera)
+    T = linked.T_c_m[linked.camera[n:]]
+    world = np.repeat(linked.points[len(part.points) :], 2, axis=0)
+    local = np.einsum("nij,nj->ni", T[:, :3, :3], world) + T[:, :3, 3]
+    seen = local[:, :2] / local[:, 2:] * CAMERA.fx + (CAMERA.cx, CAMERA.cy)
+    return seen - linked.measured[n:, :2], linked.sigma[n:, 0]
+
+
+@pytest.mark.parametrize("enough", [5, 1000])
+def test_steps_that_the_map_has_as_well_leave_no_residuals_and_count_fully(enough: int) -> None:
+    sparse_map, _ = flight(noise_px=0.1, turn_rad=0.1)
+    off, sigma = residuals_of_steps(sparse_map, OdometryFactorConfig(enough_observations=enough))
+    assert len(off) and np.abs(off).max() < 1e-6
+    assert enough > 5 or sigma == pytest.approx(0.1)  # rotations differ by nothing
+
+
+@pytest.mark.parametrize("gap_s", [1, 4])
+def test_links_of_a_worn_rig_loosen_with_the_root_of_the_time_between(gap_s: int) -> None:
+    sparse_map, _ = flight(noise_px=0.1)
+    sparse_map.keyframes.t_ns[: len(sparse_map)] = gap_s * 1_000_000_000 * np.arange(len(sparse_map))
+    sparse_map.disparity_sigma_px[AgentId(0)] = 0.2
+    _, sigma = residuals_of_steps(sparse_map, OdometryFactorConfig(enough_observations=5))
+    assert sigma == pytest.approx(0.5 * np.sqrt(gap_s))
+
+
+def test_lengths_of_one_camera_are_held_weakly_in_the_unit_that_the_map_has() -> None:
+    sparse_map, _ = flight(noise_px=0.1, turn_rad=0.1)
+    sparse_map.set_camera(AgentId(0), replace(CAMERA, stereo=False))
+    sparse_map.metric_submaps.add(SUBMAP)
+    sparse_map.measures_depth.clear()
+    many = OdometryFactorConfig(enough_observations=5)
+    for unit in (1.0, 1.5):
+        if unit != 1.0:
+            sparse_map.scale_submap(SUBMAP, unit)
+        off, sigma = residuals_of_steps(sparse_map, many)
+        weak = sigma == 2.0
+        assert np.count_nonzero(weak) == 2 * np.count_nonzero(~weak) > 0  # twelve points beside six
+        assert np.abs(off).max() < 1e-6
