@@ -26,11 +26,12 @@ class PoseState:
         self._step_s: float | None = None  # duration of that motion; None: not known
         self._last_measured: tuple[F64, float] | None = None  # T_m_c (4,4) by the last new image, s since; None: now
         self._by_sensor = False  # since the last pose by images a sensor has told a part of the motion
+        self._guessed = False  # a part of it was told by nothing
 
     @property
     def is_guess(self) -> bool:
-        """True if neither images nor a sensor have told the motion since a measured pose in this submap."""
-        return self._last_measured is not None
+        """True if a part of the motion since the last pose by a new image in this submap was told by nothing."""
+        return self._guessed
 
     @property
     def measured_over_s(self) -> float | None:
@@ -61,15 +62,15 @@ class PoseState:
     def guess(self, T_m_c: F64, dt_s: float) -> None:
         """Set a pose (4,4) that nothing measured. dt_s: since the last one."""
         measured_T_m_c, since_s = self._last_measured or (self.T_m_c, 0.0)
-        self.T_m_c = T_m_c
+        self.T_m_c, self._guessed = T_m_c, True
         if not self._by_sensor:
             self._last_measured = measured_T_m_c, since_s + dt_s
 
     def reckon(self, T_m_c: F64, dt_s: float) -> None:
         """Set a pose (4,4) by a sensor other than the camera. dt_s: since the last one."""
-        before, guessed = self.T_m_c, self.is_guess
+        before, follows_guess = self.T_m_c, self._last_measured is not None
         self.T_m_c, self._last_measured, self._by_sensor = T_m_c, None, True
-        if not guessed:
+        if not follows_guess:
             self._set_step(before, dt_s)
 
     def measured(self, T_m_c: F64, dt_s: float, *, repeated: bool = False) -> None:
@@ -79,9 +80,10 @@ class PoseState:
         """
         before, since_s = self._last_measured or (self.T_m_c, 0.0)
         since_s += dt_s
-        guessed, self._by_sensor, self.T_m_c = self.is_guess, False, T_m_c
+        long = self._by_sensor or since_s > _KNOWN_S or np.vdot(before[:3, :3], T_m_c[:3, :3]) < _KNOWN_TRACE
+        guessed, self._guessed, self._by_sensor, self.T_m_c = self._guessed, repeated, False, T_m_c
         self._last_measured = (T_m_c, since_s) if repeated else None
-        if guessed and (since_s > _KNOWN_S or np.vdot(before[:3, :3], T_m_c[:3, :3]) < _KNOWN_TRACE):
+        if guessed and long:
             self.reset_motion()
         elif not repeated:
             self._set_step(before, since_s)
@@ -97,7 +99,7 @@ class PoseState:
     def reset_motion(self) -> None:
         """Forget the motion: the next prediction is the present pose."""
         self._step_T, self.velocity, self.moves = np.eye(4), np.zeros(3), False
-        self._last_measured, self._by_sensor = None, False
+        self._last_measured, self._by_sensor, self._guessed = None, False, False
 
     def set_motion(self, step_T: F64, velocity: F64) -> None:
         """Set the motion. step_T: (4,4) T_c0_c1 a frame. velocity: (3,) m/s in m."""
@@ -117,7 +119,7 @@ class PoseState:
     def enter_submap(self) -> None:
         """Begin a new submap here; its axes are those of the odometry frame."""
         self.T_m_c = self.T_o_m @ self.T_m_c
-        self.T_o_m, self._last_measured, self._by_sensor = np.eye(4), None, False
+        self.T_o_m, self._last_measured, self._by_sensor, self._guessed = np.eye(4), None, False, False
 
     def rescale_map(self, metres: float) -> None:
         """Begin a submap in metres here whose axes are those of the old one. metres: one unit of it.
@@ -128,7 +130,7 @@ class PoseState:
         self.T_m_c, self._step_T = scaled(self.T_m_c, metres), scaled(self._step_T, metres)
         self.velocity = metres * self.velocity
         self.T_o_m = se3.orthonormalise(T_o_c @ se3.inverse(self.T_m_c))
-        self._last_measured, self._by_sensor = None, False
+        self._last_measured, self._by_sensor, self._guessed = None, False, False
 
     def rescale(self, metres: float) -> F64:
         """Begin a submap in metres here. metres: one unit of the old submap. Returns T_new_old (4,4), lengths in m."""

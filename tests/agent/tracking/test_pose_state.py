@@ -61,18 +61,29 @@ def test_nothing_is_measured_from_before(event: str) -> None:
 
 
 @pytest.mark.parametrize("guessed_first", [False, True])
-def test_what_a_sensor_told_in_between_stays(guessed_first: bool) -> None:
+def test_a_sensor_tells_the_velocity_and_a_guess_beside_it_stays_a_guess(guessed_first: bool) -> None:
     """The sensor ends before the images come back; until then its velocity counts, not that of the last images."""
     pose, slow = moving(), se3.exp(0.5 * se3.log(STEP))
     if guessed_first:
         pose.guess(pose.predict(DT_S), DT_S)
     pose.reckon(pose.T_m_c @ slow, DT_S)
+    assert pose.is_guess == guessed_first
     assert guessed_first or apart(pose.predict(DT_S), pose.T_m_c @ slow) < 1e-9
     pose.guess(pose.predict(DT_S), DT_S)
-    assert not pose.is_guess
+    assert pose.is_guess
     pose.measured(STEP, DT_S)
+    assert not pose.is_guess and not pose.moves  # from where the sensor ended nothing is measured
     pose.guess(pose.predict(DT_S), DT_S)
     assert pose.is_guess
+
+
+def test_what_a_sensor_told_all_the_way_is_no_guess() -> None:
+    pose = moving()
+    for _ in range(3):
+        pose.reckon(pose.T_m_c @ STEP, DT_S)
+    assert not pose.is_guess
+    pose.measured(pose.T_m_c @ STEP, DT_S)
+    assert pose.moves and apart(pose.predict(DT_S), pose.T_m_c @ STEP) < 1e-9
 
 
 def test_the_mean_of_a_long_loss_tells_no_velocity() -> None:
