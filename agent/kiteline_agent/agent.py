@@ -317,7 +317,7 @@ class Agent:
         """
         t_ns, start = frame.t_ns, self._inertial_start
         camera, motion = self._camera, self._camera.motion
-        starting = not camera.submaps.any and motion.tracker is not None and not motion.odometer.has_samples
+        starting = not camera.submaps.any and motion.tracker is not None and not motion.odometer.has_recent(t_ns)
         if start is not None and self._governor.on and (starting or len(start.waiting)):
             start.waiting.add(frame, joined(self._skipped_imu))
             self._skipped_imu = []

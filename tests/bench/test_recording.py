@@ -141,7 +141,9 @@ def test_faults_change_a_recording_and_no_agent_breaks_on_them(flight: Recording
     )
     assert before != after
     run = fly_alone(broken, vocabulary=False)
-    assert len(run.found) == len(broken.items) > 0
+    t_ns = [item.frame.t_ns for item in broken.items]
+    newer = [t for k, t in enumerate(t_ns) if t > max(t_ns[:k], default=-1)]  # an agent leaves out the others
+    assert [e.t_ns for e in run.found] == newer and len(newer) > 0
     assert all(np.isfinite(e.T_o_b).all() for e in run.found)
 
 

@@ -122,10 +122,10 @@ class CameraState:
     def dead_reckon(self, ctx: FrameContext) -> bool:
         """Take over the predicted pose of a frame without a measured one. True while IMU or odometer can be trusted."""
         reckoned = self.motion.dead_reckon(ctx.T_m_c, ctx.t_ns)
-        if reckoned.cov is None:
-            self.pose.guess(reckoned.T_m_c, ctx.dt_s)
-        else:
+        if reckoned.told:
             self.pose.reckon(reckoned.T_m_c, ctx.dt_s)
+        else:
+            self.pose.guess(reckoned.T_m_c, ctx.dt_s)
         self.reference.set_camera(self.pose.T_m_c)
         self.covariance.dead_reckon(ctx.dt_s, reckoned.cov, self.pose.measured_over_s)
         return reckoned.trusted

@@ -101,7 +101,7 @@ class SubmapStage:
         """Begin a submap with this frame; None if it shows too little."""
         inertial, motion = self._inertial_start, self._camera.motion
         if inertial is not None and motion.tracker is not None:
-            if inertial.add_samples(ctx) and not motion.odometer.has_samples:
+            if inertial.add_samples(ctx) and not motion.odometer.has_recent(ctx.t_ns):
                 return self._open_from_inertial_window(ctx, inertial, motion.tracker)
         if self._two_view_start is not None:
             return self._open_from_two_views(ctx, self._two_view_start)
@@ -299,7 +299,7 @@ class SubmapStage:
         inertial = camera.motion.tracker
         if start is None or inertial is None:
             return []
-        if camera.motion.metric or camera.motion.odometer.has_samples or not start.add_samples(ctx):
+        if camera.motion.metric or camera.motion.odometer.has_recent(ctx.t_ns) or not start.add_samples(ctx):
             self._forget_window(start)
             return []
         if not (camera.submaps.room and self._governor.may_do_part()):

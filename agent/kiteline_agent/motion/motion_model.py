@@ -44,12 +44,14 @@ class DeadReckoning:
     """Pose of a frame that the images did not place.
 
     T_m_c: (4,4). cov: (6,6) of it, None if neither IMU nor odometer measures the motion. trusted: dead reckoning has
-    lasted for a short time only.
+    lasted for a short time only. told: a sensor has told the motion of this frame; an odometer that slips or has fallen
+    silent has a covariance all the same.
     """
 
     T_m_c: F64
     cov: F64 | None
     trusted: bool
+    told: bool
 
 
 class MotionModel:
@@ -95,7 +97,7 @@ class MotionModel:
         if self._metric or not self.metric:
             return 0.0
         watched = self.tracker is not None and self.tracker.scale.running
-        return self.tracker.scale.deviation if self.tracker is not None and watched else self.odometer.unit_sigma
+        return self.tracker.scale.deviation if self.tracker is not None and watched else self.odometer.deviation
 
     @property
     def awaits_scale(self) -> bool:
@@ -229,10 +231,10 @@ class MotionModel:
         if self.tracker is None or state is None:
             cov = self.odometer.dead_reckon(predicted, t_ns)
             trusted = self.odometer.used and self.odometer.image_loss_s <= _TRUSTED_S
-            return DeadReckoning(predicted, cov, trusted)
+            return DeadReckoning(predicted, cov, trusted, cov is not None and self.odometer.used)
         self.odometer.dead_reckon(state.T_m_b @ self._T_b_c, t_ns)
         trusted = self.tracker.image_loss_s <= _TRUSTED_S
-        return DeadReckoning(state.T_m_b @ self._T_b_c, state.pose_cov, trusted)
+        return DeadReckoning(state.T_m_b @ self._T_b_c, state.pose_cov, trusted, True)
 
     def restart(self, t_ns: int) -> None:
         """Move the inertial state to the current pose after a relocalisation or in a new map."""
@@ -252,7 +254,7 @@ class MotionModel:
             self._steps.move_map(T_new_old)
         if self.tracker is not None and not self._metric:
             self.tracker.scale_map(growth)
-        self.odometer.move_map(T_new_old)
+        self.odometer.move_map(T_new_old, growth)
 
     def forget_turns(self) -> None:
         """Poses by images were those of a wrongly calibrated camera until now: they do not refute the IMU."""
@@ -288,7 +290,14 @@ class MotionModel:
 
     def scale_correction(self) -> tuple[float, float] | None:
         """Factor by which the map in metres is to be scaled, and its deviation; None if no correction is due."""
-        return None if self._metric or self.tracker is None else self.tracker.scale.correction()
+        if self._metric or not self.metric:
+            return None
+        watched = self.tracker is not None and self.tracker.scale.running
+        return (
+            self.tracker.scale.correction()
+            if self.tracker is not None and watched
+            else self.odometer.scale_correction()
+        )
 
     def reports(self) -> dict[str, Any]:
         """What was found of time offset, IMU and odometer; None for each that is not there."""
@@ -301,10 +310,10 @@ class MotionModel:
 
     def set_scale(self, t_ns: int, metres_per_unit: float, T_new_old: F64) -> None:
         """Scale the state to metres, in a submap that begins at this frame; the old one lies at T_new_old (4,4)."""
+        self.odometer.set_metric(metric=True, factor=metres_per_unit if self.metric else 1.0)
         if self.tracker is not None:
             self.tracker.rescale(metres_per_unit)
             self.tracker.move_map(T_new_old)
-        self.odometer.set_metric(metric=True)
         self._restart_steps(t_ns)
 
     def continue_map(self, t_ns: int, T_new_old: F64) -> None:

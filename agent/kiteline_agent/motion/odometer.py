@@ -11,8 +11,10 @@ import numpy as np
 
 from kiteline_agent.config import OdometerConfig
 from kiteline_agent.inertial.fixed_lag import BodyVelocity
+from kiteline_agent.inertial.samples.imu_watch import SILENT_S
 from kiteline_agent.motion.extrapolation import Extrapolation, MotionSource, along_twist
 from kiteline_agent.motion.odometer_samples import MeanVelocity, OdometerSamples, measured_part
+from kiteline_agent.motion.odometer_scale import LEAST_MOVED_M, OdometerScale
 from kiteline_agent.motion.unit_scale import WINDOW_S, UnitScale
 from kiteline_core.arrays import F64
 from kiteline_core.frame import OdometryBatch
@@ -22,11 +24,7 @@ _UNMATCHED = 10  # windows without a sample, after which the stamps are reported
 _WELL = 0.09  # (m/s)^2 or (rad/s)^2; directions measured worse than this count less and less
 _CORRELATION_S = 0.5  # s; correlation time of an odometer's errors: a patch of slippery floor, a gust
 _COMPARE_S = 0.2  # s; window of a comparison, in which images measure a velocity to a centimetre a second
-_LEAST_MOVED_M = 0.02  # m; motion in a window below which axes and scale are not observable
-_SCALE_START = 0.1  # relative deviation of an odometer's scale at the start
-_SCALE_MOST = 0.25  # relative; a larger difference is a fault, not a scale
-_SCALE_FLOOR = 0.01  # least relative deviation of the scale
-_SCALE_SIGMA_M_S = 0.05  # m/s; expected noise of a window in the scale estimate
+_UNIT_FLOOR = 0.01  # least relative deviation of a monocular map's unit
 _START_M_S = 0.08  # m/s; expected noise at the start, weighted as one window
 _START_RAD_S = 0.03  # rad/s; the same of the rotation rate
 _MEMORY_S = 3.0  # s; time constant of the noise estimate
@@ -36,10 +34,9 @@ _PROOFS = 3  # consecutive moving windows that must agree before an odometer is 
 _SURPRISE = 4.0  # deviations from the prediction above which a sample is rejected: 8 m/s^2
 _SEEN_M_S = 0.05  # m/s; error of the velocity between two frames placed by images
 _SEEN_RAD_S = 0.02  # rad/s; the same of the rotation rate
-_SCALE_WALK = 0.003  # relative change of the scale per sqrt(s): load and temperature
 _RISE = 0.5  # weight of such an unusual error: a slip is detected within 0.2 s
 _SETTLED = 0.4  # share of a rejected jump below which the velocity must fall before it is used again
-_ALIGNED = 0.9  # least cosine between both displacements for their lengths to be compared
+_ALIGNED = 0.9  # least cosine between both displacements of a window for the unit
 
 
 class Odometer:
@@ -51,10 +48,9 @@ class Odometer:
         self._config = config
         self.metric = metric
         self._samples = OdometerSamples(config.keep_s, config.max_gap_s)
-        self.scale, self._scale_var = 1.0, _SCALE_START**2  # true velocity = scale * measured
+        self._scale = OdometerScale(of_map=not metric)
         self._noise, self._rate_noise = _START_M_S**2, _START_RAD_S**2  # variances
         self._proofs = 0
-        self._speed = 0.0  # m/s, of the last window
         self._anchor: tuple[int, F64] | None = None  # stamp and T_m_c at the start of the window
         self._last: tuple[int, F64] | None = None  # stamp and T_m_c of the last frame
         self._velocity, self._rate = np.zeros(3), np.zeros(3)  # in b
@@ -77,10 +73,20 @@ class Odometer:
 
     # state
 
+    def has_recent(self, t_ns: int) -> bool:
+        """True if samples have come, the newest one less than SILENT_S before a frame."""
+        newest_ns = self._samples.newest_ns
+        return newest_ns is not None and t_ns - newest_ns < SILENT_S * 1e9
+
     @property
-    def has_samples(self) -> bool:
-        """True once a sample has arrived."""
-        return self._samples.any
+    def scale(self) -> float:
+        """True velocity over the measured one."""
+        return self._scale.value
+
+    @property
+    def deviation(self) -> float:
+        """Relative deviation of lengths in a monocular map, once the odometer has told its unit."""
+        return float(np.hypot(self.unit_sigma, self.scale - 1.0))
 
     @property
     def trusted(self) -> bool:
@@ -99,12 +105,12 @@ class Odometer:
 
     def report(self) -> dict[str, float | bool] | None:
         """Scale, noise and state of the odometer for report.json; None without samples."""
-        if not self.has_samples:
+        if not self._samples.any:
             return None
         return {
             "trusted": self._trusted,
             "scale": round(self.scale, 4),
-            "scale_sigma": round(float(np.sqrt(self._scale_var)), 4),
+            "scale_sigma": round(float(np.sqrt(self._scale.var)), 4),
             "noise_m_s": round(float(np.sqrt(self._noise)), 4),
             "compared": self._compared,
         }
@@ -112,10 +118,12 @@ class Odometer:
     @property
     def awaits_scale(self) -> bool:
         """True in a map of unknown scale while the odometer may still give it."""
-        if self.metric or not self.has_samples:
+        if self.metric or not self._samples.any:
             return False
-        began_ns = self._unscaled_ns
-        return began_ns is None or self._last is None or self._last[0] - began_ns < self._config.unit_wait_s * 1e9
+        if self._unscaled_ns is None or self._last is None:
+            return True
+        t_ns = self._last[0]
+        return self.has_recent(t_ns) and t_ns - self._unscaled_ns < self._config.unit_wait_s * 1e9
 
     def take_events(self) -> list[str]:
         """Events since the last call, for the log."""
@@ -132,7 +140,7 @@ class Odometer:
     @property
     def _usable(self) -> bool:
         """True if poses can be predicted: samples agree with the images, and the map is in metres."""
-        return self.has_samples and self._trusted and self.metric
+        return self._samples.any and self._trusted and self.metric
 
     # per frame
 
@@ -201,7 +209,7 @@ class Odometer:
     def _updated_velocity(self, mean: MeanVelocity, prior: F64, expected: F64 | None = None) -> "_KalmanUpdate":
         """The velocity (3,) in b by a sample. prior: (3,3) its covariance before. expected: (3,); None: as it was."""
         c, z = self._config, self.scale * mean.velocity
-        slow = (self._noise + c.floor_m_s**2) * np.eye(3) + self._scale_var * np.outer(z, z)
+        slow = (self._noise + c.floor_m_s**2) * np.eye(3) + self._scale.var * np.outer(z, z)
         return _blend(self._velocity if expected is None else expected, prior, z, mean.velocity_cov, slow, _SURPRISE)
 
     def _updated_rate(self, mean: MeanVelocity, prior: F64) -> "_KalmanUpdate":
@@ -211,7 +219,7 @@ class Odometer:
 
     def update(self, T_m_c: F64, t_ns: int) -> None:
         """Process a frame that images (and an IMU) placed at T_m_c (4,4)."""
-        if self.has_samples:
+        if self._samples.any:
             self._compare(T_m_c, t_ns)
             if self._last is not None and t_ns > self._last[0] and self.image_loss_s == 0.0 and self.metric:
                 self._set_velocity(self._last[1], T_m_c, (t_ns - self._last[0]) * 1e-9)
@@ -246,7 +254,7 @@ class Odometer:
         self._rotation_cov = self._rotation_cov + dt * (self._rotation_cross + self._rotation_cross.T)
         arm = se3.skew(self._path)
         cov = np.zeros((6, 6))
-        cov[:3, :3] = self._path_cov + self._scale_var * np.outer(self._path, self._path)
+        cov[:3, :3] = self._path_cov + self._scale.var * np.outer(self._path, self._path)
         cov[:3, :3] += arm @ r @ self._rotation_cov @ r.T @ arm.T / 3.0  # heading error along the path
         cov[3:, 3:] = self._rotation_cov
         return 0.5 * (cov + cov.T)
@@ -254,7 +262,7 @@ class Odometer:
     def velocity(self, t_ns: int) -> BodyVelocity | None:
         """Velocity for the inertial smoother at the frame t_ns; None if the odometer is not trusted."""
         c = self._config
-        if not self.has_samples or not self._trusted or not self.metric or self._last is None:
+        if not self._samples.any or not self._trusted or not self.metric or self._last is None:
             return None
         before_ns = self._last[0]
         newest = self._samples.within(before_ns, t_ns)
@@ -263,7 +271,7 @@ class Odometer:
         value, cov, age_s = self.scale * newest[0], newest[1], newest[2]
         dt = (t_ns - before_ns) * 1e-9
         # errors are correlated over frames: inflate, so that those frames count as one
-        slow = (self._noise + c.floor_m_s**2) * np.eye(3) + self._scale_var * np.outer(value, value)
+        slow = (self._noise + c.floor_m_s**2) * np.eye(3) + self._scale.var * np.outer(value, value)
         counted = cov + max(1.0, 2.0 * _CORRELATION_S / dt) * slow
         return BodyVelocity(value, cov + slow, counted, age_s)
 
@@ -274,19 +282,25 @@ class Odometer:
         self._anchor, self._last = (t_ns, T_m_c), (t_ns, T_m_c)
         self._reset_image_loss()
 
-    def move_map(self, T_new_old: F64) -> None:
-        """Transform the state after the submap frame moved by T_new_old (4,4)."""
+    def scale_correction(self) -> tuple[float, float] | None:
+        """Factor by which a monocular map in metres is to be scaled, and its deviation; None if none is due."""
+        return self._scale.correction() if self._usable else None
+
+    def move_map(self, T_new_old: F64, growth: float = 1.0) -> None:
+        """Transform the state after the submap frame moved by T_new_old (4,4), and lengths in it grew by a factor."""
+        self._scale.scale_map(growth)
         self._anchor = None if self._anchor is None else (self._anchor[0], T_new_old @ self._anchor[1])
         self._last = None if self._last is None else (self._last[0], T_new_old @ self._last[1])
         r = T_new_old[:3, :3]
         self._path = r @ self._path
         self._path_cov, self._path_cross = r @ self._path_cov @ r.T, r @ self._path_cross @ r.T
 
-    def set_metric(self, *, metric: bool) -> None:
-        """Change the map's unit to metres, or to an unknown one."""
+    def set_metric(self, *, metric: bool, factor: float = 1.0) -> None:
+        """Change the map's unit to metres, or to an unknown one. factor: by which a map in metres was scaled."""
+        self._scale.scale_map(factor)
         found = self.metres_per_unit()
         if metric and found is not None:
-            self.unit_sigma = float(np.hypot(found[1] / found[0], _SCALE_FLOOR))
+            self.unit_sigma = float(np.hypot(found[1] / found[0], _UNIT_FLOOR))
         self.metric = metric
         self._anchor = self._last = None
         self._unit_scale.clear()
@@ -344,26 +358,12 @@ class Odometer:
 
     def _compare_displacements(self, by_odometer: F64, by_images: F64, axes: float, dt: float) -> None:
         """Update scale, noise and trust from displacements (3,) in m, in the `axes` that are measured."""
-        c = self._config
         distance = float(np.sqrt(by_images @ by_images))
-        self._speed = distance / dt
-        square = float(by_odometer @ by_odometer)
-        self._scale_var += _SCALE_WALK**2 * dt
-        if square > _LEAST_MOVED_M**2:
-            along = float(by_odometer @ by_images)
-            # Over the part along the images' motion: the odometer's own noise in its square would shorten it.
-            measured_scale = distance**2 / along if along > 0.0 else 0.0
-            var = (_SCALE_SIGMA_M_S * dt / distance) ** 2 if distance > 0.0 else np.inf
-            off = measured_scale - self.scale
-            aligned = along > _ALIGNED * distance * float(np.sqrt(square))
-            if aligned and off * off < 9.0 * (self._scale_var + var):
-                gain = self._scale_var / (self._scale_var + var)
-                self.scale = float(np.clip(self.scale + gain * off, 1.0 - _SCALE_MOST, 1.0 + _SCALE_MOST))
-                self._scale_var = max((1.0 - gain) * self._scale_var, _SCALE_FLOOR**2)
+        self._scale.add(by_odometer, by_images, dt)
         error = (by_images - self.scale * by_odometer) / dt
-        tolerance = c.tolerance_m_s + _TOLERANCE_SHARE * self._speed
+        tolerance = self._config.tolerance_m_s + _TOLERANCE_SHARE * distance / dt
         square_error = float(error @ error) / max(axes, 0.5)
-        if max(distance, float(np.sqrt(square))) > _LEAST_MOVED_M:
+        if max(distance, float(np.sqrt(by_odometer @ by_odometer))) > LEAST_MOVED_M:
             self._proofs = min(self._proofs + 1, _PROOFS) if square_error < tolerance**2 else 0
         self._noise = self._filtered(self._noise, square_error, dt)
         self._trusted = self._proofs >= _PROOFS and self._noise < tolerance**2

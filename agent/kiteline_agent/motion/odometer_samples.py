@@ -34,6 +34,11 @@ class OdometerSamples:
         """True once a sample has arrived."""
         return self._samples is not None
 
+    @property
+    def newest_ns(self) -> int | None:
+        """Stamp of the newest sample; None before one has come."""
+        return int(self._samples.t_ns[-1]) if self._samples is not None and len(self._samples.t_ns) else None
+
     def add(self, batch: OdometryBatch | None) -> None:
         """Append samples that are finite and newer than the newest one."""
         if batch is None or len(batch.t_ns) == 0:

@@ -290,7 +290,7 @@ def test_no_numbers_break_it(numbers: list[float], seed: int) -> None:
 
 def test_without_use_nothing_is_looked_at() -> None:
     flown = Flown(driven(3.0), 3.0, config=OdometerConfig(use=False))
-    assert not flown.odometer.has_samples
+    assert not flown.odometer.has_recent(0)
     assert flown.odometer.report() is None
 
 
