@@ -7,6 +7,7 @@ from kiteline_core.geometry import se3
 
 _KNOWN_S = 1.0  # s without an image, whose mean motion still tells how the vehicle moves
 _KNOWN_TRACE = 1.2  # of the rotation in that time, at least: 84 degrees
+_LASTS_S = 0.5  # s of a guess, after which the motion that it goes on with ends, within as long again
 _EVEN_SPACING = 0.2  # relative; frame intervals that differ by less count as equal
 
 
@@ -27,6 +28,7 @@ class PoseState:
         self._last_measured: tuple[F64, float] | None = None  # T_m_c (4,4) by the last new image, s since; None: now
         self._by_sensor = False  # since the last pose by images a sensor has told a part of the motion
         self._guessed = False  # a part of it was told by nothing
+        self._guess_s = 0.0  # s since a sensor or a new image told the pose
 
     @property
     def is_guess(self) -> bool:
@@ -60,16 +62,22 @@ class PoseState:
         return np.asarray(se3.log(se3.inverse(self.T_m_c) @ self.predict(dt_s)) / dt_s)
 
     def guess(self, T_m_c: F64, dt_s: float) -> None:
-        """Set a pose (4,4) that nothing measured. dt_s: since the last one."""
+        """Set a pose (4,4) that nothing measured. dt_s: since the last one.
+
+        No vehicle turns on for seconds: one whose last motion went on for 4 s was upside down.
+        """
         measured_T_m_c, since_s = self._last_measured or (self.T_m_c, 0.0)
-        self.T_m_c, self._guessed = T_m_c, True
+        self.T_m_c, self._guessed, self._guess_s = T_m_c, True, self._guess_s + dt_s
+        if self._guess_s > _LASTS_S:
+            share = float(np.exp(-dt_s / _LASTS_S))
+            self._step_T, self.velocity = se3.exp(share * se3.log(self._step_T)), share * self.velocity
         if not self._by_sensor:
             self._last_measured = measured_T_m_c, since_s + dt_s
 
     def reckon(self, T_m_c: F64, dt_s: float) -> None:
         """Set a pose (4,4) by a sensor other than the camera. dt_s: since the last one."""
         before, follows_guess = self.T_m_c, self._last_measured is not None
-        self.T_m_c, self._last_measured, self._by_sensor = T_m_c, None, True
+        self.T_m_c, self._last_measured, self._by_sensor, self._guess_s = T_m_c, None, True, 0.0
         if not follows_guess:
             self._set_step(before, dt_s)
 
@@ -82,7 +90,7 @@ class PoseState:
         since_s += dt_s
         long = self._by_sensor or since_s > _KNOWN_S or np.vdot(before[:3, :3], T_m_c[:3, :3]) < _KNOWN_TRACE
         guessed, self._guessed, self._by_sensor, self.T_m_c = self._guessed, repeated, False, T_m_c
-        self._last_measured = (T_m_c, since_s) if repeated else None
+        self._last_measured, self._guess_s = (T_m_c, since_s) if repeated else None, 0.0
         if guessed and long:
             self.reset_motion()
         elif not repeated:
@@ -99,7 +107,7 @@ class PoseState:
     def reset_motion(self) -> None:
         """Forget the motion: the next prediction is the present pose."""
         self._step_T, self.velocity, self.moves = np.eye(4), np.zeros(3), False
-        self._last_measured, self._by_sensor, self._guessed = None, False, False
+        self._last_measured, self._by_sensor, self._guessed, self._guess_s = None, False, False, 0.0
 
     def set_motion(self, step_T: F64, velocity: F64) -> None:
         """Set the motion. step_T: (4,4) T_c0_c1 a frame. velocity: (3,) m/s in m."""

@@ -77,6 +77,22 @@ def test_a_sensor_tells_the_velocity_and_a_guess_beside_it_stays_a_guess(guessed
     assert pose.is_guess
 
 
+def test_a_guess_goes_on_for_half_a_second_and_comes_to_an_end() -> None:
+    pose = moving()
+    turn = se3.exp(np.array([0.05, 0.0, 0.0, 0.0, 0.05, 0.0]))  # 1 m/s and 1 rad/s
+    pose.measured(pose.T_m_c @ turn, DT_S)
+    begin = pose.T_m_c.copy()
+    for _ in range(10):
+        pose.guess(pose.predict(DT_S), DT_S)
+    assert apart(pose.predict(DT_S), pose.T_m_c @ turn) < 1e-9
+    for _ in range(90):
+        pose.guess(pose.predict(DT_S), DT_S)
+    turned = np.linalg.norm(se3.so3_log(begin[:3, :3].T @ pose.T_m_c[:3, :3]))
+    assert 0.8 < turned < 1.1 and np.linalg.norm(pose.velocity) < 1e-3
+    pose.measured(pose.T_m_c @ turn, DT_S)
+    assert not pose.moves  # long ago
+
+
 def test_what_a_sensor_told_all_the_way_is_no_guess() -> None:
     pose = moving()
     for _ in range(3):
