@@ -57,9 +57,10 @@ def image_loss_bars(name: str, recording: Recording, good: OdometryBatch) -> lis
 def monocular_bars(name: str, recording: Recording, good: OdometryBatch) -> list[Bar]:
     """Left camera and odometer, without an IMU: lengths in metres."""
     run = fly_alone(recording.with_odometry(good))
-    metric = [e for e in run.found if e.submap == run.metric_submap]
-    first_ns = next((e.t_ns for e in metric if e.tracked), run.t_ns[-1])
-    found = run.evaluate(metric, TrajectoryAlignment.SIM3)
+    in_metres = {t for t, metric in zip(run.t_ns, run.metric, strict=True) if metric}
+    metric = [e for e in run.found if e.tracked and e.t_ns in in_metres]
+    first_ns = metric[0].t_ns if metric else run.t_ns[-1]
+    found = run.evaluate(metric, TrajectoryAlignment.SIM3, "o")  # corrections of the scale begin new submaps
     off_percent = float("inf") if found is None else 100.0 * abs(1.0 / found.scale - 1.0)
     return [
         at_most(f"{name}, monocular and odometry: scale off by", off_percent, 5.0, "%", 1),
