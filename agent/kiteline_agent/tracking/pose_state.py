@@ -7,7 +7,8 @@ from kiteline_core.geometry import se3
 
 _KNOWN_S = 1.0  # s without an image, whose mean motion still tells how the vehicle moves
 _KNOWN_TRACE = 1.2  # of the rotation in that time, at least: 84 degrees
-_LASTS_S = 0.5  # s of a guess, after which the motion that it goes on with ends, within as long again
+_LASTS_S = 0.5  # s of a guess, after which the motion that it goes on with fades
+_TURN_S, _WAY_S = 0.5, 2.0  # s; time constants of that: three flights of EuRoC turn on for less long than they fly on
 _EVEN_SPACING = 0.2  # relative; frame intervals that differ by less count as equal
 
 
@@ -64,13 +65,14 @@ class PoseState:
     def guess(self, T_m_c: F64, dt_s: float) -> None:
         """Set a pose (4,4) that nothing measured. dt_s: since the last one.
 
-        No vehicle turns on for seconds: one whose last motion went on for 4 s was upside down.
+        No vehicle turns on for seconds: one whose last motion goes on for 4 s is upside down.
         """
         measured_T_m_c, since_s = self._last_measured or (self.T_m_c, 0.0)
         self.T_m_c, self._guessed, self._guess_s = T_m_c, True, self._guess_s + dt_s
         if self._guess_s > _LASTS_S:
-            share = float(np.exp(-dt_s / _LASTS_S))
-            self._step_T, self.velocity = se3.exp(share * se3.log(self._step_T)), share * self.velocity
+            way, turn = np.exp(-dt_s / _WAY_S), np.exp(-dt_s / _TURN_S)
+            self._step_T = se3.exp(np.repeat([way, turn], 3) * se3.log(self._step_T))
+            self.velocity = way * self.velocity
         if not self._by_sensor:
             self._last_measured = measured_T_m_c, since_s + dt_s
 

@@ -77,7 +77,7 @@ def test_a_sensor_tells_the_velocity_and_a_guess_beside_it_stays_a_guess(guessed
     assert pose.is_guess
 
 
-def test_a_guess_goes_on_for_half_a_second_and_comes_to_an_end() -> None:
+def test_a_guess_goes_on_for_half_a_second_and_then_fades() -> None:
     pose = moving()
     turn = se3.exp(np.array([0.05, 0.0, 0.0, 0.0, 0.05, 0.0]))  # 1 m/s and 1 rad/s
     pose.measured(pose.T_m_c @ turn, DT_S)
@@ -88,7 +88,7 @@ def test_a_guess_goes_on_for_half_a_second_and_comes_to_an_end() -> None:
     for _ in range(90):
         pose.guess(pose.predict(DT_S), DT_S)
     turned = np.linalg.norm(se3.so3_log(begin[:3, :3].T @ pose.T_m_c[:3, :3]))
-    assert 0.8 < turned < 1.1 and np.linalg.norm(pose.velocity) < 1e-3
+    assert 0.8 < turned < 1.1 and 0.05 < np.linalg.norm(pose.velocity) < 0.2  # of 1 m/s, 4.5 s later
     pose.measured(pose.T_m_c @ turn, DT_S)
     assert not pose.moves  # long ago
 
