@@ -2,7 +2,8 @@
 
 The accelerometer gives a first guess, which is accurate at rest only. A few frames later the poses by images give the
 acceleration, so that gravity is known to half a degree in motion too. The first submap keeps its axes; its rotation is
-sent to the base, and a flight controller gets its first pose once the rotation is known.
+sent to the base, and a flight controller gets its first pose once the rotation is known: never in a frame whose
+vertical nothing has measured.
 """
 
 import numpy as np
@@ -19,7 +20,7 @@ from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.ids import SubmapId
 
 _MIN_TILT_RAD = 0.035  # rad; tilt above which the map is gravity-aligned: two degrees
-_PATIENCE_S = 2.0  # s; longest time that a flight controller waits for gravity-aligned poses
+_PATIENCE_S = 2.0  # s; longest time that a flight controller waits for more than the accelerometer's first guess
 _LEAST_M_S2 = 0.1  # of a specific force that points anywhere
 _ATTITUDE_TILT = np.array([0, 1, 2, 15, 16])  # in the covariance of a state
 AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # R_m_c of a level camera that looks along x
@@ -62,6 +63,7 @@ class GravityAligner:
         self._began_ns: int | None = None
         self._R_l_o: F64 | None = None if inertial is not None else np.eye(3)
         self._renewed = self._known = False
+        self._guessed = False  # the first submap is upright only if the camera was level
         self.tilt_rad = 0.0  # of the first submap, or of the one that continues it
 
     @property
@@ -87,6 +89,7 @@ class GravityAligner:
         if self._inertial is not None and imu is not None and len(imu.t_ns):
             R_m_b = level_rotation(imu.accel.mean(axis=0))
         else:
+            self._guessed = True
             R_m_b = AHEAD @ self._camera.T_b_c[:3, :3].T
         return se3.from_rt(R_m_b, np.zeros(3)) @ self._camera.T_b_c
 
@@ -95,8 +98,7 @@ class GravityAligner:
     ) -> GravityAlignment | None:
         """Process a frame tracked at T_m_b (4,4), with R_o_m (3,3) from the submap to the odometry frame.
 
-        continued: the submap is the first one, or continues it. Returns how it is tilted, once, if it is: also where
-        the samples began so late that a flight controller got poses before, whose frame stays as it was.
+        continued: the submap is the first one, or continues it. Returns how it is tilted, once, if it is.
         """
         if self._known or self._inertial is None:
             return None
@@ -104,7 +106,8 @@ class GravityAligner:
             self._began_ns = t_ns
         R_l_m = self._inertial.gravity_rotation()
         if R_l_m is None:
-            if t_ns - self._began_ns > _PATIENCE_S * 1e9 and not self._renewed:
+            waited = t_ns - self._began_ns > _PATIENCE_S * 1e9
+            if waited and not (self._renewed or self._guessed):  # a guess may be tilted by any angle
                 self._R_l_o = np.eye(3)
             return None
         self._known = True

@@ -12,6 +12,11 @@ from kiteline_hw.system import process
 from kiteline_hw.system.clock import MonotonicClock
 
 OBSTACLES_HZ = 10.0  # distances to obstacles, a flight controller wants 10 to 15
+_UPRIGHT_NS = 3_000_000_000  # ns of poses whose vertical is not known, after which it is said: most take 0.3 s
+_NOT_UPRIGHT = (
+    "the IMU has not told which way is up: check that its samples come. Without one (--no-imu) a camera counts as "
+    "level where its flight begins"
+)
 
 
 def controller_link(
@@ -62,18 +67,43 @@ def with_controller_imu(options: AgentOptions, source: FrameSource) -> FrameSour
     return with_other_imu(source, own.noise, own.camera())
 
 
-def pose_sample(agent: OnboardAgent, output: StepOutput, t_ns: int, epoch: int) -> PoseSample | None:
-    """The pose of a step for a flight controller, as of t_ns of its clock; None without a gravity-aligned one.
+class UnsentPoses:
+    """Tells why a flight controller gets no pose while the camera is tracked; each reason when it begins."""
 
-    One whose lengths are not metres counts as not tracked: no flight controller can use it.
+    def __init__(self) -> None:
+        self._why = ""
+        self._since_ns: int | None = None  # stamp of the first pose in a row whose vertical is not known
+
+    def lines(self, estimate: Estimate | None, *, metric: bool) -> list[str]:
+        """What has changed. estimate: of the last frame. metric: its lengths are metres."""
+        if estimate is None or not estimate.tracked:
+            return []
+        before, self._why = self._why, self._reason(estimate, metric)
+        if self._why == before:
+            return []
+        return [f"flight controller: no pose is sent, as {self._why}" if self._why else "flight controller: gets poses"]
+
+    def _reason(self, estimate: Estimate, metric: bool) -> str:
+        if not metric:
+            return "lengths are not in metres"
+        if estimate.R_l_o is not None:
+            self._since_ns = None
+            return ""
+        self._since_ns = estimate.t_ns if self._since_ns is None else self._since_ns
+        return _NOT_UPRIGHT if estimate.t_ns - self._since_ns >= _UPRIGHT_NS else ""
+
+
+def pose_sample(agent: OnboardAgent, output: StepOutput, t_ns: int, epoch: int) -> PoseSample | None:
+    """The pose of a step for a flight controller, as of t_ns of its clock; None without an upright one in metres.
+
+    One that is not tracked is sent too, for its quality; in another unit it would be flown by some settings of PX4.
     """
     pose: Estimate | PredictedPose | None = output.estimate or output.predicted
-    if pose is None or pose.T_l_b is None:
+    if pose is None or pose.T_l_b is None or not agent.metric:
         return None
-    tracked = pose.tracked and agent.metric
     if isinstance(pose, PredictedPose):
-        return PoseSample(t_ns, pose.T_l_b, tracked, pose.quality, epoch, pose.cov_l, pose.velocity_l, pose.rate_b)
-    return PoseSample(t_ns, pose.T_l_b, tracked, agent.odometry_quality(pose), epoch, pose.cov_l)
+        return PoseSample(t_ns, pose.T_l_b, pose.tracked, pose.quality, epoch, pose.cov_l, pose.velocity_l, pose.rate_b)
+    return PoseSample(t_ns, pose.T_l_b, pose.tracked, agent.odometry_quality(pose), epoch, pose.cov_l)
 
 
 def push_obstacles(

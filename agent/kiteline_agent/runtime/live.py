@@ -13,6 +13,7 @@ from kiteline_agent.onboard import OnboardAgent
 from kiteline_agent.runtime.agent_runtime import PROGRESS_FRAMES, AgentRuntime, channel_with_spill, opened
 from kiteline_agent.runtime.controller import (
     OBSTACLES_HZ,
+    UnsentPoses,
     controller_link,
     pose_rate_hz,
     pose_sample,
@@ -126,7 +127,7 @@ class _LiveFlight:
         self._runtime, self._base, self._controller = runtime, base, controller
         self._clock, self._parent, self._stop = clock, parent, stop
         self._status = StatusMessages()
-        self._own_unit = False  # lengths of the last pose were not in metres
+        self._unsent = UnsentPoses()
         options = runtime.options
         self._begin_ns = begin_ns = clock.now_ns()
         runtime.begin_at(begin_ns)
@@ -215,22 +216,14 @@ class _LiveFlight:
         imu = _measured(own, runtime.reader.take_imu(predict_ns), self._shift_ns)
         return _Due(now_ns, StepInput(imu=imu, predict_ns=predict_ns))
 
-    def _told_unit(self) -> list[str]:
-        """That a flight controller gets no pose, while one is tracked in another unit than metres; each time once."""
-        output, before = self._runtime.output, self._own_unit
-        estimate = None if output is None else output.estimate
-        if estimate is not None and estimate.tracked:
-            self._own_unit = not self._runtime.agent.metric
-        return ["flight controller: no pose is sent, as lengths are not in metres"] if self._own_unit > before else []
-
     def _report(self, now_ns: int) -> None:
         """Tell the terminal, or the parent, how the flight goes."""
         runtime, controller = self._runtime, self._controller
         if self._parent is None:
             found = [] if controller is None else [f.line for f in controller.take_findings()]
-            if controller is not None:
-                found += self._told_unit()
             if runtime.output:
+                if controller is not None:
+                    found += self._unsent.lines(runtime.output.estimate, metric=runtime.agent.metric)
                 lines = self._status.lines(runtime.output, runtime.counts, now_ns - self._begin_ns, found)
                 process.print_lines(lines)
         elif runtime.counts.frames % PROGRESS_FRAMES == 0:
