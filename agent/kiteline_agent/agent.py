@@ -243,6 +243,7 @@ class Agent:
             )
             if continued:
                 self._corrections.note_continued(self.submap)
+                continued += self._align_gravity(ctx)  # a map in metres may know it at once
             events += continued + self._submaps.take_warnings()
             outcome = FrameOutcome(True, False, track.inliers, events)
         if self.right_camera is not None:

@@ -41,6 +41,7 @@ class _InOdometryFrame:
     T_o_b: F64
     cov_o: F64
     R_l_o: F64 | None
+    p_l_o: F64 | None
 
     @property
     def T_l_b(self) -> F64 | None:
@@ -49,6 +50,8 @@ class _InOdometryFrame:
             return None
         T = self.T_o_b.copy()
         T[:3] = self.R_l_o @ T[:3]
+        if self.p_l_o is not None:
+            T[:3, 3] += self.p_l_o
         return T
 
     @property
@@ -73,9 +76,12 @@ class Estimate(_InOdometryFrame):
     cov_m: (6,6) of T_m_b relative to the start of its submap, [translation in m, rotation about the body's axes],
     m, rad.
     cov_o: (6,6) of T_o_b relative to the start of the flight, [translation in o, rotation about the body's axes].
-    R_l_o: (3,3) odometry frame to gravity-aligned frame, constant once it is known; None before, if a flight begins in
-    motion, from when an IMU is left that never agreed with the images, and while it is measured again, because the IMU
-    turned out to be mounted otherwise than the calibration says.
+    R_l_o: (3,3) odometry frame to gravity-aligned frame. None before it is known, if a flight begins in motion, from
+    when an IMU is left that never agreed with the images, and while it is measured again, because the IMU turned out
+    to be mounted otherwise than the calibration says. It changes then, and after a loss over which nothing measured
+    how the vehicle turned, once the IMU tells the vertical.
+    p_l_o: (3,) m, origin of the odometry frame in the gravity-aligned one: the vehicle stays at its place where R_l_o
+    changes. None: the same origin.
     initialising: there is no map yet, or one whose scale is still to come, and so no pose: T_o_b means nothing.
     """
 
@@ -94,6 +100,7 @@ class Estimate(_InOdometryFrame):
     R_l_o: F64 | None
     T_w_b: F64 | None
     initialising: bool = False
+    p_l_o: F64 | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,8 +108,8 @@ class PredictedPose(_InOdometryFrame):
     """Pose of an instant after the last tracked frame: of a skipped frame, or between frames.
 
     source: what measured the motion since then: imu, odometer, or velocity (nothing: it is that of the last frames).
-    tracked: the last frame was. T_o_b, quality, cov_o, R_l_o: as in Estimate. velocity_o: (3,) m/s of the body's origin
-    in o. rate_b: (3,) rad/s in b.
+    tracked: the last frame was. T_o_b, quality, cov_o, R_l_o, p_l_o: as in Estimate. velocity_o: (3,) m/s of the body's
+    origin in o. rate_b: (3,) rad/s in b.
     """
 
     t_ns: int
@@ -114,6 +121,7 @@ class PredictedPose(_InOdometryFrame):
     quality: int
     cov_o: F64
     R_l_o: F64 | None
+    p_l_o: F64 | None = None
 
     @property
     def velocity_l(self) -> F64:

@@ -63,13 +63,20 @@ class GravityAligner:
         self._began_ns: int | None = None
         self._R_l_o: F64 | None = None if inertial is not None else np.eye(3)
         self._renewed = self._known = False
+        self._p_l_o: F64 | None = None
         self._guessed = False  # the first submap is upright only if the camera was level
+        self._doubted = False  # since it was known nothing has measured a part of the turns
         self.tilt_rad = 0.0  # of the first submap, or of the one that continues it
 
     @property
     def R_l_o(self) -> F64 | None:
-        """(3,3) that gravity-aligns the odometry frame; None before. Constant, but for `renew`."""
-        return self._R_l_o
+        """(3,3) that gravity-aligns the odometry frame; None before. It turns after `renew`, `doubt` and a guess."""
+        return None if self._renewed and not self._known else self._R_l_o
+
+    @property
+    def p_l_o(self) -> F64 | None:
+        """(3,) m, the odometry frame's origin in the gravity-aligned frame; None where that never turned."""
+        return self._p_l_o
 
     def forget(self) -> None:
         """The vertical came from an IMU that contradicts the images: it is not known in this flight."""
@@ -78,7 +85,11 @@ class GravityAligner:
     def renew(self) -> None:
         """The IMU is mounted otherwise than the calibration says, and so was the vertical: it is measured again."""
         if self._inertial is not None:
-            self._R_l_o, self._renewed, self._known = None, True, False
+            self._renewed, self._known = True, False
+
+    def doubt(self) -> None:
+        """Neither images nor IMU have measured how the vehicle turned: the odometry frame may lean from here on."""
+        self._doubted = self._known
 
     def ignore_imu(self) -> None:
         """Go on as without an IMU, for a camera that was level when the flight began."""
@@ -94,17 +105,24 @@ class GravityAligner:
         return se3.from_rt(R_m_b, np.zeros(3)) @ self._camera.T_b_c
 
     def update(
-        self, t_ns: int, T_m_b: F64, R_o_m: F64, submap: SubmapId, *, continued: bool
+        self, t_ns: int, T_m_b: F64, T_o_m: F64, submap: SubmapId, *, continued: bool
     ) -> GravityAlignment | None:
-        """Process a frame tracked at T_m_b (4,4), with R_o_m (3,3) from the submap to the odometry frame.
+        """Process a frame tracked at T_m_b (4,4), with T_o_m (4,4) from the submap to the odometry frame.
 
         continued: the submap is the first one, or continues it. Returns how it is tilted, once, if it is.
         """
-        if self._known or self._inertial is None:
+        if self._inertial is None:
             return None
         if self._began_ns is None:
             self._began_ns = t_ns
-        R_l_m = self._inertial.gravity_rotation()
+        # Once known, only what many frames tell counts: the first few know it to two degrees.
+        asked = not self._known or (self._doubted and self._inertial.running)
+        R_l_m = self._inertial.gravity_rotation() if asked else None
+        R_o_m, here_o = T_o_m[:3, :3], (T_o_m @ T_m_b)[:3, 3]
+        if self._known:
+            if R_l_m is not None:
+                self._turn_upright(R_l_m, R_o_m, here_o)
+            return None
         if R_l_m is None:
             waited = t_ns - self._began_ns > _PATIENCE_S * 1e9
             if waited and not (self._renewed or self._guessed):  # a guess may be tilted by any angle
@@ -113,10 +131,20 @@ class GravityAligner:
         self._known = True
         if self._R_l_o is None:
             self._R_l_o = level_rotation(R_o_m @ R_l_m[2])
+        else:
+            self._turn_upright(R_l_m, R_o_m, here_o)
         self.tilt_rad = float(np.linalg.norm(se3.so3_log(R_l_m)))
         if not continued or self._renewed or self.tilt_rad < _MIN_TILT_RAD:
             return None
         return upright_about(submap, R_l_m, T_m_b[:3, 3])
+
+    def _turn_upright(self, R_l_m: F64, R_o_m: F64, here_o: F64) -> None:
+        """Turn the gravity-aligned frame about the vehicle, at here_o (3,) m, without a change of its heading."""
+        assert self._R_l_o is not None
+        self._doubted = False
+        here_l = self._R_l_o @ here_o + (0.0 if self._p_l_o is None else self._p_l_o)
+        self._R_l_o = level_rotation(self._R_l_o @ R_o_m @ R_l_m[2]) @ self._R_l_o
+        self._p_l_o = here_l - self._R_l_o @ here_o
 
 
 def upright_about(submap: SubmapId, R_l_m: F64, here: F64) -> GravityAlignment:

@@ -122,6 +122,8 @@ class CameraState:
     def dead_reckon(self, ctx: FrameContext) -> bool:
         """Take over the predicted pose of a frame without a measured one. True while IMU or odometer can be trusted."""
         reckoned = self.motion.dead_reckon(ctx.T_m_c, ctx.t_ns)
+        if not self.motion.running:
+            self.gravity.doubt()
         if reckoned.told:
             self.pose.reckon(reckoned.T_m_c, ctx.dt_s)
         else:
@@ -139,7 +141,7 @@ class CameraState:
             return None
         opened = self.submaps.opened
         continued = opened == 1 or (opened == 2 and self._T_o_first is not None)
-        return self.gravity.update(t_ns, self.T_m_b, self.pose.T_o_m[:3, :3], self.submaps.active, continued=continued)
+        return self.gravity.update(t_ns, self.T_m_b, self.pose.T_o_m, self.submaps.active, continued=continued)
 
     def first_aligned(self, alignment: GravityAlignment) -> GravityAlignment:
         """How the first submap is tilted, by which the base aligns its world, where the active one continues it."""

@@ -58,7 +58,7 @@ class PoseReport:
         self._last = Estimate(
             ctx.t_ns, tracked, outcome.bridged, T_m_b if tracked else None, T_o_m @ T_m_b, keyframe, T_k_c.copy(),
             submap, outcome.inliers, quality, cov_m, cov_o, camera.gravity.R_l_o, T_w_b if tracked else None,
-            initialising,
+            initialising, camera.gravity.p_l_o,
         )  # fmt: skip
         self._recent.add(ctx.t_ns, self._last.T_o_b, measured=tracked and not outcome.bridged)
         return self._last
@@ -105,5 +105,5 @@ class PoseReport:
         velocity, rate = by_poses or (R_o_m @ moved.velocity, moved.rate)
         return PredictedPose(
             t_ns, moved.source.value, last.tracked, camera.pose.T_o_m @ moved.T_m_b, velocity, rate, quality,
-            cov_o, camera.gravity.R_l_o,
+            cov_o, camera.gravity.R_l_o, camera.gravity.p_l_o,
         )  # fmt: skip

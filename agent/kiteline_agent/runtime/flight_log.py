@@ -99,7 +99,7 @@ def _to_json(value: object, names: Sequence[str]) -> dict[str, Any]:
 def estimate_from_json(value: Mapping[str, Any]) -> Estimate:
     """The estimate of such a record. Raises ValueError when a field is missing or of another shape."""
     known = {field.name for field in fields(Estimate)}
-    if known != set(value):
+    if known - {"p_l_o"} != set(value) - {"p_l_o"}:  # which older logs lack
         raise ValueError(f"logged estimate has fields {sorted(value)}, expected {sorted(known)}")
     fields_of: dict[str, Any] = {name: _matrix(v) if isinstance(v, list) else v for name, v in value.items()}
     return Estimate(**fields_of)

@@ -7,6 +7,7 @@ from kiteline_agent.inertial.gravity_alignment import GravityAligner, level_rota
 from kiteline_agent.inertial.inertial_tracker import InertialTracker
 from kiteline_agent.step import Estimate
 from kiteline_codec.schema import GravityAlignment, SubmapPlacement, messages
+from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuBatch, ImuCalibration
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
@@ -41,7 +42,7 @@ def test_the_accelerometer_alone_sets_the_body_upright() -> None:
 def test_without_an_imu_gravity_is_not_awaited() -> None:
     aligner = GravityAligner(CAMERA, None)
     np.testing.assert_array_equal(aligner.R_l_o, np.eye(3))
-    assert aligner.update(0, np.eye(4), np.eye(3), SubmapId(0), continued=True) is None
+    assert aligner.update(0, np.eye(4), np.eye(4), SubmapId(0), continued=True) is None
     ahead = aligner.first_pose(None)[:3, :3]
     np.testing.assert_allclose(ahead @ [0.0, 0.0, 1.0], [1.0, 0.0, 0.0], atol=1e-12)
 
@@ -50,11 +51,11 @@ def test_the_base_is_told_once_and_the_place_stays() -> None:
     knows = Knows()
     aligner = GravityAligner(CAMERA, knows)
     T_m_b = se3.from_rt(np.eye(3), np.array([1.0, 2.0, 3.0]))
-    assert aligner.update(0, T_m_b, np.eye(3), SubmapId(0), continued=True) is None
+    assert aligner.update(0, T_m_b, np.eye(4), SubmapId(0), continued=True) is None
     assert aligner.R_l_o is None
     lean = se3.so3_exp(np.array([0.2, -0.3, 0.0]))
     knows.up = lean.T
-    level = aligner.update(10**8, T_m_b, np.eye(3), SubmapId(0), continued=True)
+    level = aligner.update(10**8, T_m_b, np.eye(4), SubmapId(0), continued=True)
     np.testing.assert_allclose((level.T_l_m @ T_m_b)[:3, 3], T_m_b[:3, 3], atol=1e-4)  # rounded as on the wire
     told = messages.decode(messages.key(level), messages.encode(level))
     assert isinstance(told, GravityAlignment)
@@ -65,23 +66,26 @@ def test_the_base_is_told_once_and_the_place_stays() -> None:
     np.testing.assert_array_equal(echo.S_w_m, level.T_l_m)
     np.testing.assert_allclose(aligner.R_l_o @ lean @ [0.0, 0.0, 1.0], [0.0, 0.0, 1.0], atol=1e-9)
     assert aligner.tilt_rad == pytest.approx(np.hypot(0.2, 0.3))
-    assert aligner.update(2 * 10**8, T_m_b, np.eye(3), SubmapId(0), continued=True) is None
+    assert aligner.update(2 * 10**8, T_m_b, np.eye(4), SubmapId(0), continued=True) is None
 
 
 def test_what_leans_hardly_is_left_and_patience_ends() -> None:
     knows = Knows()
     hardly = GravityAligner(CAMERA, knows)
     knows.up = se3.so3_exp(np.array([0.02, 0.0, 0.0]))
-    assert hardly.update(0, np.eye(4), np.eye(3), SubmapId(0), continued=True) is None
+    assert hardly.update(0, np.eye(4), np.eye(4), SubmapId(0), continued=True) is None
     assert abs(hardly.R_l_o[2, 1]) > 0.01  # the flight controller gets even this
     knows.up = None
     patient = GravityAligner(CAMERA, knows)
     patient.first_pose(ImuBatch(np.array([0]), np.zeros((1, 3)), np.array([[0.0, 0.0, 9.8]])))
     for t_s in (0.0, 1.0, 1.9):
-        patient.update(int(t_s * 1e9), np.eye(4), np.eye(3), SubmapId(0), continued=True)
+        patient.update(int(t_s * 1e9), np.eye(4), np.eye(4), SubmapId(0), continued=True)
         assert patient.R_l_o is None
-    patient.update(int(2.1e9), np.eye(4), np.eye(3), SubmapId(0), continued=True)
+    patient.update(int(2.1e9), np.eye(4), np.eye(4), SubmapId(0), continued=True)
     np.testing.assert_array_equal(patient.R_l_o, np.eye(3))
+    knows.up = se3.so3_exp(np.array([0.0, 0.3, 0.0]))  # the accelerometer's first guess was wrong
+    patient.update(int(2.2e9), np.eye(4), np.eye(4), SubmapId(0), continued=True)
+    np.testing.assert_allclose(patient.R_l_o, knows.up, atol=1e-9)
 
 
 def test_no_controller_gets_poses_before_samples_that_begin_late() -> None:
@@ -90,14 +94,14 @@ def test_no_controller_gets_poses_before_samples_that_begin_late() -> None:
     aligner = GravityAligner(CAMERA, knows)
     aligner.first_pose(None)
     for t_s in (0.0, 2.1, 30.0):
-        assert aligner.update(round(1e9 * t_s), np.eye(4), np.eye(3), SubmapId(0), continued=True) is None
+        assert aligner.update(round(1e9 * t_s), np.eye(4), np.eye(4), SubmapId(0), continued=True) is None
         assert aligner.R_l_o is None
     knows.up = se3.so3_exp(np.array([0.3, 0.0, 0.0]))
-    level = aligner.update(round(31e9), np.eye(4), np.eye(3), SubmapId(0), continued=True)
+    level = aligner.update(round(31e9), np.eye(4), np.eye(4), SubmapId(0), continued=True)
     assert level is not None and aligner.tilt_rad == pytest.approx(0.3)
     np.testing.assert_allclose(level.T_l_m[:3, :3], knows.up, atol=1e-4)
     np.testing.assert_allclose(aligner.R_l_o, knows.up, atol=1e-9)
-    assert aligner.update(round(32e9), np.eye(4), np.eye(3), SubmapId(0), continued=True) is None
+    assert aligner.update(round(32e9), np.eye(4), np.eye(4), SubmapId(0), continued=True) is None
 
 
 def test_gravity_is_known_after_five_frames_in_motion() -> None:
@@ -139,3 +143,60 @@ def test_a_flight_controller_gets_upright_poses() -> None:
     e = Estimate(0, True, False, T, T, KeyframeId(0), np.eye(4), SubmapId(0), 100, 90, cov, cov, R, None)
     np.testing.assert_allclose(e.T_l_b, se3.from_rt(R, np.zeros(3)) @ T, atol=1e-12)
     np.testing.assert_allclose(np.diag(e.cov_l), [1.0, 1.0, 4.0, 0.1, 0.2, 0.3], atol=1e-12)
+
+
+def test_poses_are_upright_again_after_a_loss_over_which_nothing_measured_the_turns(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    knows, upright = Knows(), se3.so3_exp(np.array([0.0, 0.4, 0.0]))
+    aligner = GravityAligner(CAMERA, knows)
+    aligner.first_pose(None)
+    knows.up = upright
+    aligner.doubt()  # frames before there is a map
+    T_m_b, T_o_m, cov = se3.from_rt(np.eye(3), np.array([1.0, 2.0, 3.0])), np.eye(4), np.eye(6)
+    aligner.update(0, T_m_b, T_o_m, SubmapId(0), continued=True)
+    lean = se3.from_rt(se3.so3_exp(np.array([0.3, -0.1, 0.9])), np.array([5.0, 0.0, 1.0]))  # of the next submap in o
+
+    def frame(t_ns: int) -> F64:
+        assert aligner.update(t_ns, T_m_b, lean, SubmapId(1), continued=False) is None
+        pose = Estimate(
+            t_ns, True, False, T_m_b, lean @ T_m_b, KeyframeId(0), np.eye(4), SubmapId(1), 100, 90, cov, cov,
+            aligner.R_l_o, None, p_l_o=aligner.p_l_o,
+        )  # fmt: skip
+        assert pose.T_l_b is not None
+        return pose.T_l_b
+
+    before = frame(1)
+    monkeypatch.setattr(Knows, "running", True)
+    np.testing.assert_array_equal(frame(2), before)  # nothing was lost: what the IMU says walks, too
+    aligner.doubt()
+    monkeypatch.setattr(Knows, "running", False)
+    np.testing.assert_array_equal(frame(3), before)
+    monkeypatch.setattr(Knows, "running", True)
+    after = frame(4)
+    np.testing.assert_allclose(after[:3, :3].T[:, 2], upright[2], atol=1e-9)  # up in the body is as the IMU says
+    np.testing.assert_allclose(after[:3, 3], before[:3, 3], atol=1e-9)
+    turn = se3.so3_log(after[:3, :3] @ before[:3, :3].T)
+    assert abs(turn[2]) < 1e-9 and np.linalg.norm(turn) > 0.3  # the heading stays
+    lean = se3.from_rt(se3.so3_exp(np.array([0.0, 0.2, 0.0])), np.zeros(3)) @ lean
+    leaning = frame(5)
+    aligner.doubt()
+    np.testing.assert_allclose(frame(6)[:3, 3], leaning[:3, 3], atol=1e-9)  # also the second time
+
+
+def test_the_vehicle_stays_at_its_place_where_the_imu_was_mounted_otherwise() -> None:
+    knows = Knows()
+    aligner = GravityAligner(CAMERA, knows)
+    aligner.first_pose(None)
+    here = se3.from_rt(np.eye(3), np.array([4.0, 2.0, 1.0]))
+    knows.up = np.eye(3)
+    aligner.update(0, here, np.eye(4), SubmapId(0), continued=True)
+    aligner.renew()
+    knows.up = None
+    aligner.update(1, here, np.eye(4), SubmapId(0), continued=True)
+    assert aligner.R_l_o is None
+    knows.up = se3.so3_exp(np.array([0.3, 0.0, 0.0]))
+    aligner.update(2, here, np.eye(4), SubmapId(0), continued=True)
+    assert aligner.R_l_o is not None and aligner.p_l_o is not None
+    np.testing.assert_allclose(aligner.R_l_o, knows.up, atol=1e-9)
+    np.testing.assert_allclose(aligner.R_l_o @ here[:3, 3] + aligner.p_l_o, here[:3, 3], atol=1e-9)
