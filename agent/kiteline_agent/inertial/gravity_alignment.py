@@ -21,6 +21,8 @@ from kiteline_core.ids import SubmapId
 
 _MIN_TILT_RAD = 0.035  # rad; tilt above which the map is gravity-aligned: two degrees
 _PATIENCE_S = 2.0  # s; longest time that a flight controller waits for more than the accelerometer's first guess
+_SETTLED_S = 1.0  # s of fusion after which the vertical is known to a degree or two: after the first frames to five
+_SURE_RAD = 0.0175  # rad; deviation of the vertical below which it need not settle: a degree
 _LEAST_M_S2 = 0.1  # of a specific force that points anywhere
 _ATTITUDE_TILT = np.array([0, 1, 2, 15, 16])  # in the covariance of a state
 AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # R_m_c of a level camera that looks along x
@@ -65,6 +67,7 @@ class GravityAligner:
         self._renewed = self._known = False
         self._p_l_o: F64 | None = None
         self._guessed = False  # the first submap is upright only if the camera was level
+        self._fused_ns: int | None = None  # stamp of the first frame since which images and IMU are fused
         self._doubted = False  # since it was known nothing has measured a part of the turns
         self.tilt_rad = 0.0  # of the first submap, or of the one that continues it
 
@@ -91,6 +94,10 @@ class GravityAligner:
         """Neither images nor IMU have measured how the vehicle turned: the odometry frame may lean from here on."""
         self._doubted = self._known
 
+    def settle(self, t_ns: int) -> None:
+        """The fusion begins at this frame with a vertical that a window of many frames has told."""
+        self._fused_ns = t_ns - round(_SETTLED_S * 1e9)
+
     def ignore_imu(self) -> None:
         """Go on as without an IMU, for a camera that was level when the flight began."""
         self._inertial, self._R_l_o = None, np.eye(3)
@@ -113,30 +120,35 @@ class GravityAligner:
         """
         if self._inertial is None:
             return None
-        if self._began_ns is None:
-            self._began_ns = t_ns
-        # Once known, only what many frames tell counts: the first few know it to two degrees.
-        asked = not self._known or (self._doubted and self._inertial.running)
-        R_l_m = self._inertial.gravity_rotation() if asked else None
-        R_o_m, here_o = T_o_m[:3, :3], (T_o_m @ T_m_b)[:3, 3]
-        if self._known:
-            if R_l_m is not None:
-                self._turn_upright(R_l_m, R_o_m, here_o)
-            return None
+        self._began_ns = t_ns if self._began_ns is None else self._began_ns
+        settled = self._is_settled(t_ns)
+        R_l_m = self._inertial.gravity_rotation() if not self._known or (self._doubted and settled) else None
         if R_l_m is None:
-            waited = t_ns - self._began_ns > _PATIENCE_S * 1e9
+            waited = not self._known and t_ns - self._began_ns > _PATIENCE_S * 1e9
             if waited and not (self._renewed or self._guessed):  # a guess may be tilted by any angle
                 self._R_l_o = np.eye(3)
             return None
-        self._known = True
         if self._R_l_o is None:
-            self._R_l_o = level_rotation(R_o_m @ R_l_m[2])
-        else:
-            self._turn_upright(R_l_m, R_o_m, here_o)
+            self._R_l_o = level_rotation(T_o_m[:3, :3] @ R_l_m[2])
+        elif settled or not self._guessed:
+            self._turn_upright(R_l_m, T_o_m[:3, :3], (T_o_m @ T_m_b)[:3, 3])
+        if self._known or (self._guessed and not settled):
+            return None
+        self._known = True
         self.tilt_rad = float(np.linalg.norm(se3.so3_log(R_l_m)))
         if not continued or self._renewed or self.tilt_rad < _MIN_TILT_RAD:
             return None
         return upright_about(submap, R_l_m, T_m_b[:3, 3])
+
+    def _is_settled(self, t_ns: int) -> bool:
+        """True if images and IMU have been fused for long enough to trust the vertical, or say so."""
+        assert self._inertial is not None
+        if not self._inertial.running:
+            self._fused_ns = None
+            return False
+        self._fused_ns = t_ns if self._fused_ns is None else self._fused_ns
+        state = self._inertial.state
+        return t_ns - self._fused_ns >= _SETTLED_S * 1e9 or (state is not None and up_of(state)[1] < _SURE_RAD)
 
     def _turn_upright(self, R_l_m: F64, R_o_m: F64, here_o: F64) -> None:
         """Turn the gravity-aligned frame about the vehicle, at here_o (3,) m, without a change of its heading."""

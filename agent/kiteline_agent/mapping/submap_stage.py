@@ -331,6 +331,7 @@ class SubmapStage:
             camera.T_m_b, camera.pose.velocity, solution.bias, gravity, None, found.accel_noise, solution.offset
         )  # fmt: skip
         camera.motion.begin_metric_map(ctx.t_ns, state)
+        camera.gravity.settle(ctx.t_ns)
         text = f"mono: metric within {100.0 * sigma:.1f} %, from {found.duration_s:.1f} s of images and IMU"
         return [f"{text}, one unit was {unit.metres:.3g} m", "submap: opened"]
 

@@ -88,7 +88,7 @@ def test_what_leans_hardly_is_left_and_patience_ends() -> None:
     np.testing.assert_allclose(patient.R_l_o, knows.up, atol=1e-9)
 
 
-def test_no_controller_gets_poses_before_samples_that_begin_late() -> None:
+def test_no_controller_gets_poses_before_samples_that_begin_late(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing has told where up is: the camera may be mounted at any angle."""
     knows = Knows()
     aligner = GravityAligner(CAMERA, knows)
@@ -96,12 +96,19 @@ def test_no_controller_gets_poses_before_samples_that_begin_late() -> None:
     for t_s in (0.0, 2.1, 30.0):
         assert aligner.update(round(1e9 * t_s), np.eye(4), np.eye(4), SubmapId(0), continued=True) is None
         assert aligner.R_l_o is None
-    knows.up = se3.so3_exp(np.array([0.3, 0.0, 0.0]))
-    level = aligner.update(round(31e9), np.eye(4), np.eye(4), SubmapId(0), continued=True)
+    first, settled = se3.so3_exp(np.array([0.2, 0.0, 0.0])), se3.so3_exp(np.array([0.3, 0.0, 0.0]))
+    knows.up = first
+    assert aligner.update(round(31e9), np.eye(4), np.eye(4), SubmapId(0), continued=True) is None
+    np.testing.assert_allclose(aligner.R_l_o, first, atol=1e-9)  # a vehicle in flight cannot wait for more
+    monkeypatch.setattr(Knows, "running", True)
+    for t_s in (32.0, 32.9):
+        assert aligner.update(round(1e9 * t_s), np.eye(4), np.eye(4), SubmapId(0), continued=True) is None
+    knows.up = settled
+    level = aligner.update(round(33e9), np.eye(4), np.eye(4), SubmapId(0), continued=True)
     assert level is not None and aligner.tilt_rad == pytest.approx(0.3)
-    np.testing.assert_allclose(level.T_l_m[:3, :3], knows.up, atol=1e-4)
-    np.testing.assert_allclose(aligner.R_l_o, knows.up, atol=1e-9)
-    assert aligner.update(round(32e9), np.eye(4), np.eye(4), SubmapId(0), continued=True) is None
+    np.testing.assert_allclose(level.T_l_m[:3, :3], settled, atol=1e-4)
+    np.testing.assert_allclose(aligner.R_l_o, settled, atol=1e-9)
+    assert aligner.update(round(34e9), np.eye(4), np.eye(4), SubmapId(0), continued=True) is None
 
 
 def test_gravity_is_known_after_five_frames_in_motion() -> None:
@@ -150,14 +157,14 @@ def test_poses_are_upright_again_after_a_loss_over_which_nothing_measured_the_tu
 ) -> None:
     knows, upright = Knows(), se3.so3_exp(np.array([0.0, 0.4, 0.0]))
     aligner = GravityAligner(CAMERA, knows)
-    aligner.first_pose(None)
     knows.up = upright
     aligner.doubt()  # frames before there is a map
     T_m_b, T_o_m, cov = se3.from_rt(np.eye(3), np.array([1.0, 2.0, 3.0])), np.eye(4), np.eye(6)
     aligner.update(0, T_m_b, T_o_m, SubmapId(0), continued=True)
     lean = se3.from_rt(se3.so3_exp(np.array([0.3, -0.1, 0.9])), np.array([5.0, 0.0, 1.0]))  # of the next submap in o
 
-    def frame(t_ns: int) -> F64:
+    def frame(t_s: int) -> F64:
+        t_ns = 1_000_000_000 * t_s
         assert aligner.update(t_ns, T_m_b, lean, SubmapId(1), continued=False) is None
         pose = Estimate(
             t_ns, True, False, T_m_b, lean @ T_m_b, KeyframeId(0), np.eye(4), SubmapId(1), 100, 90, cov, cov,
@@ -173,21 +180,27 @@ def test_poses_are_upright_again_after_a_loss_over_which_nothing_measured_the_tu
     monkeypatch.setattr(Knows, "running", False)
     np.testing.assert_array_equal(frame(3), before)
     monkeypatch.setattr(Knows, "running", True)
-    after = frame(4)
+    np.testing.assert_array_equal(frame(4), before)
+    after = frame(5)
     np.testing.assert_allclose(after[:3, :3].T[:, 2], upright[2], atol=1e-9)  # up in the body is as the IMU says
     np.testing.assert_allclose(after[:3, 3], before[:3, 3], atol=1e-9)
     turn = se3.so3_log(after[:3, :3] @ before[:3, :3].T)
     assert abs(turn[2]) < 1e-9 and np.linalg.norm(turn) > 0.3  # the heading stays
     lean = se3.from_rt(se3.so3_exp(np.array([0.0, 0.2, 0.0])), np.zeros(3)) @ lean
-    leaning = frame(5)
+    leaning = frame(6)
     aligner.doubt()
-    np.testing.assert_allclose(frame(6)[:3, 3], leaning[:3, 3], atol=1e-9)  # also the second time
+    monkeypatch.setattr(Knows, "running", False)
+    np.testing.assert_array_equal(frame(7), leaning)
+    monkeypatch.setattr(Knows, "running", True)
+    aligner.settle(8_000_000_000)
+    again = frame(8)
+    np.testing.assert_allclose(again[:3, :3].T[:, 2], upright[2], atol=1e-9)  # at once
+    np.testing.assert_allclose(again[:3, 3], leaning[:3, 3], atol=1e-9)  # also the second time
 
 
 def test_the_vehicle_stays_at_its_place_where_the_imu_was_mounted_otherwise() -> None:
     knows = Knows()
     aligner = GravityAligner(CAMERA, knows)
-    aligner.first_pose(None)
     here = se3.from_rt(np.eye(3), np.array([4.0, 2.0, 1.0]))
     knows.up = np.eye(3)
     aligner.update(0, here, np.eye(4), SubmapId(0), continued=True)
