@@ -2,13 +2,14 @@
 
 An IMU takes samples at a constant rate. Over a serial line or a bus they arrive late by chance, often several at once,
 and many drivers stamp them then. The samples are counted, and a robust line through their stamps over that count tells
-when each was taken, apart from a constant delay, which the time offset holds. Even stamps are left as they are.
+when each was taken, apart from a constant delay, which the time offset holds. Even stamps are left as they are. Where
+the rate changes, as of a flight controller that is asked for more, the count begins again.
 """
 
 import numpy as np
 
 from kiteline_agent.inertial.clocks.stamp_line import stamp_line
-from kiteline_core.arrays import I64
+from kiteline_core.arrays import F64, I64
 from kiteline_core.frame import ImuBatch, chosen, joined
 from kiteline_core.order_statistics import median
 
@@ -21,6 +22,10 @@ _UNEVEN = 0.05  # share of steps that differ by more, from which a line is used
 _MOST_S = 0.03  # s; scatter beyond which nothing is counted on
 _SILENT_S = 0.5  # s without a sample: it begins again
 _MISSED = 3.0, 4.0  # deviations of the scatter, and periods: a sample that is later follows missing ones
+_EARLY = 4  # samples in a row that come as much too early: the rate has risen
+_FEWER = 1.25  # periods a sample in both halves of the newest _FEWEST: the rate has fallen
+_ALIKE = 12  # newest steps that are even by themselves, where the rate has changed
+_CHANGED = 0.15  # relative change of the usual step, at least, to count as another rate
 _TOLD_S = 1e-3  # s; scatter that the user should know of
 
 
@@ -34,6 +39,7 @@ class SampleClock:
         self._newest_ns: int | None = None  # the last time that was given
         self._last: ImuBatch | None = None  # the last sample, with its stamp
         self._even, self._unjudged = True, 0  # and samples since that was judged
+        self._early = 0  # samples in a row that came before the line says that they were taken
         self._told = False
         self._events: list[str] = []
 
@@ -93,10 +99,13 @@ class SampleClock:
         old = self._stamps_ns
         if len(old) and not 0 <= int(stamps_ns[0]) - int(old[-1]) < 1e9 * _SILENT_S:
             self._begin_again()
+            self._newest_ns = None
         new = self._number(stamps_ns)
         self._unjudged += len(stamps_ns)
+        if self._has_another_rate():
+            new = np.arange(-len(stamps_ns), 0) + len(self._numbers)
         if len(self._stamps_ns) >= _FEWEST and self._unjudged >= _JUDGED:
-            self._even, self._unjudged = self._is_even(), 0
+            self._even, self._unjudged = _is_even(np.diff(self._stamps_ns).astype(np.float64), _UNEVEN), 0
         if self._even:
             self._period_ns = self._scatter_ns = 0.0
             return stamps_ns
@@ -113,10 +122,28 @@ class SampleClock:
             self._events.append(f"imu: stamps scatter by {1e3 * line.scatter_s:.1f} ms: samples are counted instead")
         return np.round(self._begin_ns + self._period_ns * new).astype(np.int64)
 
-    def _begin_again(self) -> None:
-        self._stamps_ns, self._numbers, self._newest_ns = self._stamps_ns[:0], self._numbers[:0], None
-        self._even, self._unjudged = True, 0
+    def _begin_again(self, kept: int = 0) -> None:
+        """Count anew, from so many of the newest samples on."""
+        self._stamps_ns = self._stamps_ns[len(self._stamps_ns) - kept :]
+        self._numbers = np.arange(kept, dtype=np.int64)
+        self._even, self._unjudged, self._early = True, kept, 0
         self._period_ns = self._scatter_ns = 0.0
+
+    def _has_another_rate(self) -> bool:
+        """True if the newest samples come at another rate than those before, which are forgotten then."""
+        steps, n = np.diff(self._stamps_ns).astype(np.float64), self._numbers
+        kept = 0
+        if self._early >= _EARLY:
+            kept = self._early
+        elif self._period_ns > 0.0 and len(n) > _FEWEST:
+            half = _FEWEST // 2
+            if min(n[-1] - n[-1 - half], n[-1 - half] - n[-1 - 2 * half]) > _FEWER * half:
+                kept = half  # the other one began before it fell
+        if kept == 0 and len(steps) >= 2 * _ALIKE and _is_even(steps[-_ALIKE:]):
+            kept = _ALIKE * (abs(median(steps[-_ALIKE:]) / median(steps[:_ALIKE]) - 1.0) > _CHANGED)
+        if kept:
+            self._begin_again(kept)
+        return kept > 0
 
     def _number(self, stamps_ns: I64) -> I64:
         """Count new samples, and those that are missing before them. Returns their numbers (n,)."""
@@ -127,6 +154,7 @@ class SampleClock:
             found, most_ns = [], max(_MISSED[0] * self._scatter_ns, _MISSED[1] * self._period_ns)
             for stamp_ns in stamps_ns.tolist():
                 late_ns = stamp_ns - self._begin_ns - self._period_ns * (last + 1)
+                self._early = self._early + 1 if late_ns < -most_ns else 0
                 last += 1 + (round(late_ns / self._period_ns) if late_ns > most_ns else 0)
                 found.append(last)
             numbers = np.array(found, np.int64)
@@ -134,11 +162,11 @@ class SampleClock:
         self._numbers = np.concatenate([self._numbers, numbers])[-_SAMPLES:]
         return numbers
 
-    def _is_even(self) -> bool:
-        """True if nearly all steps are whole multiples of the usual one: samples may be missing."""
-        steps = np.diff(self._stamps_ns).astype(np.float64)
-        usual = median(steps)
-        if not 0.0 < float(steps.mean()) < _FILLED * usual:  # several come at once
-            return False
-        off = np.abs(steps / usual - np.maximum(np.round(steps / usual), 1.0))
-        return int((off > _EVEN).sum()) <= _UNEVEN * len(off)
+
+def _is_even(steps: F64, uneven: float = 0.0) -> bool:
+    """True if all steps, but for a share, are whole multiples of the usual one: samples may be missing."""
+    usual = median(steps)
+    if not 0.0 < float(steps.mean()) < _FILLED * usual:  # several come at once
+        return False
+    off = np.abs(steps / usual - np.maximum(np.round(steps / usual), 1.0))
+    return int((off > _EVEN).sum()) <= uneven * len(off)

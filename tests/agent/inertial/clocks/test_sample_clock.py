@@ -144,3 +144,23 @@ def test_a_clock_that_is_set_back_goes_on() -> None:
     stamps[1004:] -= 3_000_000_000
     _, times = timed(SampleClock(), stamps)
     assert len(times) > 1980
+
+
+@pytest.mark.parametrize("jitter_ms", [0.0, 4.0])
+@pytest.mark.parametrize("rates_hz", [(50, 200), (100, 200), (200, 100), (200, 50), (200, 150), (200, 125)])
+def test_a_rate_that_changes_in_flight_is_followed(rates_hz: tuple[int, int], jitter_ms: float) -> None:
+    """A flight controller that is asked for more samples, or for fewer by a ground station."""
+    before_hz, after_hz = rates_hz
+    true = np.concatenate([np.arange(0.0, 9.0, 1.0 / before_hz), np.arange(9.0, 16.0, 1.0 / after_hz)]) + 7.0
+    late_s = 1e-3 * np.random.default_rng(7).uniform(0.0, jitter_ms, len(true)) if jitter_ms else np.zeros(len(true))
+    stamps = np.maximum.accumulate(np.round(1e9 * (true + late_s)).astype(np.int64) + np.arange(len(true)))
+    clock = SampleClock()
+    numbers, times = timed(clock, stamps)
+    taken_s = true[numbers.astype(np.int64)]
+    off_ms = 1e3 * (1e-9 * times - taken_s) - 0.5 * jitter_ms
+    if jitter_ms == 0.0:
+        assert len(times) == len(true) and np.abs(off_ms).max() < 0.1
+        assert clock.take_events() == []
+    assert (np.diff(times) > 0).all() and len(times) > len(true) - 12
+    assert np.abs(off_ms).max() < 50.0
+    assert np.abs(off_ms[taken_s > 20.5]).max() < 1.5  # 4.5 s later
