@@ -22,6 +22,8 @@ from kiteline_hw.mavlink.watch.messages import (
     FilterStatus,
     StatusText,
 )
+from kiteline_hw.mavlink.watch.presence import DEVICE_TOPIC as DEVICE
+from kiteline_hw.mavlink.watch.presence import TOPIC as CONTROLLER
 from kiteline_hw.mavlink.watch.presence import LinkState, PresenceWatch
 from kiteline_hw.ports import PoseSample
 
@@ -124,8 +126,11 @@ class ControllerWatch:
             out += self._requests(self.presence.heartbeat, now_ns)
         new = self._log.take()
         self._findings += new
-        self._texts = (self._texts + new)[-self.config.waiting :]
-        if self.presence.heartbeat is not None:
+        found = self.presence.heartbeat is not None
+        # That nothing is found is no news to a controller that has been found.
+        texts = [f for f in new if found or f.topic not in (CONTROLLER, DEVICE)]
+        self._texts = (self._texts + texts)[-self.config.waiting :]
+        if found:
             out += [StatusText(int(f.level), f.short) for f in self._texts]
             self._texts = []
         return out

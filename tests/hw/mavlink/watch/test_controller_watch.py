@@ -264,6 +264,20 @@ def test_a_silent_controller_is_said_and_its_return() -> None:
     assert len(bench.topic("controller")) == 4
 
 
+def test_a_controller_that_comes_late_is_not_told_that_none_was_there() -> None:
+    controller = ModelledAutopilot("ardupilot", faults=Faults(silent=True))
+    bench = Bench(controller)
+    bench.device_fault = "the device is missing"
+    bench.run(1.0)
+    bench.device_fault = ""
+    bench.run(7.0)
+    controller.faults.silent = False
+    bench.run(4.0)
+    texts = [text.text for text in controller.texts]
+    assert any("sees ArduPilot" in text for text in texts)
+    assert not any("not found" in text or "missing" in text for text in texts), texts
+
+
 def test_a_restarted_controller_is_said() -> None:
     bench = Bench(ModelledAutopilot("ardupilot"))
     bench.run(8.0)
