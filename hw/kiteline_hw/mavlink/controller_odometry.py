@@ -57,6 +57,7 @@ class ControllerOdometryConfig:
     max_wheel_ns: int = 500_000_000  # ns; nor over more
     drift: float = 2e-4  # s/s between the controller's clock and ours, at most
     reset_ns: int = 2_000_000_000  # ns; a stamp that goes back by more is of another boot
+    late_ns: int = 1_000_000_000  # ns for which stamps stay behind by as much, until they are, too: a stall ends sooner
     interval_us: int = 20_000  # us between two messages, as requested
     request_ns: int = 2_000_000_000  # ns of silence after which they are requested again
     max_samples: int = 1024  # buffered until the next frame; 20 s at 50 Hz
@@ -69,17 +70,27 @@ class StampClock:
         self._config = config or ControllerOdometryConfig()
         self._offset_ns: int | None = None  # our clock less theirs, at the least delay seen
         self._last: tuple[int, int] = (0, 0)  # stamp, arrival
+        self._late_since_ns: int | None = None  # arrival of the first message in a row that seems seconds late
 
     def to_ours(self, stamp_ns: int, now_ns: int) -> int:
         """The time on our clock of a stamp that arrived now."""
         last_stamp_ns, last_arrival_ns = self._last
         self._last = stamp_ns, now_ns
         offset_ns = now_ns - stamp_ns
-        if self._offset_ns is None or last_stamp_ns - stamp_ns > self._config.reset_ns:
+        if self._offset_ns is None or last_stamp_ns - stamp_ns > self._config.reset_ns or self._lags(offset_ns, now_ns):
             self._offset_ns = offset_ns
         drifted_ns = self._offset_ns + round(self._config.drift * (now_ns - last_arrival_ns))
         self._offset_ns = min(offset_ns, drifted_ns)
         return stamp_ns + self._offset_ns
+
+    def _lags(self, offset_ns: int, now_ns: int) -> bool:
+        """True if messages seem seconds late for long: another boot, whose clock has passed that of the last one."""
+        if self._offset_ns is None or offset_ns - self._offset_ns <= self._config.reset_ns:
+            self._late_since_ns = None
+            return False
+        if self._late_since_ns is None:
+            self._late_since_ns = now_ns
+        return now_ns - self._late_since_ns >= self._config.late_ns
 
 
 def _is_finite(message: MavlinkMessage) -> bool:

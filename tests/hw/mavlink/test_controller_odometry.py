@@ -155,6 +155,20 @@ def test_a_reboot_of_the_controller_resets_the_clock() -> None:
     assert clock.to_ours(1 * S, 110 * S) == 110 * S
 
 
+def test_a_reboot_is_noticed_when_the_new_clock_has_passed_the_old_one() -> None:
+    clock = StampClock(ControllerOdometryConfig())
+    for k in range(100):  # up for 5 s when it is heard first
+        clock.to_ours(5 * S + k * S // 100, 60 * S + k * S // 100)
+    last_ns = 0
+    for k in range(200):  # silent for 30 s, and up again for 20 s
+        now_ns = 91 * S + k * S // 100
+        last_ns = clock.to_ours(20 * S + k * S // 100, now_ns)
+    assert last_ns == 91 * S + 199 * S // 100
+    # what a stalled computer reads all at once is as old as it says
+    stalled_ns = [clock.to_ours(22 * S + k * S // 100, 96 * S) for k in range(300)]
+    np.testing.assert_allclose(stalled_ns, [93 * S + k * S // 100 for k in range(300)], atol=S // 500)
+
+
 def test_odometry_through_the_session() -> None:
     wanted = ControllerOdometry(OdometrySource.CONTROLLER, mounting("flu"))
     stream = ControllerSession(mounting("flu"), odometry=wanted, system=1)
