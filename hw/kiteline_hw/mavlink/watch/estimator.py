@@ -28,6 +28,7 @@ class EstimatorConfig:
     ignored_ns: int = 6_000_000_000  # ns without one; a filter takes seconds to align itself
     rejected_ns: int = 1_000_000_000  # ns of innovations beyond the filter's limit
     silent_ns: int = 10_000_000_000  # ns without any report
+    unheard_ns: int = 3_000_000_000  # ns between two reports, over which no state lasts: they come twice a second
     gap_ns: int = 1_000_000_000  # ns between two poses after which they count as stopped
 
 
@@ -71,6 +72,8 @@ class EstimatorWatch:
 
     def report(self, m: FilterStatus, now_ns: int) -> None:
         """A report of the estimator."""
+        if self._report_ns is not None and now_ns - self._report_ns > self.config.unheard_ns:
+            self._since.clear()
         self._report_ns = now_ns
         has_position = bool(m.flags & POSITION_FLAGS) and not m.flags & NO_AIDING_FLAG
         first, last = self._first_pose_ns, self._last_pose_ns

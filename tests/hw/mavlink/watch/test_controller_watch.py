@@ -278,6 +278,18 @@ def test_a_controller_that_comes_late_is_not_told_that_none_was_there() -> None:
     assert not any("not found" in text or "missing" in text for text in texts), texts
 
 
+def test_a_controller_that_was_silent_does_not_ignore_the_poses_of_that_time() -> None:
+    controller = ModelledAutopilot("ardupilot")
+    bench = Bench(controller)
+    bench.run(0.9)  # its first reports have no position yet
+    controller.faults.silent = controller.faults.deaf = True
+    bench.run(16.0)
+    controller.faults.silent = controller.faults.deaf = False
+    bench.run(20.0)
+    assert not any("ignores them" in finding.text for finding in bench.topic("poses"))
+    assert "uses them" in bench.topic("poses")[-1].text
+
+
 def test_a_restarted_controller_is_said() -> None:
     bench = Bench(ModelledAutopilot("ardupilot"))
     bench.run(8.0)
