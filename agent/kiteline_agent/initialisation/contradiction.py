@@ -12,7 +12,7 @@ _WARNING = (
     "(T_BS), the intrinsics, the units (rad/s, m/s^2) and the time offset (one of up to 0.15 s is found)"
 )
 _NO_SCALE = (
-    "imu: no scale is known after {:.0f} s in motion, and there is no pose before: speed up and slow down, in changing "
+    "imu: no scale is known after {:.0f} s in motion, and no pose in metres before: speed up and slow down, in changing "
     "directions; if that was flown, check the signs of the accelerations, and that samples come at 200 Hz and without "
     "gaps, or fewer as means over their steps"
 )

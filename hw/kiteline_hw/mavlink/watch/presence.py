@@ -172,7 +172,8 @@ class PresenceWatch:
             self._log.say(
                 DEVICE_TOPIC, link.device_fault, FindingLevel.ERROR,
                 f"flight controller: {self._url}: {link.device_fault}", "kiteline: serial port is missing",
-                f"Plug it in, or end the program that uses it; this user must be in group dialout. {RETRIED}",
+                f"Plug it in, or end the program that uses it; this user must be in group dialout; "
+                f"a USB device keeps its name in /dev/serial/by-id. {RETRIED}",
             )  # fmt: skip
         elif self._log.state(DEVICE_TOPIC) not in (None, ""):
             self._log.say(
