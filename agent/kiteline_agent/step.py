@@ -75,7 +75,8 @@ class Estimate(_InOdometryFrame):
     flight; -1: nothing measures the motion. A later submap counts as placed by odometry until it is recognised.
     cov_m: (6,6) of T_m_b relative to the start of its submap, [translation in m, rotation about the body's axes],
     m, rad.
-    cov_o: (6,6) of T_o_b relative to the start of the flight, [translation in o, rotation about the body's axes].
+    cov_o: (6,6) of T_o_b relative to the start of the flight, [translation in o, rotation about the body's axes];
+    of one camera relative to where its lengths first were metres.
     R_l_o: (3,3) odometry frame to gravity-aligned frame. None before it is known, if a flight begins in motion, from
     when an IMU is left that never agreed with the images, and while it is measured again, because the IMU turned out
     to be mounted otherwise than the calibration says. It changes then, and after a loss over which nothing measured

@@ -107,6 +107,12 @@ class PoseCovariance:
 
     # updates
 
+    def begin_flight(self) -> None:
+        """Forget how uncertain the motion so far is: poses count from the submap that begins next."""
+        self._carried, self._same_frame = np.zeros((6, 6)), True
+        self._T_o_b0 = self._T_o_b_left = None
+        self._T_o_m_before = {}
+
     def begin_submap(self, T_m_b: F64) -> None:
         """Begin a submap, with its first keyframe at T_m_b (4,4)."""
         self._noise, self._shift = np.zeros((6, 6)), np.zeros((6, SHAPES))

@@ -12,9 +12,9 @@ _WARNING = (
     "(T_BS), the intrinsics, the units (rad/s, m/s^2) and the time offset (one of up to 0.15 s is found)"
 )
 _NO_SCALE = (
-    "imu: no scale is known after {:.0f} s in motion, and no pose in metres before: speed up and slow down, in changing "
-    "directions; if that was flown, check the signs of the accelerations, and that samples come at 200 Hz and without "
-    "gaps, or fewer as means over their steps"
+    "imu: no scale is known after {:.0f} s in motion, and no pose in metres before: speed up and slow down, in "
+    "changing directions; if that was flown, check the signs of the accelerations, and that samples come at 200 Hz and "
+    "without gaps, or fewer as means over their steps"
 )
 _WAITS_S = 10.0  # s of windows in motion without a scale, after which it is said: most starts know it after 6 s
 _APART_S = 2.5  # s between two windows, at most: between those further apart the vehicle stood still

@@ -46,6 +46,7 @@ class CameraState:
         self.gravity = GravityAligner(camera, self.motion.tracker)
         self.reference = ReferenceKeyframe(local_map)
         self.submaps = Submaps(identity)
+        self._had_metres = has_depth
         self._T_o_first: F64 | None = None  # the first submap where images led from it into the next one
 
     @property
@@ -224,6 +225,12 @@ class CameraState:
             return self.pose.rescale(unit_m)
         self.pose.rescale_map(unit_m)
         return np.eye(4)
+
+    def begin_metres(self) -> None:
+        """The next submap is in metres. Before the first such one, errors of the motion are in no known unit."""
+        if not self._had_metres and self.submaps.any:
+            self.covariance.begin_flight()
+        self._had_metres = True
 
     def leave_submap(self) -> None:
         """Leave the active submap for a new one that begins here."""

@@ -175,6 +175,7 @@ class SubmapStage:
             camera.leave_submap()
         else:
             camera.set_first_gravity(solution.T_w_b[:3, :3].T @ solution.gravity)
+        camera.begin_metres()
         submap = camera.open_submap()
         camera.pose.reset_motion()
         # Corners of several images would take a second of a small budget at once.
@@ -366,6 +367,8 @@ class SubmapStage:
         camera = self._camera
         since, T_k_c = camera.reference.keyframe, camera.reference.T_k_c.copy()
         T_new_old = camera.continue_in_metres(unit_m)
+        if tells_scale:
+            camera.begin_metres()
         if unit_m != 1.0:
             self._map.drop_submap(camera.submaps.active)
         submap = camera.open_submap()

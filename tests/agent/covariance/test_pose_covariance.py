@@ -6,17 +6,21 @@ from typing import Any
 import numpy as np
 import pytest
 
-from kiteline_agent.config import CovarianceConfig
+from kiteline_agent.config import AgentConfig, CovarianceConfig, LocalMapConfig
 from kiteline_agent.covariance import calibration_error_kernels as certainty_kernels
 from kiteline_agent.covariance.calibration_error_kernels import adjoint
 from kiteline_agent.covariance.pose_covariance import PoseCovariance
 from kiteline_agent.covariance.pose_quality import LOST_BELOW, probability_good
 from kiteline_agent.local_map.local_map import LocalMap
+from kiteline_agent.mapping.camera_state import CameraState
+from kiteline_agent.step import Identity
 from kiteline_agent.tracking.pose_state import PoseState
 from kiteline_agent.tracking.track import Track
 from kiteline_core.arrays import F64
+from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry import se3
-from kiteline_core.ids import KeyframeId, SubmapId
+from kiteline_core.geometry.cameras import CameraModel, CameraRig
+from kiteline_core.ids import AgentId, KeyframeId, SubmapId
 from tests.agent.seen_scenes import CAMERA, SHAPES, map_of, scene, seen_with, tracked
 
 X, NOTHING = scene(), np.zeros(SHAPES)  # points, and no error of calibration
@@ -217,6 +221,28 @@ def test_dead_reckoning_grows_uncertain_and_the_odometry_keeps_it() -> None:
     after = covariance.of_poses(pose, pose.T_m_c)[1]
     assert np.trace(after[:3, :3]) == pytest.approx(3 * sizes[-1], rel=0.05)  # but nobody knows the way there
     assert after[0, 0] > before[0, 0]
+
+
+def test_what_is_not_known_of_a_path_in_another_unit_is_forgotten_where_metres_begin() -> None:
+    rig = CameraRig(CameraModel(640, 480, 400.0, 400.0, 320.0, 240.0), None, np.eye(4), None)
+    local_map = LocalMap(CAMERA, LocalMapConfig())
+    camera = CameraState(rig, ImuCalibration(), AgentConfig(), Identity(AgentId(0), 0), local_map)
+    camera.open_submap()
+
+    def sigma_m(*, metres: bool) -> float:
+        """After two seconds without images, where the next submap begins."""
+        for _ in range(40):
+            camera.covariance.dead_reckon(0.05, None)
+        camera.leave_submap()
+        if metres:
+            camera.begin_metres()
+        camera.open_submap()
+        return float(np.sqrt(camera.covariance.of_poses(camera.pose, camera.T_m_b)[1][0, 0]))
+
+    assert sigma_m(metres=False) > 1.0
+    assert sigma_m(metres=True) < 0.01  # no pose before could be flown
+    assert sigma_m(metres=False) > 1.0
+    assert sigma_m(metres=True) > 2.0  # the way from the first metres on counts
 
 
 def test_dead_reckoning_from_an_unknown_speed_is_worse_and_one_by_a_slow_camera_too() -> None:
