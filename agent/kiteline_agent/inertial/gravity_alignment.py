@@ -22,7 +22,7 @@ from kiteline_core.ids import SubmapId
 _MIN_TILT_RAD = 0.035  # rad; tilt above which the map is gravity-aligned: two degrees
 _PATIENCE_S = 2.0  # s; longest time that a flight controller waits for more than the accelerometer's first guess
 _SETTLED_S = 1.0  # s of fusion after which the vertical is known to a degree or two: after the first frames to five
-_SURE_RAD = 0.0175  # rad; deviation of the vertical below which it need not settle: a degree
+_SURE_RAD = 0.0175  # rad; deviation of a vertical that is better than that of the first frames: a degree
 _LEAST_M_S2 = 0.1  # of a specific force that points anywhere
 _ATTITUDE_TILT = np.array([0, 1, 2, 15, 16])  # in the covariance of a state
 AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # R_m_c of a level camera that looks along x
@@ -68,6 +68,7 @@ class GravityAligner:
         self._p_l_o: F64 | None = None
         self._guessed = False  # the first submap is upright only if the camera was level
         self._fused_ns: int | None = None  # stamp of the first frame since which images and IMU are fused
+        self._rough = False  # it was told from a few frames, as samples had just come
         self._doubted = False  # since it was known nothing has measured a part of the turns
         self.tilt_rad = 0.0  # of the first submap, or of the one that continues it
 
@@ -121,8 +122,8 @@ class GravityAligner:
         if self._inertial is None:
             return None
         self._began_ns = t_ns if self._began_ns is None else self._began_ns
-        settled = self._is_settled(t_ns)
-        R_l_m = self._inertial.gravity_rotation() if not self._known or (self._doubted and settled) else None
+        asked = self._is_settled(t_ns) if self._known else True
+        R_l_m = self._inertial.gravity_rotation() if asked else None
         if R_l_m is None:
             waited = not self._known and t_ns - self._began_ns > _PATIENCE_S * 1e9
             if waited and not (self._renewed or self._guessed):  # a guess may be tilted by any angle
@@ -130,30 +131,33 @@ class GravityAligner:
             return None
         if self._R_l_o is None:
             self._R_l_o = level_rotation(T_o_m[:3, :3] @ R_l_m[2])
-        elif settled or not self._guessed:
+        else:
             self._turn_upright(R_l_m, T_o_m[:3, :3], (T_o_m @ T_m_b)[:3, 3])
-        if self._known or (self._guessed and not settled):
+        if self._known:
             return None
-        self._known = True
+        self._known, self._rough = True, self._guessed
         self.tilt_rad = float(np.linalg.norm(se3.so3_log(R_l_m)))
         if not continued or self._renewed or self.tilt_rad < _MIN_TILT_RAD:
             return None
         return upright_about(submap, R_l_m, T_m_b[:3, 3])
 
     def _is_settled(self, t_ns: int) -> bool:
-        """True if images and IMU have been fused for long enough to trust the vertical, or say so."""
+        """True if the vertical is known better than when it was told, or than what was guessed since."""
         assert self._inertial is not None
         if not self._inertial.running:
             self._fused_ns = None
             return False
         self._fused_ns = t_ns if self._fused_ns is None else self._fused_ns
+        if not (self._doubted or self._rough):
+            return False
         state = self._inertial.state
-        return t_ns - self._fused_ns >= _SETTLED_S * 1e9 or (state is not None and up_of(state)[1] < _SURE_RAD)
+        sure = state is not None and up_of(state)[1] < _SURE_RAD
+        return sure or (self._doubted and t_ns - self._fused_ns >= _SETTLED_S * 1e9)
 
     def _turn_upright(self, R_l_m: F64, R_o_m: F64, here_o: F64) -> None:
         """Turn the gravity-aligned frame about the vehicle, at here_o (3,) m, without a change of its heading."""
         assert self._R_l_o is not None
-        self._doubted = False
+        self._doubted = self._rough = False
         here_l = self._R_l_o @ here_o + (0.0 if self._p_l_o is None else self._p_l_o)
         self._R_l_o = level_rotation(self._R_l_o @ R_o_m @ R_l_m[2]) @ self._R_l_o
         self._p_l_o = here_l - self._R_l_o @ here_o

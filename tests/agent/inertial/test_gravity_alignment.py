@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from kiteline_agent.inertial import gravity_alignment
 from kiteline_agent.inertial.gravity_alignment import GravityAligner, level_rotation
 from kiteline_agent.inertial.inertial_tracker import InertialTracker
 from kiteline_agent.step import Estimate
@@ -96,19 +97,22 @@ def test_no_controller_gets_poses_before_samples_that_begin_late(monkeypatch: py
     for t_s in (0.0, 2.1, 30.0):
         assert aligner.update(round(1e9 * t_s), np.eye(4), np.eye(4), SubmapId(0), continued=True) is None
         assert aligner.R_l_o is None
-    first, settled = se3.so3_exp(np.array([0.2, 0.0, 0.0])), se3.so3_exp(np.array([0.3, 0.0, 0.0]))
+    first, later = se3.so3_exp(np.array([0.2, 0.0, 0.0])), se3.so3_exp(np.array([0.3, 0.0, 0.0]))
     knows.up = first
-    assert aligner.update(round(31e9), np.eye(4), np.eye(4), SubmapId(0), continued=True) is None
+    level = aligner.update(round(31e9), np.eye(4), np.eye(4), SubmapId(0), continued=True)
+    assert level is not None and aligner.tilt_rad == pytest.approx(0.2)
+    np.testing.assert_allclose(level.T_l_m[:3, :3], first, atol=1e-4)
     np.testing.assert_allclose(aligner.R_l_o, first, atol=1e-9)  # a vehicle in flight cannot wait for more
     monkeypatch.setattr(Knows, "running", True)
-    for t_s in (32.0, 32.9):
-        assert aligner.update(round(1e9 * t_s), np.eye(4), np.eye(4), SubmapId(0), continued=True) is None
-    knows.up = settled
-    level = aligner.update(round(33e9), np.eye(4), np.eye(4), SubmapId(0), continued=True)
-    assert level is not None and aligner.tilt_rad == pytest.approx(0.3)
-    np.testing.assert_allclose(level.T_l_m[:3, :3], settled, atol=1e-4)
-    np.testing.assert_allclose(aligner.R_l_o, settled, atol=1e-9)
-    assert aligner.update(round(34e9), np.eye(4), np.eye(4), SubmapId(0), continued=True) is None
+    monkeypatch.setattr(Knows, "state", "a state")
+    knows.up = later
+    for sigma_rad, told in ((0.03, first), (0.01, later)):  # it turns once more is known
+        monkeypatch.setattr(gravity_alignment, "up_of", lambda _state, sigma_rad=sigma_rad: (np.zeros(3), sigma_rad))
+        assert aligner.update(round(40e9), np.eye(4), np.eye(4), SubmapId(0), continued=True) is None
+        np.testing.assert_allclose(aligner.R_l_o, told, atol=1e-9)
+    knows.up = first
+    assert aligner.update(round(50e9), np.eye(4), np.eye(4), SubmapId(0), continued=True) is None
+    np.testing.assert_allclose(aligner.R_l_o, later, atol=1e-9)  # and that is all
 
 
 def test_gravity_is_known_after_five_frames_in_motion() -> None:
