@@ -114,7 +114,8 @@ class Mapper:
             self._intake.take(agent, records, now_ns)
         for agent, records in given.imports:
             self._intake.take(agent, records, now_ns, in_contact=False)
-        if self._placements.align_with_gravity() or self._placements.make_metric():
+        scaled, turned = self._placements.make_metric(), self._placements.align_with_gravity()
+        if scaled or turned:
             self.grid_updates.rebuild()
         # 2. Apply the results of finished jobs, then carry out commands.
         changes = NOTHING

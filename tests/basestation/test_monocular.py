@@ -27,6 +27,7 @@ from kiteline_codec.schema import (
     CachedKeyframe,
     CachedLandmarks,
     CameraIntrinsics,
+    GravityAlignment,
     KeyframeHeader,
     LivePose,
     Record,
@@ -348,6 +349,17 @@ def test_a_unit_that_grew_while_the_base_refined_is_as_long_as_its_agent_says(ma
     mapper._placements.rescale({submap: 1.001}, {})  # what the base finds later stands
     mapper.step(MapperInput(()), 2 * 10**12)
     assert sim3.scale_of(mapper.placements[submap]) == pytest.approx(2.002)
+
+
+def test_metre_and_vertical_that_come_together_are_applied_together(make_flight: MakeFlight) -> None:
+    """A map that is placed in the same step would lie elsewhere for a moment, and live poses with it."""
+    mapper, (own, _) = told_metres(make_flight, first_in_metres=False)
+    submap = submap_of_keyframe(own.keyframes[0])
+    tilt = GravityAlignment(submap, se3.exp(np.array([0.0, 0.0, 0.0, 0.2, -0.1, 0.0])))
+    mapper.step(MapperInput(((own.agent, (SubmapScale(submap, 2.0), tilt)),)), 10**12)
+    S_w_m = mapper.placements[submap]
+    assert sim3.scale_of(S_w_m) == pytest.approx(2.0)
+    np.testing.assert_allclose(sim3.rigid(S_w_m)[:3, :3], tilt.T_l_m[:3, :3], atol=1e-9)
 
 
 def test_a_later_submap_is_scaled_where_it_begins_and_the_next_one_goes_with_it(make_flight: MakeFlight) -> None:
