@@ -243,7 +243,8 @@ class Agent:
             )
             if continued:
                 self._corrections.note_continued(self.submap)
-                continued += self._align_gravity(ctx)  # a map in metres may know it at once
+                if self._camera.motion.running:  # a window has told the vertical of this map in metres
+                    continued += self._align_gravity(ctx)
             events += continued + self._submaps.take_warnings()
             outcome = FrameOutcome(True, False, track.inliers, events)
         if self.right_camera is not None:

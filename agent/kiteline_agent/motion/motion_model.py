@@ -16,7 +16,7 @@ from kiteline_agent.inertial.inertial_config import InertialConfig
 from kiteline_agent.inertial.inertial_tracker import InertialTracker
 from kiteline_agent.inertial.samples.imu_watch import SILENT_S, ImuWatch
 from kiteline_agent.inertial.samples.sample_check import SampleCheck
-from kiteline_agent.inertial.scale_filter import INTERVAL_S
+from kiteline_agent.inertial.scale_filter import INTERVAL_S, ScaleFilter
 from kiteline_agent.motion.extrapolation import Extrapolation, MotionSource, along_twist
 from kiteline_agent.motion.loss_motion import LossMotionEstimator
 from kiteline_agent.motion.odometer import Odometer
@@ -96,8 +96,14 @@ class MotionModel:
         """Relative deviation of the map's lengths in metres; 0 where images measure them, or in a unit of its own."""
         if self._metric or not self.metric:
             return 0.0
-        watched = self.tracker is not None and self.tracker.scale.running
-        return self.tracker.scale.deviation if self.tracker is not None and watched else self.odometer.deviation
+        by_imu = self._scale_by_imu
+        return self.odometer.deviation if by_imu is None else by_imu.deviation
+
+    @property
+    def _scale_by_imu(self) -> ScaleFilter | None:
+        """What watches the scale of a monocular map whose metre the IMU told; None where the odometer did."""
+        running = self.tracker is not None and self.tracker.scale.running
+        return self.tracker.scale if self.tracker is not None and running else None
 
     @property
     def awaits_scale(self) -> bool:
@@ -292,12 +298,8 @@ class MotionModel:
         """Factor by which the map in metres is to be scaled, and its deviation; None if no correction is due."""
         if self._metric or not self.metric:
             return None
-        watched = self.tracker is not None and self.tracker.scale.running
-        return (
-            self.tracker.scale.correction()
-            if self.tracker is not None and watched
-            else self.odometer.scale_correction()
-        )
+        by_imu = self._scale_by_imu
+        return self.odometer.scale_correction() if by_imu is None else by_imu.correction()
 
     def reports(self) -> dict[str, Any]:
         """What was found of time offset, IMU and odometer; None for each that is not there."""

@@ -297,7 +297,7 @@ class Odometer:
 
     def set_metric(self, *, metric: bool, factor: float = 1.0) -> None:
         """Change the map's unit to metres, or to an unknown one. factor: by which a map in metres was scaled."""
-        self._scale.scale_map(factor)
+        self._scale.begin(factor)
         found = self.metres_per_unit()
         if metric and found is not None:
             self.unit_sigma = float(np.hypot(found[1] / found[0], _UNIT_FLOOR))

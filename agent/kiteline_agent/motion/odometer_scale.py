@@ -26,7 +26,7 @@ class OdometerScale:
         """of_map: the map of one camera, whose lengths the odometer tells: the map is off by it, not the odometer."""
         self._of_map = of_map
         self.value, self.var = 1.0, _START**2
-        self._age_s = 0.0  # since the map was last scaled
+        self._age_s = 0.0  # of compared windows since the map began
 
     def add(self, by_odometer: F64, by_images: F64, dt_s: float) -> None:
         """Add a window of so many s: displacements (3,) in m."""
@@ -46,12 +46,16 @@ class OdometerScale:
             self.value = float(np.clip(self.value + gain * off, 1.0 - _MOST, 1.0 + _MOST))
             self.var = max((1.0 - gain) * self.var, _FLOOR**2)
 
+    def begin(self, factor: float) -> None:
+        """A map in metres begins, whose lengths are `factor` times those before: the next correction waits."""
+        self.scale_map(factor)
+        self._age_s = 0.0
+
     def scale_map(self, factor: float) -> None:
         """Lengths in the map were multiplied by `factor`."""
         if self._of_map:
             self.value *= factor
             self.var *= factor**2
-            self._age_s = 0.0
 
     def correction(self) -> tuple[float, float] | None:
         """Factor by which the map is to be scaled, and its deviation; None if it is right as far as is known."""
