@@ -26,11 +26,21 @@ _LEAST_DEVIATIONS = 1.1  # smallest correction in its own deviations
 _LEAST_S = 4.0  # s between two corrections
 _START_SCALE = 0.022  # relative deviation of the start's scale: that of a first window
 _ACCEL_WALK = 0.02  # m/s^2 per sqrt(s): errors of scale and axes, of the map's rotations
-_SCALE_WALK = 0.006  # per sqrt(s): the map's own scale drifts while it grows
+MAP_WALK = 0.006  # per sqrt(s): the map's own scale drifts while it grows
 _IMAGE_RAD = 7e-4  # rad; error of a position by images, over the depth that they see
 _IMU_INFLATION = 3.0  # of the calibration's noise densities, beside the factor that the start found
 _CHI2 = 16.27  # 99.9 % with 3 degrees of freedom: beyond it an interval is left out, the images jumped
 INTERVAL_S = 0.39  # s between two compared poses, and of inertial steps: velocity changes more than images err
+
+
+def correction_due(scale: float, sigma: float, age_s: float) -> tuple[float, float] | None:
+    """Factor by which a map is to be scaled, and its deviation; None if it is right as far as is known.
+
+    scale: metres per unit of the map. sigma: its deviation. age_s: since the map began, or was corrected.
+    """
+    if age_s < _LEAST_S or sigma > _KNOWN_SIGMA * scale:
+        return None
+    return (scale, sigma) if abs(np.log(scale)) > max(_LEAST, _LEAST_DEVIATIONS * sigma / scale) else None
 
 
 class ScaleFilter:
@@ -61,10 +71,7 @@ class ScaleFilter:
 
     def correction(self) -> tuple[float, float] | None:
         """Factor by which the map is to be scaled, and its deviation; None if it is right as far as is known."""
-        scale, sigma = self.scale
-        if not self.running or self.age_s < _LEAST_S or sigma > _KNOWN_SIGMA * scale:
-            return None
-        return (scale, sigma) if abs(np.log(scale)) > max(_LEAST, _LEAST_DEVIATIONS * sigma / scale) else None
+        return correction_due(*self.scale, self.age_s) if self.running else None
 
     def stop(self) -> None:
         """Forget all: a map of another unit begins."""
@@ -132,7 +139,7 @@ class ScaleFilter:
 
     def _walk(self, cov: F64, dt_s: float) -> None:
         """Add to a covariance what scale and bias move by in dt_s."""
-        cov[_UNITS, _UNITS] += _SCALE_WALK**2 * dt_s
+        cov[_UNITS, _UNITS] += MAP_WALK**2 * dt_s
         cov[_BIAS, _BIAS] += (_ACCEL_WALK**2 + self._calibration.accel_walk**2) * dt_s * np.eye(3)
 
     def correct(self, factor: float) -> None:

@@ -157,9 +157,12 @@ class SubmapStage:
         if found is not None:
             return self._open_in_metres(found, start)
         if start.contradicted and not self._camera.submaps.any:
-            self._camera.ignore_imu()
-            self._warnings = [*start.take_warnings(), _IGNORED]
+            self._ignore_imu(start)
         return None
+
+    def _ignore_imu(self, start: InertialStart) -> None:
+        self._camera.ignore_imu()
+        self._warnings = [*start.take_warnings(), _IGNORED]
 
     def continue_start(self) -> tuple[FrameContext, OpenedSubmap] | None:
         """Go on with the solution that was begun. Returns the frame in which a submap begins by it, the last one."""
@@ -309,8 +312,7 @@ class SubmapStage:
         if start.keyframe_t_ns == ctx.t_ns:
             self._path.add(ctx.t_ns, camera.reference.keyframe, camera.reference.T_k_c)
         if start.contradicted:
-            camera.ignore_imu()
-            self._warnings = [*start.take_warnings(), _IGNORED]
+            self._ignore_imu(start)
         if found is None:
             return []
         events = self._continue_by_window(ctx, track, found)

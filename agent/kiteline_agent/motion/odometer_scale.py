@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from kiteline_agent.inertial.scale_filter import MAP_WALK, correction_due
 from kiteline_core.arrays import F64
 
 LEAST_MOVED_M = 0.02  # m; motion in a window below which axes and scale are not observable
@@ -11,12 +12,7 @@ _MOST = 0.25  # relative; a larger difference is a fault, not a scale
 _FLOOR = 0.01  # least relative deviation
 _SIGMA_M_S = 0.05  # m/s; expected noise of a window
 _WALK = 0.003  # relative change per sqrt(s): load and temperature
-_MAP_WALK = 0.006  # the same of a monocular map, which drifts while it grows
 _GATE = 3.0  # deviations beyond which a window is left out: slip
-_KNOWN_SIGMA = 0.025  # relative deviation below which a map may be corrected
-_LEAST = 0.015  # relative; smallest correction: each begins a new submap
-_LEAST_DEVIATIONS = 1.1  # smallest correction in its own deviations
-_LEAST_S = 4.0  # s between two corrections
 
 
 class OdometerScale:
@@ -31,7 +27,7 @@ class OdometerScale:
     def add(self, by_odometer: F64, by_images: F64, dt_s: float) -> None:
         """Add a window of so many s: displacements (3,) in m."""
         distance, square = float(np.sqrt(by_images @ by_images)), float(by_odometer @ by_odometer)
-        self.var += (_MAP_WALK if self._of_map else _WALK) ** 2 * dt_s
+        self.var += (MAP_WALK if self._of_map else _WALK) ** 2 * dt_s
         self._age_s += dt_s
         if square <= LEAST_MOVED_M**2:
             return
@@ -59,9 +55,6 @@ class OdometerScale:
 
     def correction(self) -> tuple[float, float] | None:
         """Factor by which the map is to be scaled, and its deviation; None if it is right as far as is known."""
-        sigma = float(np.sqrt(self.var)) / self.value
-        if not self._of_map or self._age_s < _LEAST_S or sigma > _KNOWN_SIGMA:
+        if not self._of_map:
             return None
-        if abs(np.log(self.value)) <= max(_LEAST, _LEAST_DEVIATIONS * sigma):
-            return None
-        return 1.0 / self.value, sigma / self.value
+        return correction_due(1.0 / self.value, float(np.sqrt(self.var)) / self.value**2, self._age_s)

@@ -109,6 +109,10 @@ class PoseState:
     def reset_motion(self) -> None:
         """Forget the motion: the next prediction is the present pose."""
         self._step_T, self.velocity, self.moves = np.eye(4), np.zeros(3), False
+        self._forget_guesses()
+
+    def _forget_guesses(self) -> None:
+        """The present pose is where it is by definition, whatever told the motion until here."""
         self._last_measured, self._by_sensor, self._guessed, self._guess_s = None, False, False, 0.0
 
     def set_motion(self, step_T: F64, velocity: F64) -> None:
@@ -129,7 +133,8 @@ class PoseState:
     def enter_submap(self) -> None:
         """Begin a new submap here; its axes are those of the odometry frame."""
         self.T_m_c = self.T_o_m @ self.T_m_c
-        self.T_o_m, self._last_measured, self._by_sensor, self._guessed = np.eye(4), None, False, False
+        self.T_o_m = np.eye(4)
+        self._forget_guesses()
 
     def rescale_map(self, metres: float) -> None:
         """Begin a submap in metres here whose axes are those of the old one. metres: one unit of it.
@@ -140,7 +145,7 @@ class PoseState:
         self.T_m_c, self._step_T = scaled(self.T_m_c, metres), scaled(self._step_T, metres)
         self.velocity = metres * self.velocity
         self.T_o_m = se3.orthonormalise(T_o_c @ se3.inverse(self.T_m_c))
-        self._last_measured, self._by_sensor, self._guessed = None, False, False
+        self._forget_guesses()
 
     def rescale(self, metres: float) -> F64:
         """Begin a submap in metres here. metres: one unit of the old submap. Returns T_new_old (4,4), lengths in m."""

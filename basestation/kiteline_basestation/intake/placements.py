@@ -93,8 +93,9 @@ class SubmapPlacements:
     def _in_metres(self) -> bool:
         """True if w is in metres."""
         first = self.first
-        known = first is not None and first in self._map.metres_per_unit
-        return known or (first is not None and not self._map.is_up_to_scale(self._map.map_id(first)))
+        if first is None:
+            return False
+        return first in self._map.metres_per_unit or not self._map.is_up_to_scale(self._map.map_id(first))
 
     def place_new(self, keyframe: KeyframeId) -> None:
         """Place the submap of a new keyframe: the first of all at w, a later one where the last one was left."""

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from kiteline_agent.inertial.preintegration import Samples
-from kiteline_agent.inertial.scale_filter import _IMAGE_RAD, _IMU_INFLATION, _SCALE_WALK, _START_SCALE, ScaleFilter
+from kiteline_agent.inertial.scale_filter import _IMAGE_RAD, _IMU_INFLATION, _START_SCALE, MAP_WALK, ScaleFilter
 from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry import se3
 
@@ -29,7 +29,7 @@ def flown(seed: int, accel_noise: float, told: float) -> tuple[float, float, flo
     walk = np.cumsum(0.01 / np.sqrt(HZ) * rng.standard_normal((len(t), 3)), axis=0)
     force = a - GRAVITY + 0.05 * rng.standard_normal(3) + walk + density * np.sqrt(HZ) * rng.standard_normal(a.shape)
     at = np.arange(0, len(t), EVERY)
-    drift = _SCALE_WALK * np.sqrt(EVERY / HZ) * rng.standard_normal(len(at))
+    drift = MAP_WALK * np.sqrt(EVERY / HZ) * rng.standard_normal(len(at))
     units = np.exp(_START_SCALE * rng.standard_normal() + np.cumsum(drift))  # of the map, in a metre
     steps = np.diff(p[at], axis=0) * units[1:, None]
     seen = np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])
