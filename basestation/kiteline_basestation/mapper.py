@@ -302,14 +302,14 @@ class Mapper:
         for keyframe in changes.requeried:
             self._local_bundles.add(keyframe)
         self._local_bundles.void(changes.moved, changes.bent)
-        withdrawn = self._placements.separate(changes.split)
+        self._placements.separate(changes.split)
         self._placements.rescale(changes.rescaled, changes.scale_sigma)
         for map_id in sorted(changes.moved):
             self._placements.update_map(map_id)
             self.grid_updates.rebuild()
         return tuple(
             (agent_of_submap(submap), Key(SubmapPlacement.KIND, int(submap), 0))
-            for submap in (*withdrawn, *sorted(self._forgotten))
+            for submap in (*self._placements.take_withdrawn(), *sorted(self._forgotten))
             if submap not in self.placements
         )
 

@@ -109,20 +109,20 @@ class PoseCovariance:
 
     def begin_flight(self) -> None:
         """Forget how uncertain the motion so far is: poses count from the submap that begins next."""
-        self._carried, self._same_frame = np.zeros((6, 6)), True
+        self._carried = np.zeros((6, 6))
         self._T_o_b0 = self._T_o_b_left = None
         self._T_o_m_before = {}
 
-    def begin_submap(self, T_m_b: F64) -> None:
-        """Begin a submap, with its first keyframe at T_m_b (4,4)."""
+    def begin_submap(self, T_m_b: F64, T_o_m: F64) -> None:
+        """Begin a submap, with its first keyframe at T_m_b (4,4). T_o_m: (4,4) of it in the odometry frame."""
         self._noise, self._shift = np.zeros((6, 6)), np.zeros((6, SHAPES))
         self._reset_reckoning()
         self._unmeasured_s = 0.0
         self._T_m_b0 = T_m_b
         self._schedule.begin((T_m_b @ self._T_b_c)[:3, 3])
         if self._T_o_b0 is None:
-            self._T_o_b0 = T_m_b
-        self._scale.begin_map(T_m_b[:3, 3], (T_m_b if self._T_o_b_left is None else self._T_o_b_left)[:3, 3])
+            self._T_o_b0, self._same_frame = T_o_m @ T_m_b, np.array_equal(T_o_m, np.eye(4))
+        self._scale.begin_map(T_m_b[:3, 3], (self._T_o_b0 if self._T_o_b_left is None else self._T_o_b_left)[:3, 3])
 
     def update(self, track: Track, dt_s: float = 0.0) -> None:
         """Update after images gave the pose, from landmarks of the local map. dt_s: since the last such frame.

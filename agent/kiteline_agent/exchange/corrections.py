@@ -186,11 +186,16 @@ class Corrections:
 
         Live poses go on where the base will place it: it scales w as long as the old one is its first submap.
         """
-        for state in (self._smoothing, self._filter, self._whole):
-            state.clear()
-        S_w_old, self._own_world = self._S_w_m.get(old), None
+        self.leave_world()
+        S_w_old = self._S_w_m.get(old)
         if S_w_old is not None:
             self._S_w_m[submap] = sim3.with_scaled_translation(sim3.rigid(S_w_old), unit_m / sim3.scale_of(S_w_old))
+
+    def leave_world(self) -> None:
+        """Odometry does not lead on in w: live poses are in it again once the active submap is placed."""
+        for state in (self._smoothing, self._filter, self._whole):
+            state.clear()
+        self._own_world = None
 
     def is_recognised(self, submap: SubmapId) -> bool:
         """True if the base merged a submap with another one: its pose there rests on more than odometry."""

@@ -210,7 +210,10 @@ class CameraState:
 
     def set_first_gravity(self, gravity_b: F64) -> None:
         """Set the camera where the flight begins: body at the origin, z up. gravity_b: (3,) in the body."""
-        self.pose.T_m_c = se3.from_rt(level_rotation(-gravity_b), np.zeros(3)) @ se3.inverse(self.T_c_b)
+        self.pose.T_m_c = self._upright(gravity_b)
+
+    def _upright(self, gravity_b: F64) -> F64:
+        return np.asarray(se3.from_rt(level_rotation(-gravity_b), np.zeros(3)) @ se3.inverse(self.T_c_b))
 
     def continue_in_metres(self, unit_m: float) -> F64:
         """Begin a new submap in this tracked frame. unit_m: m, one unit of the old one. Returns T_new_old (4,4).
@@ -226,11 +229,21 @@ class CameraState:
         self.pose.rescale_map(unit_m)
         return np.eye(4)
 
+    @property
+    def had_metres(self) -> bool:
+        """True if a submap of this flight is in metres."""
+        return self._had_metres
+
     def begin_metres(self) -> None:
         """The next submap is in metres. Before the first such one, errors of the motion are in no known unit."""
         if not self._had_metres and self.submaps.any:
             self.covariance.begin_flight()
         self._had_metres = True
+
+    def begin_upright(self, gravity_b: F64) -> None:
+        """Begin a submap as a flight does: body at its origin, z up. The odometry frame stays. gravity_b: (3,)."""
+        self.leave_submap()
+        self.pose.move_map(self._upright(gravity_b))
 
     def leave_submap(self) -> None:
         """Leave the active submap for a new one that begins here."""
@@ -239,7 +252,7 @@ class CameraState:
 
     def open_submap(self) -> SubmapId:
         """Open a submap at the present pose."""
-        self.covariance.begin_submap(self.T_m_b)
+        self.covariance.begin_submap(self.T_m_b, self.pose.T_o_m)
         submap = self.submaps.open_next()
         self._map.activate(submap)
         return submap

@@ -174,10 +174,14 @@ class SubmapStage:
 
     def _open_in_metres(self, found: InertialMap, start: InertialStart) -> OpenedSubmap:
         camera, solution, ctx = self._camera, found.solution, self._corrected(found.frame, found.lens)
-        if camera.submaps.any:
+        gravity_b = solution.T_w_b[:3, :3].T @ solution.gravity
+        if not camera.submaps.any:
+            camera.set_first_gravity(gravity_b)
+        elif camera.had_metres:
             camera.leave_submap()
-        else:
-            camera.set_first_gravity(solution.T_w_b[:3, :3].T @ solution.gravity)
+        else:  # nothing tells how it lies to maps whose units of length are their own
+            camera.begin_upright(gravity_b)
+            self._corrections.leave_world()
         camera.begin_metres()
         submap = camera.open_submap()
         camera.pose.reset_motion()

@@ -23,6 +23,7 @@ from kiteline_core.ids import KeyframeId, SubmapId, agent_of_submap, submap_of_k
 _ODOMETRY_GAP_S = 1.5  # s; a submap that begins within this time of the last one is placed by odometry
 _TIE_M = 0.2  # m; deviation of the motion over a loss up to which it places a submap: half a metre at worst
 _TIE_RAD = 0.03  # rad; the same of the rotation
+_LATE_TIE_S = 2.0  # s of a submap after which no tie to the one before is awaited: it would have come with it
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +48,7 @@ class SubmapPlacements:
         self.far = 0  # placements that were left out: they have no code
         self._told: dict[SubmapId, SubmapPlacement] = {}  # by an earlier process, until its state is restored
         self._scale_sigma: dict[SubmapId, float] = {}  # relative deviation of lengths, where accelerations told it
+        self._withdrawn: list[SubmapId] = []  # that lost their placements, and agents were not told yet
 
     @property
     def first(self) -> SubmapId | None:
@@ -98,10 +100,16 @@ class SubmapPlacements:
         return first in self._map.metres_per_unit or not self._map.is_up_to_scale(self._map.map_id(first))
 
     def place_new(self, keyframe: KeyframeId) -> None:
-        """Place the submap of a new keyframe: the first of all at w, a later one where the last one was left."""
+        """Place the submap of a new keyframe: the first of all at w, a later one where the last one was left.
+
+        One in metres begins a new w if all placed ones are of its agent and in units of their own, to which nothing
+        ties it: those would keep grid and poses out of w for the rest of the flight. They return by a merge.
+        """
         submap = submap_of_keyframe(keyframe)
         if submap in self.S_w_m or self._place_by_tie(submap):
             return
+        if self._is_apart_in_metres(submap, keyframe):
+            self._withdraw(list(self.S_w_m))
         if not self.S_w_m:
             gravity = self._intake.gravity.get(submap)
             S_w_m = np.eye(4) if gravity is None else gravity.T_l_m
@@ -120,6 +128,15 @@ class SubmapPlacements:
             scale = sim3.scale_of(S_w_before) if self._map.is_up_to_scale(submap) else 1.0
             S_w_m = sim3.normalise(sim3.of(scale, T_w_c) @ se3.inverse(T_m_first))
         self._place(submap, S_w_m)
+
+    def _is_apart_in_metres(self, submap: SubmapId, keyframe: KeyframeId) -> bool:
+        """True if nothing tells how a submap in metres lies to the placed ones, which are its agent's and not."""
+        if submap not in self._map.metric_submaps or submap in self._intake.loss_ties or self._in_metres:
+            return False
+        stamps = self._map.keyframes.t_ns[[self._map.rows[k] for k in (self._map.submaps[submap][0], keyframe)]]
+        if stamps[1] - stamps[0] < _LATE_TIE_S * 1e9:
+            return False
+        return {agent_of_submap(placed) for placed in self.S_w_m} == {agent_of_submap(submap)}
 
     def tell_rooted(self) -> None:
         """Publish the poses that were chosen for keyframes at which submaps begin without their first ones."""
@@ -184,17 +201,24 @@ class SubmapPlacements:
             if submap in self.unmerged:
                 self.unmerged[submap] = sim3.scaled_about(self.unmerged[submap], factor, first)
 
-    def separate(self, split: Collection[SubmapId]) -> list[SubmapId]:
-        """Move submaps that were split from a map back to where they lay before. Returns those without placement."""
-        withdrawn = []
+    def separate(self, split: Collection[SubmapId]) -> None:
+        """Move submaps that were split from a map back to where they lay before; others have no placement any more."""
         for submap in sorted(set(split) & self.S_w_m.keys() - {self.first}):
             self._recognised.discard(submap)
             if submap in self.unmerged:
                 self._set(submap, self.unmerged[submap])
             else:
-                self.delete(submap)
-                withdrawn.append(submap)
+                self._withdraw([submap])
+
+    def take_withdrawn(self) -> list[SubmapId]:
+        """Submaps that lost their placements since the last call, of which agents have to be told."""
+        withdrawn, self._withdrawn = self._withdrawn, []
         return withdrawn
+
+    def _withdraw(self, submaps: Collection[SubmapId]) -> None:
+        for submap in submaps:
+            self.delete(submap)
+        self._withdrawn += submaps
 
     def delete(self, submap: SubmapId) -> None:
         """Drop the placement of a submap, also one that has not been sent yet."""

@@ -104,7 +104,7 @@ def test_a_camera_that_is_rotated_in_the_body_widens_the_covariance() -> None:
         map_of(seen_with(np.zeros(SHAPES), scene(), np.eye(4))), np.eye(4), CovarianceConfig(), has_body=True,
         has_depth=True,
     )  # fmt: skip
-    covariance.begin_submap(np.eye(4))
+    covariance.begin_submap(np.eye(4), np.eye(4))
     before = covariance.of_poses(poses, T_m_b)[0]
     covariance.set_camera_rotation(0.006)
     after = covariance.of_poses(poses, T_m_b)[0]

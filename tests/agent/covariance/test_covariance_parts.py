@@ -31,7 +31,7 @@ def begun(**config: float) -> PoseCovariance:
     """The covariance in a map of one keyframe that begins at the origin."""
     local_map = map_of(seen_with(np.zeros(SHAPES), scene(), np.eye(4)))
     covariance = PoseCovariance(local_map, np.eye(4), CovarianceConfig(**config), has_body=False, has_depth=True)
-    covariance.begin_submap(np.eye(4))
+    covariance.begin_submap(np.eye(4), np.eye(4))
     return covariance
 
 

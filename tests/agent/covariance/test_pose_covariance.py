@@ -130,7 +130,7 @@ def test_disparity_errors_that_cancel_cost_less_than_their_parts() -> None:
 def test_near_its_start_the_covariance_follows_every_few_centimetres() -> None:
     def deviations(step_m: float, frames: int) -> list[float]:
         local_map, covariance = begun()
-        covariance.begin_submap(np.eye(4))
+        covariance.begin_submap(np.eye(4), np.eye(4))
         out = []
         for k in range(frames):
             T_c_m = se3.exp(np.array([k * step_m, 0.0, 0.0, 0.0, 0.0, 0.0]))
@@ -158,7 +158,7 @@ def test_the_error_of_a_keyframe_is_that_of_what_is_measured_against_it() -> Non
 def test_noise_of_a_measured_pose_is_what_it_says() -> None:
     rng = np.random.default_rng(0)
     local_map, covariance = begun(calibration_px=0.0, least_rms=0.0)
-    covariance.begin_submap(np.eye(4))
+    covariance.begin_submap(np.eye(4), np.eye(4))
     nees = []
     for _ in range(100):
         track = tracked(local_map, seen_with(NOTHING, X, T_C_M) + 0.15 * rng.normal(size=(120, 3)), T_C_M)
@@ -172,7 +172,7 @@ def test_noise_of_a_measured_pose_is_what_it_says() -> None:
 
 def test_what_an_imu_pulls_poses_by_adds_up_from_keyframe_to_keyframe() -> None:
     local_map, covariance = begun(calibration_px=0.0)
-    covariance.begin_submap(np.eye(4))
+    covariance.begin_submap(np.eye(4), np.eye(4))
     track = tracked_at(local_map, np.eye(4))
     pull = np.array([0.0, 0.0, 0.004, 0.0, 0.001, 0.0])
 
@@ -196,7 +196,7 @@ def test_what_an_imu_pulls_poses_by_adds_up_from_keyframe_to_keyframe() -> None:
 
 def test_a_wrong_place_in_the_body_shows_once_the_body_turns() -> None:
     _, covariance = begun(has_body=True, calibration_px=0.0, extrinsic_rad=1e-3, extrinsic_m=0.0)
-    covariance.begin_submap(np.eye(4))
+    covariance.begin_submap(np.eye(4), np.eye(4))
     assert not covariance.of_poses(PoseState(), np.eye(4))[0].any()
     half = se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, np.pi]))
     sigma = np.sqrt(np.diag(covariance.of_poses(PoseState(), half)[0])[3:])
@@ -205,7 +205,7 @@ def test_a_wrong_place_in_the_body_shows_once_the_body_turns() -> None:
 
 def test_dead_reckoning_grows_uncertain_and_the_odometry_keeps_it() -> None:
     pose, (local_map, covariance) = PoseState(), begun(has_body=True, calibration_px=0.0)
-    covariance.begin_submap(np.eye(4))
+    covariance.begin_submap(np.eye(4), np.eye(4))
     covariance.update(tracked_at(local_map, np.eye(4)))
     before = covariance.of_poses(pose, np.eye(4))[1]
     sizes = []
@@ -249,7 +249,7 @@ def test_dead_reckoning_from_an_unknown_speed_is_worse_and_one_by_a_slow_camera_
     sigma = []
     for over_s in (0.0, None, 0.4):
         _, covariance = begun(unknown_velocity_m_s=5.0, unknown_rate_rad_s=1.0)
-        covariance.begin_submap(np.eye(4))
+        covariance.begin_submap(np.eye(4), np.eye(4))
         covariance.dead_reckon(0.3, None, over_s)
         sigma.append(np.sqrt(np.diag(covariance.of_poses(PoseState(), np.eye(4))[0])))
     np.testing.assert_allclose(sigma[0], np.repeat([0.03 * 0.3 + 0.09, 0.02 * 0.3 + 0.09], 3), rtol=1e-6)
@@ -262,7 +262,7 @@ def test_a_livelier_vehicle_is_less_certain_in_the_dark(option: str, axis: int) 
     sigma = []
     for value in (2.0, 4.0):
         _, covariance = begun(calibration_px=0.0, **{option: value})
-        covariance.begin_submap(np.eye(4))
+        covariance.begin_submap(np.eye(4), np.eye(4))
         covariance.dead_reckon(1.0, None)
         sigma.append(np.sqrt(covariance.of_poses(PoseState(), np.eye(4))[0][axis, axis]))
     assert sigma[1] > 1.5 * sigma[0]

@@ -20,7 +20,7 @@ def monocular() -> PoseCovariance:
     """In a map that began at the origin."""
     local_map = map_of(seen_with(np.zeros(SHAPES), scene(), np.eye(4)), None)
     covariance = PoseCovariance(local_map, np.eye(4), CovarianceConfig(), has_body=False, has_depth=False)
-    covariance.begin_submap(np.eye(4))
+    covariance.begin_submap(np.eye(4), np.eye(4))
     return covariance
 
 
@@ -65,7 +65,7 @@ def test_a_new_map_begins_certain_and_the_flight_stays_as_it_was() -> None:
     pose.T_m_c = at(10.0, 0.0, 0.0)
     covariance.before_map_change(pose, np.eye(4), SUBMAP)
     pose.enter_submap()
-    covariance.begin_submap(pose.T_m_c)
+    covariance.begin_submap(pose.T_m_c, np.eye(4))
     cov_m, cov_o = covariance.of_poses(pose, pose.T_m_c)
     assert np.sqrt(cov_o[0, 0]) == pytest.approx(0.2, rel=0.01)
     assert np.sqrt(cov_m[0, 0]) < 1e-3
