@@ -1,9 +1,10 @@
 """Gravity alignment of the odometry frame and the first submap.
 
 The accelerometer gives a first guess, which is accurate at rest only. A few frames later the poses by images give the
-acceleration, so that gravity is known to half a degree in motion too. The first submap keeps its axes; its rotation is
-sent to the base, and a flight controller gets its first pose once the rotation is known: never in a frame whose
-vertical nothing has measured.
+acceleration, so that gravity is known to half a degree in motion too, to three degrees with a worn or shaken IMU. The
+first submap keeps its axes; its rotation is sent to the base, and a flight controller gets its first pose once the
+rotation is known: never in a frame whose vertical nothing has measured. That frame then follows what the smoother
+finds, too slowly to be seen as motion.
 """
 
 import numpy as np
@@ -23,6 +24,8 @@ _MIN_TILT_RAD = 0.035  # rad; tilt above which the map is gravity-aligned: two d
 _PATIENCE_S = 2.0  # s; longest time that a flight controller waits for more than the accelerometer's first guess
 _SETTLED_S = 1.0  # s of fusion after which the vertical is known to a degree or two: after the first frames to five
 _SURE_RAD = 0.0175  # rad; deviation of a vertical that is better than that of the first frames: a degree
+_FOLLOW_S = 3.0  # s; time constant with which the vertical of a flight controller follows the smoother's
+_FOLLOW_RAD_S = 0.005  # rad/s, at most: 3 degrees in 10 s. At 10 m/s it bends the path by 0.05 m/s^2
 _LEAST_M_S2 = 0.1  # of a specific force that points anywhere
 _ATTITUDE_TILT = np.array([0, 1, 2, 15, 16])  # in the covariance of a state
 AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # R_m_c of a level camera that looks along x
@@ -68,13 +71,14 @@ class GravityAligner:
         self._p_l_o: F64 | None = None
         self._guessed = False  # the first submap is upright only if the camera was level
         self._fused_ns: int | None = None  # stamp of the first frame since which images and IMU are fused
+        self._followed_ns = 0  # stamp of the frame up to which the smoother's vertical is followed
         self._rough = False  # it was told from a few frames, as samples had just come
         self._doubted = False  # since it was known nothing has measured a part of the turns
         self.tilt_rad = 0.0  # of the first submap, or of the one that continues it
 
     @property
     def R_l_o(self) -> F64 | None:
-        """(3,3) that gravity-aligns the odometry frame; None before. It turns after `renew`, `doubt` and a guess."""
+        """(3,3) that gravity-aligns the odometry frame; None before. At once after `renew`, `doubt`, a guess."""
         return None if self._renewed and not self._known else self._R_l_o
 
     @property
@@ -123,7 +127,10 @@ class GravityAligner:
             return None
         self._began_ns = t_ns if self._began_ns is None else self._began_ns
         asked = self._is_settled(t_ns) if self._known else True
-        R_l_m = self._inertial.gravity_rotation() if asked else None
+        if not asked:
+            self._follow(t_ns, T_o_m, (T_o_m @ T_m_b)[:3, 3])
+            return None
+        R_l_m = self._inertial.gravity_rotation()
         if R_l_m is None:
             waited = not self._known and t_ns - self._began_ns > _PATIENCE_S * 1e9
             if waited and not (self._renewed or self._guessed):  # a guess may be tilted by any angle
@@ -154,12 +161,35 @@ class GravityAligner:
         sure = state is not None and up_of(state)[1] < _SURE_RAD
         return sure or (self._doubted and t_ns - self._fused_ns >= _SETTLED_S * 1e9)
 
+    def _follow(self, t_ns: int, T_o_m: F64, here_o: F64) -> None:
+        """Turn the gravity-aligned frame slowly to the smoother's vertical, once images and IMU are fused for long."""
+        settled = self._fused_ns is not None and t_ns - self._fused_ns >= _SETTLED_S * 1e9
+        dt_s, self._followed_ns = (t_ns - self._followed_ns) * 1e-9, t_ns
+        if not settled or self._doubted or self._rough or dt_s > _FOLLOW_S:
+            return
+        assert self._inertial is not None
+        R_l_m = self._inertial.gravity_rotation()
+        if R_l_m is None:
+            return
+        turn = self._upright_turn(R_l_m, T_o_m[:3, :3])
+        angle = float(np.linalg.norm(turn))
+        self._turn(min(dt_s / _FOLLOW_S, _FOLLOW_RAD_S * dt_s / max(angle, 1e-9)) * turn, here_o)
+
     def _turn_upright(self, R_l_m: F64, R_o_m: F64, here_o: F64) -> None:
-        """Turn the gravity-aligned frame about the vehicle, at here_o (3,) m, without a change of its heading."""
-        assert self._R_l_o is not None
+        """Turn the gravity-aligned frame at once."""
         self._doubted = self._rough = False
+        self._turn(self._upright_turn(R_l_m, R_o_m), here_o)
+
+    def _upright_turn(self, R_l_m: F64, R_o_m: F64) -> F64:
+        """Rotation vector (3,) that makes the gravity-aligned frame upright, without a change of its heading."""
+        assert self._R_l_o is not None
+        return np.asarray(se3.so3_log(level_rotation(self._R_l_o @ R_o_m @ R_l_m[2])))
+
+    def _turn(self, turn: F64, here_o: F64) -> None:
+        """Turn the gravity-aligned frame about the vehicle, at here_o (3,) m. turn: (3,) rad."""
+        assert self._R_l_o is not None
         here_l = self._R_l_o @ here_o + (0.0 if self._p_l_o is None else self._p_l_o)
-        self._R_l_o = level_rotation(self._R_l_o @ R_o_m @ R_l_m[2]) @ self._R_l_o
+        self._R_l_o = se3.so3_exp(turn) @ self._R_l_o
         self._p_l_o = here_l - self._R_l_o @ here_o
 
 

@@ -202,6 +202,30 @@ def test_poses_are_upright_again_after_a_loss_over_which_nothing_measured_the_tu
     np.testing.assert_allclose(again[:3, 3], leaning[:3, 3], atol=1e-9)  # also the second time
 
 
+def test_the_vertical_of_the_first_frames_slowly_follows_what_is_found_later(monkeypatch: pytest.MonkeyPatch) -> None:
+    knows, found = Knows(), se3.so3_exp(np.array([0.04, -0.03, 0.0]))
+    aligner = GravityAligner(CAMERA, knows)
+    knows.up = np.eye(3)  # by a few frames of a shaken IMU
+    off, place, step_s = [], [], 0.05
+    for k in range(600):
+        T_o_b = se3.from_rt(np.eye(3), np.array([5.0 * k * step_s, 1.0, 0.0]))
+        before = None if aligner.R_l_o is None else (aligner.R_l_o, aligner.p_l_o)
+        aligner.update(round(1e9 * k * step_s), T_o_b, np.eye(4), SubmapId(0), continued=True)
+        knows.up = found
+        monkeypatch.setattr(Knows, "running", True)
+        assert aligner.R_l_o is not None
+        off.append(float(np.linalg.norm(se3.so3_log(aligner.R_l_o @ found.T))))
+        if before is not None and before[1] is not None:
+            assert aligner.p_l_o is not None
+            here = T_o_b[:3, 3]
+            place.append(np.linalg.norm(aligner.R_l_o @ here + aligner.p_l_o - before[0] @ here - before[1]))
+    assert len(set(off[:20])) == 1  # not before the smoother has settled
+    assert np.diff(off).min() > -0.005 * step_s - 1e-9  # too slow to be seen as motion
+    assert off[-1] < 1e-3
+    assert max(place) < 1e-9  # about the vehicle, which does not move by it
+    assert abs(se3.so3_log(aligner.R_l_o)[2]) < 1e-6  # nor turn
+
+
 def test_the_vehicle_stays_at_its_place_where_the_imu_was_mounted_otherwise() -> None:
     knows = Knows()
     aligner = GravityAligner(CAMERA, knows)
