@@ -340,27 +340,6 @@ def tell(mapper: Mapper, flight: Any, metres: float) -> None:
     mapper.step(MapperInput(((flight.agent, (record,)),)), 10**12)
 
 
-@pytest.mark.parametrize("by", ["the same agent", "another agent"])
-def test_a_map_in_metres_begins_a_new_world_where_nothing_ties_it_to_one_in_another_unit(
-    make_flight: MakeFlight, by: str
-) -> None:
-    """Grid and poses would be in no world for the rest of the flight; that of another agent is left alone."""
-    agent = int(by == "another agent")
-    own = in_own_unit(make_flight(keyframes=4, turns=0.07, stereo=False), 0.5)
-    later = make_flight(agent=agent, keyframes=10, turns=0.18, start=0.5, submap=1, stereo=False)
-    own_submap, submap = (submap_of_keyframe(f.keyframes[0]) for f in (own, later))
-    mapper = Mapper(WITHOUT_GRID)
-    withdrawn: list[int] = []
-    for flight, said in ((own, []), (later, [SubmapScale(submap, 1.0)])):
-        for n, batch in enumerate([[CameraIntrinsics(flight.agent, flight.camera), *said], *flight.records, []]):
-            output = mapper.step(MapperInput(((flight.agent, tuple(batch)),)), n * STEP_NS)
-            withdrawn += [key.id for _, key in output.withdrawn]
-            if n == 2:
-                assert list(mapper.placements) == [own_submap]  # a tie may come late
-    assert list(mapper.placements) == [own_submap if agent else submap]
-    assert withdrawn == ([] if agent else [own_submap])
-
-
 def test_a_unit_that_grew_while_the_base_refined_is_as_long_as_its_agent_says(make_flight: MakeFlight) -> None:
     mapper, (own, _) = told_metres(make_flight, first_in_metres=False)
     submap = submap_of_keyframe(own.keyframes[0])

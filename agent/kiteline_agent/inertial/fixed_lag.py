@@ -20,6 +20,7 @@ from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.order_statistics import median
 
+_MOST_STATES = 6  # in the window, while samples come frames late
 _BY_DEFINITION = 1e-4  # m and rad: deviation of a pose that defines its map
 _VELOCITY_CHI2 = 7.81  # 95 % with 3 degrees of freedom: an odometer's velocity beyond it is down-weighted
 
@@ -100,8 +101,9 @@ class FixedLagSmoother:
     def __init__(
         self, camera: RectifiedCamera, calibration: ImuCalibration, config: FixedLagConfig, gravity_m_s2: float = 9.81
     ) -> None:
-        n, p = config.states + 1, config.points
+        n, p = max(config.states, _MOST_STATES) + 1, config.points
         self._config = config
+        self._states = config.states  # in the window
         self._calibration = calibration
         self._gravity = gravity_m_s2
         floor = np.repeat([config.turn_floor_rad, config.velocity_floor_m_s, config.position_floor_m], 3)
@@ -198,9 +200,10 @@ class FixedLagSmoother:
         IMU measures. Without it, biases and vertical would take up the difference, and poses would lag behind the
         images later. Returns None, without a state, if the system could not be solved; `start` is needed then.
         """
-        if self._n > self._config.states - 1 and not self._drop_oldest():
-            self.stop()
-            return None
+        while self._n > self._states - 1:
+            if not self._drop_oldest():
+                self.stop()
+                return None
         k = self._n
         bias = self._state[k - 1, 6:].copy()
         motion = self._integrated(samples, bias)
@@ -233,9 +236,13 @@ class FixedLagSmoother:
             return None
         return self.state
 
-    def replace_last(self, samples: Samples) -> None:
-        """Replace the samples of the interval before the newest state."""
-        k = self._n - 2
+    def hold(self, intervals: int) -> None:
+        """Keep so many intervals in the window, whose samples are awaited, if there is room."""
+        self._states = int(np.clip(intervals + 1, self._config.states, max(self._config.states, _MOST_STATES)))
+
+    def replace(self, back: int, samples: Samples) -> None:
+        """Replace the samples of an interval. back: 0 for that before the newest state. Older ones are final."""
+        k = self._n - 2 - back
         if k >= 0:
             bias = self._imu_bias[k].copy()
             self._put_interval(k, preintegrate(samples, bias, self._calibration, self._config.imu_inflation))

@@ -168,8 +168,8 @@ class GravityAligner:
         if not settled or self._doubted or self._rough or dt_s > _FOLLOW_S:
             return
         assert self._inertial is not None
-        R_l_m = self._inertial.gravity_rotation()
-        if R_l_m is None:
+        R_l_m, state = self._inertial.gravity_rotation(), self._inertial.state
+        if R_l_m is None or state is None or up_of(state)[1] > _SURE_RAD:
             return
         turn = self._upright_turn(R_l_m, T_o_m[:3, :3])
         angle = float(np.linalg.norm(turn))

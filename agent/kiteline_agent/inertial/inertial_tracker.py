@@ -26,6 +26,7 @@ from kiteline_core.frame import ImuBatch, ImuCalibration
 from kiteline_core.geometry import disparity_offset, se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 
+_WAITING = 6  # intervals whose samples are awaited: more than the smoother holds
 _PRIOR_SIGMA = np.repeat([0.005, 0.1], 3)  # rad/s, m/s^2: of biases of earlier tracking, after a loss
 
 
@@ -53,7 +54,7 @@ class InertialTracker:
         self._scale_watch = ScaleWatch(self.scale, self._p_b_c, self._has_come, self._between_frames)
         # the interval that was asked for last
         self._cached: tuple[tuple[int, int, int | None], Samples | None] | None = None
-        self._incomplete: tuple[int, int] | None = None  # the last interval, if samples at its end were missing
+        self._incomplete: list[tuple[int, int]] = []  # the last intervals, if samples at their ends were missing
         self._bias = np.zeros(6)
         self._last: tuple[int, F64] | None = None  # stamp and T_m_b of the last frame
         self._interval_end_ns = 0  # IMU time
@@ -260,7 +261,7 @@ class InertialTracker:
             self._smoother.begin_map(T_m_b)
         self.self_calibration.begin_map()
         self._scale_watch.forget()
-        self._incomplete = None
+        self._incomplete = []
         self._initialiser.clear()
         self._set_last(t_ns, T_m_b)
         self._image_loss_s = 0.0
@@ -287,7 +288,7 @@ class InertialTracker:
         self.clock.forget()
         self._last = None
         self.self_calibration.begin_map()
-        self._incomplete = None
+        self._incomplete = []
         self._image_loss_s = 0.0
 
     def rescale(self, scale: float) -> None:
@@ -360,21 +361,29 @@ class InertialTracker:
         if samples is None:
             self._smoother.stop()
             return None
-        self._complete_interval()
+        self._complete_intervals()
         state = self._smoother.add(samples, points, velocity, length_error)
         if state is not None:
             self._bias = state.bias
         end_ns = self._interval_end_ns + round(samples.duration_s * 1e9)
         newest = self._buffer.newest_t_ns
-        self._incomplete = (self._interval_end_ns, end_ns) if newest is not None and newest < end_ns else None
+        if newest is not None and newest < end_ns:
+            self._incomplete.append((self._interval_end_ns, end_ns))
+        self._smoother.hold(len(self._incomplete))
         return state
 
-    def _complete_interval(self) -> None:
-        """Replace the last interval if its final samples came after its frame: IMU stamps ahead of the camera's."""
-        if self._incomplete is not None:
-            samples = self._between(*self._incomplete)
+    def _complete_intervals(self) -> None:
+        """Replace the last intervals whose final samples came after their frames: IMU stamps ahead of the camera's.
+
+        What still has not come counts next to nothing: forces held for more than a frame would turn the vertical.
+        """
+        newest, intervals = self._buffer.newest_t_ns, self._incomplete
+        for back, (begin_ns, end_ns) in enumerate(reversed(intervals)):
+            samples = self._between(begin_ns, end_ns)
             if samples is not None:
-                self._smoother.replace_last(samples)
+                lacks = self._buffer.lacks(end_ns)
+                self._smoother.replace(back, without_held(samples) if lacks else samples)
+        self._incomplete = [i for i in intervals[-_WAITING:] if newest is not None and newest < i[1]]
 
     def _calibrate(self, t_ns: int, T_m_b_visual: F64, depth_m: float, dt_s: float) -> None:
         gravity = self._smoother.gravity if self._smoother.running and self._images_have_scale else None
@@ -384,7 +393,7 @@ class InertialTracker:
             self._smoother.stop()
             self._initialiser.clear()
             self._bias = np.concatenate([self.self_calibration.gyro.bias, np.zeros(3)])
-            self._cached = self._incomplete = None
+            self._cached, self._incomplete = None, []
         elif change.any():
             self._bias = np.concatenate([self._bias[:3], self._bias[3:] + change])
             self._smoother.shift_accel_bias(change)

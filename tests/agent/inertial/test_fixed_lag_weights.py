@@ -83,7 +83,7 @@ def test_noise_counts_more_by_its_inflation_also_once_late_samples_have_come() -
         smoother = begun(replace(PLAIN, imu_inflation=factor))
         smoother.add(samples, None)
         if late:
-            smoother.replace_last(samples)
+            smoother.replace(0, samples)
         sizes.append(float(np.trace(np.linalg.inv(smoother._imu_info[0])[3:6, 3:6])))
     np.testing.assert_allclose(np.divide(sizes[1:], sizes[0]), 9.0, rtol=1e-3)
 

@@ -1,0 +1,35 @@
+"""Where submaps lie in the world, when a map in metres follows one in another unit."""
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from kiteline_basestation.mapper import Mapper, MapperInput
+from kiteline_codec.schema import CameraIntrinsics, SubmapScale
+from kiteline_core.ids import submap_of_keyframe
+from tests.basestation.feeding import STEP_NS, WITHOUT_GRID
+from tests.basestation.test_monocular import in_own_unit
+
+MakeFlight = Callable[..., Any]
+
+
+@pytest.mark.parametrize("by", ["the same agent", "another agent"])
+def test_a_map_in_metres_begins_a_new_world_where_nothing_ties_it_to_one_in_another_unit(
+    make_flight: MakeFlight, by: str
+) -> None:
+    """Grid and poses would be in no world for the rest of the flight; that of another agent is left alone."""
+    agent = int(by == "another agent")
+    own = in_own_unit(make_flight(keyframes=4, turns=0.07, stereo=False), 0.5)
+    later = make_flight(agent=agent, keyframes=10, turns=0.18, start=0.5, submap=1, stereo=False)
+    own_submap, submap = (submap_of_keyframe(f.keyframes[0]) for f in (own, later))
+    mapper = Mapper(WITHOUT_GRID)
+    withdrawn: list[int] = []
+    for flight, said in ((own, []), (later, [SubmapScale(submap, 1.0)])):
+        for n, batch in enumerate([[CameraIntrinsics(flight.agent, flight.camera), *said], *flight.records, []]):
+            output = mapper.step(MapperInput(((flight.agent, tuple(batch)),)), n * STEP_NS)
+            withdrawn += [key.id for _, key in output.withdrawn]
+            if n == 2:
+                assert list(mapper.placements) == [own_submap]  # a tie may come late
+    assert list(mapper.placements) == [own_submap if agent else submap]
+    assert withdrawn == ([] if agent else [own_submap])
