@@ -10,8 +10,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuCalibration, Trajectory
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraModel, CameraRig
@@ -26,8 +26,6 @@ from kiteline_hw.sensors.images import ImageFile
 from kiteline_hw.sensors.imu_buffer import ImuSamples, ImuTable
 from kiteline_hw.sources.recording import Recording, Stamped, image_size, list_images, sorted_trajectory
 from kiteline_hw.sources.text_files import listed_file, nanoseconds, pose_from_tum, read_rows, read_tum_poses
-
-F64 = NDArray[np.float64]
 
 _CAMERA_KEYS = (
     "T_BS (data: 16 numbers), resolution [width, height], intrinsics [fu, fv, cu, cv], distortion_model and "

@@ -8,15 +8,13 @@ the colour cameras) are ignored: the images were rectified so that their rows ag
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64
 from kiteline_core.frame import Trajectory
 from kiteline_hw.ports import SourceError
 from kiteline_hw.sources.kitti_raw import is_raw, open_raw, pairs_by_name, rig_of
 from kiteline_hw.sources.recording import Recording, image_size, list_images, sorted_trajectory
 from kiteline_hw.sources.text_files import read_rows, row_values, seconds_to_ns
-
-F64 = NDArray[np.float64]
 
 NOMINAL_HZ = 10  # KITTI's rate, used if there is no times.txt
 PAIRS = (("image_0", "image_1", "P0", "P1"), ("image_2", "image_3", "P2", "P3"), ("image_l", "image_r", "P0", "P1"))

@@ -9,16 +9,14 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64
 from kiteline_core.geometry.cameras import CameraModel, CameraRig
 from kiteline_hw.calibration.checks import checked_baseline, checked_camera
 from kiteline_hw.ports import SourceError, SourceReport
 from kiteline_hw.sensors.frames import EncodedFrame
 from kiteline_hw.sources.recording import Recording, frames_by_key, image_size, list_images
 from kiteline_hw.sources.text_files import read_text, row_values
-
-F64 = NDArray[np.float64]
 
 CALIBRATION = "calib_cam_to_cam.txt"
 _PAIRS = (("00", "01"), ("02", "03"))  # grey, colour

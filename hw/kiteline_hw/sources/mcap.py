@@ -10,10 +10,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
-
 from kiteline_core import odometry
+from kiteline_core.arrays import F64
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration, OdometryBatch, Trajectory
 from kiteline_core.geometry.cameras import CameraRig
 from kiteline_hw.calibration.file_calibration import FileCalibration
@@ -85,7 +83,7 @@ class McapSource:
         self._split_imu: ImuChoice | None = None
         self._notes: tuple[str, ...] = ()
         self._odometer_channel: int | None = None
-        self._T_b_d: NDArray[np.float64] | None = None  # the odometer's frame in the body; None: they are the same
+        self._T_b_d: F64 | None = None  # the odometer's frame in the body; None: they are the same
         rig_channel = self._by_schema("kiteline.Rig")
         if rig_channel is not None:
             self._open_log(rig_channel, mono)

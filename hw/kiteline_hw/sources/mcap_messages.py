@@ -15,8 +15,8 @@ from mcap.exceptions import McapError
 from mcap.records import Channel, Schema
 from mcap_protobuf.decoder import DecoderFactory as ProtobufDecoders
 from mcap_ros2.decoder import DecoderFactory as Ros2Decoders
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64
 from kiteline_core.frame import EncodedImage, OdometryBatch
 from kiteline_core.geometry import se3
 from kiteline_hw.logs.mcap_log_read import read_odometry
@@ -24,8 +24,6 @@ from kiteline_hw.sensors.images import detect_format
 from kiteline_hw.sensors.odometry_buffer import RATE_SIGMA_RAD_S, VELOCITY_SIGMA_M_S, reported_covariance
 from kiteline_hw.sensors.raw_pixels import BadImage, RawPixels
 from kiteline_hw.sources.bags.ros2_samples import fast_decoder
-
-F64 = NDArray[np.float64]
 
 _LOOKED_AT = 20  # messages of a channel, of which the first stamp that is not 0 is compared with its log time
 _OTHER_CLOCK_NS = 3_600_000_000_000  # ns between stamp and log time, from which they are of two clocks

@@ -9,16 +9,14 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraModel, CameraRig, Lens
 from kiteline_hw.calibration.checks import checked_baseline, checked_camera, parse_lens
 from kiteline_hw.calibration.file_calibration import FileCalibration
 from kiteline_hw.ports import SourceError
 from kiteline_hw.sources.mcap_messages import CameraCalibration, Transform
-
-F64 = NDArray[np.float64]
 
 _WORLD_FRAMES = ("world", "map", "odom", "earth")
 _ONE_KIND = 1.1  # ratio of focal lengths: two lenses of one kind differ by less

@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration, Trajectory
 from kiteline_core.geometry.cameras import CameraRig
 from kiteline_hw.ports import SourceError, SourceReport
@@ -16,7 +16,6 @@ from kiteline_hw.sensors.images import ImageFile, decode_grey
 from kiteline_hw.sensors.imu_buffer import ImuSamples, NoImu
 from kiteline_hw.sensors.raw_pixels import BadImage
 
-F64 = NDArray[np.float64]
 Stamped = list[tuple[int, Path]]  # t_ns, image file
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".bmp", ".tif", ".tiff", ".webp")

@@ -6,12 +6,11 @@ from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
 from kiteline_hw.ports import SourceError
 
-F64 = NDArray[np.float64]
 Yaml = dict[str, str | list[float]]
 
 _MOST_BYTES = 1 << 28  # of a table: hours of samples

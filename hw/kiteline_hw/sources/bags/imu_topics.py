@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 from itertools import islice
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kiteline_core.arrays import F64
 from kiteline_hw.sources.mcap_messages import ImuRow
 from kiteline_hw.sources.mcap_rig import TransformTree
 
@@ -37,7 +37,7 @@ class ImuChoice:
 
     gyro: ImuTopic
     accel: ImuTopic
-    R_g_a: NDArray[np.float64] | None
+    R_g_a: F64 | None
     note: str
 
     @property
