@@ -5,7 +5,6 @@ mav0 or in dso.
 """
 
 import contextlib
-import heapq
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -21,10 +20,17 @@ from kiteline_hw.calibration.file_calibration import FileCalibration, FilePart
 from kiteline_hw.calibration.files import read_calibration
 from kiteline_hw.calibration.nodes import Node, read_nodes
 from kiteline_hw.ports import SourceError, SourceReport
-from kiteline_hw.sensors.frames import EncodedFrame, pair_by_time, pair_tolerance_ns
+from kiteline_hw.sensors.frames import EncodedFrame
 from kiteline_hw.sensors.images import ImageFile
 from kiteline_hw.sensors.imu_buffer import ImuSamples, ImuTable
-from kiteline_hw.sources.recording import Recording, Stamped, image_size, list_images, sorted_trajectory
+from kiteline_hw.sources.recording import (
+    Recording,
+    Stamped,
+    frames_by_time,
+    image_size,
+    list_images,
+    sorted_trajectory,
+)
 from kiteline_hw.sources.text_files import listed_file, nanoseconds, pose_from_tum, read_rows, read_tum_poses
 
 _CAMERA_KEYS = (
@@ -116,11 +122,7 @@ def _read_frames(images: list[Stamped], report: SourceReport) -> Iterator[Encode
         for t, path in images[0]:
             yield EncodedFrame(t, ImageFile(path))
         return
-    sides = [[(t, side, path) for t, path in listed] for side, listed in enumerate(images)]
-    tolerance_ns = pair_tolerance_ns(np.array([t for t, _ in images[0]], np.int64))
-    merged = heapq.merge(*sides, key=lambda item: item[0])
-    for t, left, right in pair_by_time(merged, tolerance_ns, ("left image", "right image"), report):
-        yield EncodedFrame(t, ImageFile(left), None if right is None else ImageFile(right))
+    yield from frames_by_time(*images, report)
 
 
 def _read_imu(path: Path, report: SourceReport) -> ImuSamples:

@@ -8,8 +8,6 @@ numbers that vary in their names.
 """
 
 import glob
-import heapq
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -17,12 +15,10 @@ import numpy as np
 from kiteline_core.geometry.cameras import CameraRig, Lens
 from kiteline_hw.calibration.checks import checked_baseline
 from kiteline_hw.calibration.file_calibration import FileCalibration
-from kiteline_hw.ports import SourceError, SourceReport
-from kiteline_hw.sensors.frames import EncodedFrame, pair_by_time, pair_tolerance_ns
+from kiteline_hw.ports import SourceError
 from kiteline_hw.sensors.image_names import in_natural_order, pair_keys
-from kiteline_hw.sensors.images import ImageFile
 from kiteline_hw.sources.calibration import camera_from_yaml
-from kiteline_hw.sources.recording import Recording, Stamped, frames_by_key, image_size
+from kiteline_hw.sources.recording import Recording, Stamped, frames_by_key, frames_by_time, image_size
 from kiteline_hw.sources.text_files import read_yaml, seconds_to_ns, yaml_number
 
 _UNSTAMPED_HZ = 10.0  # rate of images whose names are no stamps
@@ -67,7 +63,7 @@ def _recording(pattern: str, rig: CameraRig, sides: list[list[Path]], rate_hz: f
     stamped = [_stamped(side) for side in sides]
     times = [t for t, _ in stamped[0]]
     if rights and all(stamped):
-        return Recording(name, rig, len(lefts), lambda report: _pairs_by_time(stamped[0], stamped[1], report))
+        return Recording(name, rig, len(lefts), lambda report: frames_by_time(*stamped, report))
     if not times:
         if not rate_hz > 0:
             raise SourceError(f"rate_hz is {rate_hz:g}: expected images a second")
@@ -86,13 +82,6 @@ def _first_mismatch(lefts: list[Path], rights: list[Path]) -> str:
     both = zip(lefts, rights, strict=False)
     left, right = next((pair for pair in both if pair[0].name != pair[1].name), (lefts[0], rights[0]))
     return f"first {left.name} and {right.name}"
-
-
-def _pairs_by_time(lefts: Stamped, rights: Stamped, report: SourceReport) -> Iterator[EncodedFrame]:
-    merged = heapq.merge(*([(t, side, path) for t, path in files] for side, files in enumerate((lefts, rights))))
-    tolerance_ns = pair_tolerance_ns(np.array([t for t, _ in lefts], np.int64))
-    for t, left, right in pair_by_time(merged, tolerance_ns, ("left image", "right image"), report):
-        yield EncodedFrame(t, ImageFile(left), None if right is None else ImageFile(right))
 
 
 def _list_files(pattern: str) -> list[Path]:

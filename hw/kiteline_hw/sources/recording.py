@@ -1,5 +1,6 @@
 """A FrameSource over files on disk: what the readers of data set folders return."""
 
+import heapq
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,7 +11,7 @@ from kiteline_core.arrays import F64
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration, Trajectory
 from kiteline_core.geometry.cameras import CameraRig
 from kiteline_hw.ports import SourceError, SourceReport
-from kiteline_hw.sensors.frames import EncodedFrame, decode_frames
+from kiteline_hw.sensors.frames import EncodedFrame, decode_frames, pair_by_time, pair_tolerance_ns
 from kiteline_hw.sensors.image_names import Keys, in_natural_order
 from kiteline_hw.sensors.images import ImageFile, decode_grey
 from kiteline_hw.sensors.imu_buffer import ImuSamples, NoImu
@@ -71,6 +72,14 @@ def frames_by_key(
         yield EncodedFrame(t, ImageFile(left), None if right is None else ImageFile(right))
     for path in by_key.values():
         report.skip("missing left image", f"{path.name} has no partner")
+
+
+def frames_by_time(lefts: Stamped, rights: Stamped, report: SourceReport) -> Iterator[EncodedFrame]:
+    """Frames of left and right images, paired by their stamps; a left image without a partner comes alone."""
+    sides = ([(t, side, path) for t, path in images] for side, images in enumerate((lefts, rights)))
+    tolerance_ns = pair_tolerance_ns(np.array([t for t, _ in lefts], np.int64))
+    for t, left, right in pair_by_time(heapq.merge(*sides), tolerance_ns, ("left image", "right image"), report):
+        yield EncodedFrame(t, ImageFile(left), None if right is None else ImageFile(right))
 
 
 def image_size(images: list[Path]) -> tuple[int, int]:
