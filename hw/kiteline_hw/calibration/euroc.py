@@ -38,10 +38,7 @@ def read_camera(node: Node) -> FilePart:
     if "camera_model" in node.keys and node.get("camera_model").text() != "pinhole":
         raise node.get("camera_model").error("pinhole")
     fx, fy, cx, cy = node.get("intrinsics").numbers((4,), "4 numbers fx, fy, cx, cy")
-    sides = node.get("resolution")
-    sides.numbers((2,), "width and height in px")
-    assert isinstance(sides.value, list)
-    width, height = (Node(node.path, sides.key, side).pixels() for side in sides.value)
+    width, height = node.get("resolution").size()
     name = node.get("distortion_model").text() if "distortion_model" in node.keys else ""
     d = node.get("distortion_coefficients")
     values = d.numbers((), "a list of numbers") if d.value is not None or names_lens(name) else []

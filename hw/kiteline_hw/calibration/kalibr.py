@@ -108,10 +108,7 @@ def _camera(table: Node) -> CameraModel:
     if model != "pinhole":
         raise table.get("camera_model").error("pinhole (with radtan, equidistant or no distortion)")
     fx, fy, cx, cy = table.get("intrinsics").numbers((4,), "4 numbers fx, fy, cx, cy")
-    sides = table.get("resolution")
-    sides.numbers((2,), "width and height in px")
-    assert isinstance(sides.value, list)
-    width, height = (Node(table.path, sides.key, side).pixels() for side in sides.value)
+    width, height = table.get("resolution").size()
     name = table.get("distortion_model").text() if "distortion_model" in table.keys else "none"
     told = "distortion_coeffs" in table.keys or names_lens(name)
     d = table.get("distortion_coeffs").numbers((), "a list of numbers") if told else []

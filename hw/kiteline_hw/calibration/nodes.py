@@ -82,6 +82,13 @@ class Node:
             raise self.error(f"{expected}, all finite")
         return values
 
+    def size(self) -> tuple[int, int]:
+        """A list of width and height of an image in px."""
+        if not isinstance(self.value, list) or len(self.value) != 2:
+            raise self.error("width and height in px")
+        width, height = (Node(self.path, self.key, side).pixels() for side in self.value)
+        return width, height
+
     def rows(self, rows: int, columns: int) -> F64:
         """A matrix written as a list of rows."""
         expected = f"{rows} rows of {columns} numbers"

@@ -4,17 +4,14 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from kiteline_core.geometry.cameras import CameraRig, Lens
-from kiteline_hw.calibration.checks import checked_baseline
+from kiteline_core.geometry.cameras import CameraRig
 from kiteline_hw.calibration.file_calibration import FileCalibration
 from kiteline_hw.calibration.files import read_calibration
 from kiteline_hw.calibration.nodes import read_nodes
 from kiteline_hw.ports import SourceError
-from kiteline_hw.sources.calibration import camera_from_yaml
+from kiteline_hw.sources.calibration import rig_from_yaml
 from kiteline_hw.sources.open import open_source
-from kiteline_hw.sources.text_files import read_yaml, yaml_number
+from kiteline_hw.sources.text_files import read_yaml
 from kiteline_hw.system.process import home_path
 
 CALIBRATIONS = ("camera.yaml", "/etc/kiteline/camera.yaml")  # looked for where no calibration is named
@@ -91,15 +88,9 @@ def read_rig(scheme: str, options: LiveOptions, *, stereo: bool, given: FileCali
             recorded.close()
     if "fx" not in read_nodes(path).keys:
         return read_rig(scheme, options, stereo=stereo, given=read_calibration(str(path)))
+    otherwise = (
+        "; a pair with lenses is told by a recording with its calibration (calibration=euroc:DIR or "
+        "calibration=FILE.mcap)"
+    )
     table = read_yaml(path, "fx, fy, cx, cy, width, height")
-    camera = camera_from_yaml(table, path)
-    if not stereo:
-        return CameraRig(camera, None, np.eye(4), None, has_body=False)
-    if camera.lens is not Lens.NONE:
-        raise SourceError(
-            f"{path}: a pair in a camera.yaml must be rectified already: expected no k1 k2 p1 p2 k3; a pair with "
-            "lenses is told by a recording with its calibration (calibration=euroc:DIR or calibration=FILE.mcap)"
-        )
-    T_c_r = np.eye(4)
-    T_c_r[0, 3] = yaml_number(table, "baseline_m", path)
-    return CameraRig(camera, camera, np.eye(4), checked_baseline(T_c_r, f"{path}: baseline_m"), has_body=False)
+    return rig_from_yaml(table, path, stereo=stereo, otherwise=otherwise)

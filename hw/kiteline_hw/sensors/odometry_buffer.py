@@ -71,5 +71,5 @@ def reported_covariance(diagonal: F64, sigma: float) -> F64:
     One that it does not know (0 or below, not finite) becomes sigma^2, and a huge one UNMEASURED.
     """
     unknown = ~np.isfinite(diagonal) | (diagonal <= 0.0)
-    out = np.where(unknown, sigma * sigma, np.where(unknown, 1.0, diagonal))
+    out = np.where(unknown, sigma * sigma, diagonal)
     return np.diag(np.where(out >= _UNMEASURED_FROM, UNMEASURED, out))

@@ -12,12 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
-from kiteline_core.geometry.cameras import CameraRig, Lens
-from kiteline_hw.calibration.checks import checked_baseline
+from kiteline_core.geometry.cameras import CameraRig
 from kiteline_hw.calibration.file_calibration import FileCalibration
 from kiteline_hw.ports import SourceError
 from kiteline_hw.sensors.image_names import in_natural_order, pair_keys
-from kiteline_hw.sources.calibration import camera_from_yaml
+from kiteline_hw.sources.calibration import rig_from_yaml
 from kiteline_hw.sources.recording import Recording, Stamped, frames_by_key, frames_by_time, image_size
 from kiteline_hw.sources.text_files import read_yaml, seconds_to_ns, yaml_number
 
@@ -45,15 +44,7 @@ def open_source(pattern: str, mono: bool, imu: bool, given: FileCalibration | No
             "or --calibration FILE; `kiteline calibrate` makes one"
         )
     table = read_yaml(path, "fx, fy, cx, cy, width, height")
-    camera = camera_from_yaml(table, path)
-    right = T_c_r = None
-    if len(sides) == 2:
-        if camera.lens is not Lens.NONE:
-            raise SourceError(f"{path}: a pair by pattern must be rectified already: expected no k1 k2 p1 p2 k3")
-        right, T_c_r = camera, np.eye(4)
-        T_c_r[0, 3] = yaml_number(table, "baseline_m", path)
-        checked_baseline(T_c_r, f"{path}: baseline_m")
-    rig = CameraRig(camera, right, np.eye(4), T_c_r, has_body=False)
+    rig = rig_from_yaml(table, path, stereo=len(sides) == 2)
     return _recording(pattern, rig, sides, yaml_number(table, "rate_hz", path, _UNSTAMPED_HZ))
 
 
