@@ -17,19 +17,18 @@ LABEL_COLOURS: U8 = np.array([[150, 150, 150], [88, 160, 96], [214, 96, 60]], np
 _VERTEX = np.dtype([("xyz", "<f4", 3), ("rgb", "u1", 3), ("label", "u1"), ("observations", "<u2")])
 
 
-def map_ply(points: F64, labels: U8, observations: I64, colours: U8 | None = None, *, metric: bool = True) -> bytes:
+def map_ply(points: F64, labels: U8, observations: I64, *, metric: bool = True) -> bytes:
     """Map points as a binary PLY. points: (n,3) in w, m or, if not metric, in the map's own unit.
 
-    labels: (n,) 0 unlabelled, 1 ground, 2 obstacle.
-    observations: (n,) how many keyframes see each point. colours: (n,3) RGB; by label when not given. Raises ValueError
-    when the lengths differ.
+    labels: (n,) 0 unlabelled, 1 ground, 2 obstacle. observations: (n,) how many keyframes see each point. Raises
+    ValueError when the lengths differ.
     """
     n = len(points)
-    if len(labels) != n or len(observations) != n or (colours is not None and len(colours) != n):
+    if len(labels) != n or len(observations) != n:
         raise ValueError(f"{n} points, {len(labels)} labels, {len(observations)} observation counts: want one a point")
     vertex = np.zeros(n, _VERTEX)
     vertex["xyz"] = points
-    vertex["rgb"] = LABEL_COLOURS[np.minimum(labels, 2)] if colours is None else colours
+    vertex["rgb"] = LABEL_COLOURS[np.minimum(labels, 2)]
     vertex["label"] = labels
     vertex["observations"] = np.minimum(observations, 65535)
     unit = "metres" if metric else "own unit of length"
@@ -49,17 +48,14 @@ def tum(t_ns: I64, poses: F64) -> bytes:
     return "".join(line(int(t), pose) for t, pose in zip(t_ns, poses, strict=True)).encode()
 
 
-def g2o(
-    keyframes: I64, poses: F64, edges: I64, weights: F64 | None = None, scale: F64 | None = None
-) -> bytes:  # fmt: skip
+def g2o(keyframes: I64, poses: F64, edges: I64, scale: F64 | None = None) -> bytes:
     """A pose graph for g2o and its readers. keyframes: (n,) ids. poses: (n,4,4) T_w_k. edges: (e,2) rows of poses.
 
     Vertices are numbered by row, for many readers hold 32 bits only; a comment names each keyframe. An edge
-    measures the relative pose as it stands. weights: (e,) of the edges' information, else 1. The first vertex is fixed.
+    measures the relative pose as it stands, with the information 1. The first vertex is fixed.
     scale: (n,) units of w in one of those in which a keyframe's agent measures; the comment tells it where it is not 1.
     """
     scale = np.ones(len(keyframes)) if scale is None else scale
-    weights = np.ones(len(edges)) if weights is None else weights
     lines = [
         f"# vertex {i} is keyframe {k}{'' if s == 1.0 else f', scale {s:.9g}'}\n"
         for i, (k, s) in enumerate(zip(keyframes, scale, strict=True))
@@ -67,9 +63,9 @@ def g2o(
     lines += [f"VERTEX_SE3:QUAT {i} {_pose_text(pose)}\n" for i, pose in enumerate(poses)]
     if len(poses):
         lines.append("FIX 0\n")
-    for (a, b), weight in zip(edges, weights, strict=True):
-        upper = " ".join(f"{weight if i == j else 0.0:.9g}" for i in range(6) for j in range(i, 6))
-        lines.append(f"EDGE_SE3:QUAT {a} {b} {_pose_text(se3.inverse(poses[a]) @ poses[b])} {upper}\n")
+    information = " ".join(str(int(i == j)) for i in range(6) for j in range(i, 6))
+    for a, b in edges:
+        lines.append(f"EDGE_SE3:QUAT {a} {b} {_pose_text(se3.inverse(poses[a]) @ poses[b])} {information}\n")
     return "".join(lines).encode()
 
 

@@ -6,8 +6,6 @@ from pathlib import Path
 
 import numpy as np
 
-from kiteline_agent.config import AgentConfig
-from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.grid.placed_map import placed_map
 from kiteline_basestation.runtime.flight_summary import keyframe_poses
 from kiteline_basestation.runtime.map_files import map_files
@@ -46,15 +44,14 @@ class FlownGrid:
 
 
 def fly_grid(
-    bench: Bench, name: str, recording: Recording, agent: AgentConfig | None = None, base: BaseConfig | None = None,
-    bytes_s: tuple[int, int] = (0, 0), channels: Callable[[RecordChannel], RecordChannel] | None = None,
+    bench: Bench, name: str, recording: Recording, channels: Callable[[RecordChannel], RecordChannel] | None = None
 ) -> FlownGrid:  # fmt: skip
     """Fly a recording, in lock-step in this process, and write the base's grid into the bench's folder.
 
     channels: wraps the two ends of the link.
     """
     bench.say(f"flying {name}")
-    run = fly_recording(recording, agent, base, bytes_s, channels=channels)
+    run = fly_recording(recording, channels=channels)
     mapper = run.station.mapper
     folder = bench.folder / "grids" / name.replace(", ", "_").replace(" ", "_")
     folder.mkdir(parents=True, exist_ok=True)

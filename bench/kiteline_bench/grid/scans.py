@@ -93,9 +93,9 @@ def grid_config(scans: Iterable[PosedScan]) -> GridConfig:
     return replace(GridConfig(), ground_m=float(np.median(known)) if len(known) else 0.0)
 
 
-def drawn(scans: Sequence[PosedScan], bf_px_m: float, config: GridConfig | None = None) -> ScanGrid:
+def drawn(scans: Sequence[PosedScan], bf_px_m: float) -> ScanGrid:
     """The base's grid of scans at their true poses, numbered in their order."""
-    config = config or grid_config(scans)
+    config = grid_config(scans)
     grid = ScanGrid(config)
     for k, posed in enumerate(scans):
         kept = keep(config, posed.scan, bf_px_m)

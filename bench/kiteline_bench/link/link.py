@@ -24,6 +24,7 @@ from kiteline_lab.flights.processes import free_endpoint
 TITLE = "The thin link"
 
 _FLIGHT = "room_flight.mcap"
+_TELEMETRY_S = 120  # s over which the telemetry's delay is measured
 
 
 def run(bench: Bench) -> list[Bar]:
@@ -146,7 +147,7 @@ def _tunnel(reference: Reference) -> list[Bar]:
     ]
 
 
-def telemetry_p95_ms(rate_bytes_s: int, seconds: int = 120) -> tuple[float, float]:
+def telemetry_p95_ms(rate_bytes_s: int) -> tuple[float, float]:
     """p95 of the telemetry's delay in ms, and B/s of packets that arrive, with as much traffic as the rate allows."""
     draw = random.Random(2)
     controller = RoutingController(None, TelemetryConfig(bytes_s=500))
@@ -155,7 +156,7 @@ def telemetry_p95_ms(rate_bytes_s: int, seconds: int = 120) -> tuple[float, floa
     to_a: list[bytes] = []
     to_b: list[bytes] = []
     arrived = 0
-    for tick in range(seconds * 100):
+    for tick in range(_TELEMETRY_S * 100):
         now_ns = tick * 10_000_000
         for end, incoming in ((a, to_a), (b, to_b)):
             for message in incoming:
@@ -165,7 +166,7 @@ def telemetry_p95_ms(rate_bytes_s: int, seconds: int = 120) -> tuple[float, floa
                 pass
         out = (a.poll(now_ns), b.poll(now_ns)) if rate_bytes_s else ([], [])
         to_a, to_b = controller.step(*out, now_ns)
-    return float(np.percentile(controller.up.telemetry_delay_ns, 95)) / 1e6, arrived / seconds
+    return float(np.percentile(controller.up.telemetry_delay_ns, 95)) / 1e6, arrived / _TELEMETRY_S
 
 
 def _outage(bench: Bench) -> list[Bar]:

@@ -14,6 +14,7 @@ from kiteline_core.geometry.cameras import RectifiedCamera
 _R_B_C = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 LOOP_M = 60.0
 _STEP_M = 0.1  # between two frames: 1 m/s at 10 Hz
+_POINTS = 900
 _NEAR_M, _FAR_M = 0.5, 60.0
 _GROSS_PX = 200.0  # largest error of a wrong match along each axis; half of them fall on other landmarks
 
@@ -57,13 +58,13 @@ def camera() -> RectifiedCamera:
     return RectifiedCamera(640, 480, 400.0, 400.0, 319.5, 239.5, 0.1, False, T_b_c)
 
 
-def loop(planar: bool, laps: float = 1.0, step_m: float = _STEP_M) -> F64:
+def loop(planar: bool, laps: float = 1.0) -> F64:
     """Body poses (n,4,4) along a rounded loop of 60 m; a drone climbs, sinks and leans in it. The first is I."""
-    n = round(laps * LOOP_M / step_m)
+    n = round(laps * LOOP_M / _STEP_M)
     radius = LOOP_M / (2.0 * np.pi)
     out = np.tile(np.eye(4), (n + 1, 1, 1))
     for k in range(n + 1):
-        angle = k * step_m / radius
+        angle = k * _STEP_M / radius
         lean = np.zeros(3) if planar else np.array([0.12 * np.sin(5 * angle), 0.10 * np.sin(7 * angle), 0.0])
         out[k, :3, :3] = se3.so3_exp(np.array([0.0, 0.0, angle])) @ se3.so3_exp(lean)
         height = 0.0 if planar else 1.5 * np.sin(3.0 * angle)
@@ -71,15 +72,15 @@ def loop(planar: bool, laps: float = 1.0, step_m: float = _STEP_M) -> F64:
     return np.asarray(se3.inverse(out[0]) @ out)
 
 
-def world(rng: np.random.Generator, count: int = 900) -> F64:
+def world(rng: np.random.Generator) -> F64:
     """Points (n,3) on both sides of the loop, a few of them far away."""
     radius = LOOP_M / (2.0 * np.pi)
-    angle = rng.uniform(0.0, 2.0 * np.pi, count)
-    side = np.where(rng.random(count) < 0.5, rng.uniform(2.0, 6.0, count), -rng.uniform(2.0, 7.0, count))
-    side = np.where(rng.random(count) < 0.1, rng.uniform(15.0, 45.0, count), side)
+    angle = rng.uniform(0.0, 2.0 * np.pi, _POINTS)
+    side = np.where(rng.random(_POINTS) < 0.5, rng.uniform(2.0, 6.0, _POINTS), -rng.uniform(2.0, 7.0, _POINTS))
+    side = np.where(rng.random(_POINTS) < 0.1, rng.uniform(15.0, 45.0, _POINTS), side)
     out = radius + side
     return np.stack(
-        [out * np.sin(angle), radius - out * np.cos(angle), rng.uniform(-1.5, 3.5, count)], axis=1
+        [out * np.sin(angle), radius - out * np.cos(angle), rng.uniform(-1.5, 3.5, _POINTS)], axis=1
     )  # fmt: skip
 
 

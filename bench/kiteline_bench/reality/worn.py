@@ -50,13 +50,13 @@ class _Pair:
         return self.worn.ate_m(path) / max(times * self.clean.ate_m(path), least_m)
 
 
-def recording(bench: Bench, scene: str, seed: int, rig: str, seconds: float = SECONDS) -> Recording:
+def recording(bench: Bench, scene: str, seed: int, rig: str) -> Recording:
     """A simulated flight, rendered unless the bench's folder has it."""
     path, first_s, step_s = _PATHS[scene]
     start_s = first_s + step_s * (seed % len(SEEDS))
     command = [
         scene, "--trajectory", bench.source(f"trajectories/{path}"), "--start", f"{start_s:g}", "--seconds",
-        f"{seconds:g}", "--seed", f"{seed}", "--rig", rig,
+        f"{SECONDS:g}", "--seed", f"{seed}", "--rig", rig,
     ]  # fmt: skip
     return load(str(render(bench, f"{scene}_{seed}_{rig}", command)[0]))
 

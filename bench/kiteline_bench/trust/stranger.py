@@ -21,6 +21,7 @@ from kiteline_lab.flights.processes import free_endpoint
 SECONDS = 30.0  # of flood by default
 BYTES_S = 50e6
 _AGENT_S = 200.0  # s that a flight may take, its start included
+_LONGEST_S = 60.0  # s that a word of a process is awaited
 _GROWN_MIB = 32.0
 _KEYFRAMES = re.compile(r"stopped: (\d+) keyframe")
 _FLOWN = re.compile(r"over: (\d+) frames: (\d+) tracked.*?; (\d+) keyframe")
@@ -45,10 +46,10 @@ class _Processes:
     def said(self, name: str) -> str:
         return (self.out / f"{name}.txt").read_text(errors="replace")
 
-    def until(self, name: str, text: str, seconds: float = 60.0) -> float:
-        """Seconds until a process has said a text; `seconds` if it did not."""
+    def until(self, name: str, text: str) -> float:
+        """Seconds until a process has said a text; _LONGEST_S if it did not."""
         begin_s = time.monotonic()
-        while text not in self.said(name) and time.monotonic() - begin_s < seconds:
+        while text not in self.said(name) and time.monotonic() - begin_s < _LONGEST_S:
             time.sleep(0.05)
         return time.monotonic() - begin_s
 

@@ -1,6 +1,6 @@
 """Requests of other programs over Zenoh: a server that queues them until the loop polls it, and a client.
 
-Key: kiteline/1/GROUP/SERVICE/VERB. The request is the payload, or else the selector's parameters; the reply or the
+Key: kiteline/1/default/SERVICE/VERB. The request is the payload, or else the selector's parameters; the reply or the
 error reply is a text.
 """
 
@@ -19,7 +19,8 @@ from kiteline_hw.links.zenoh_access import access_of_base
 from kiteline_hw.links.zenoh_session import close_session, direct, open_session, reason_of
 from kiteline_hw.ports import LinkError
 
-_GROUP = "kiteline/1/{}"
+_GROUP = "kiteline/1/default"
+_TIMEOUT_S = 10.0  # s in which a request must be answered
 _RETRY_S = 0.1  # s between two requests that nobody answered
 _MAX_WAITING = 64  # requests in the queue; more are refused
 _MOST_BYTES = 1 << 16  # of a request
@@ -34,11 +35,6 @@ class Question:
     text: str
 
 
-def prefix(service: str, group: str = "default") -> str:
-    """The key of a service, without its verb."""
-    return f"{_GROUP.format(group)}/{service}"
-
-
 class QueryServer:
     """Receives requests on a session, or on one of its own that listens on an endpoint. Raises LinkError."""
 
@@ -47,7 +43,7 @@ class QueryServer:
         logins: Mapping[str, str] | None = None,
     ) -> None:  # fmt: skip
         """logins: users and passwords without which nobody connects to the endpoint; None: anyone may."""
-        access = access_of_base(_GROUP.format("default"))
+        access = access_of_base(_GROUP)
         self._own_session = open_session(endpoint, "base", access=access, logins=logins) if session is None else None
         self._arrived: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._open: dict[int, Any] = {}
@@ -55,10 +51,10 @@ class QueryServer:
         used = self._own_session if session is None else session
         assert used is not None
         try:
-            self._queryable = used.declare_queryable(f"{prefix(service)}/*", direct(self._on_query), complete=True)
+            self._queryable = used.declare_queryable(f"{_GROUP}/{service}/*", direct(self._on_query), complete=True)
         except zenoh.ZError as error:
             self.close()
-            raise LinkError(f"cannot answer questions on {prefix(service)}: {reason_of(error)}") from error
+            raise LinkError(f"cannot answer questions on {_GROUP}/{service}: {reason_of(error)}") from error
 
     def _on_query(self, query: Any) -> None:
         with contextlib.suppress(Exception):  # one bad question must not end the service
@@ -111,24 +107,24 @@ def _reply(query: Any, ok: bool, text: str) -> None:
 
 
 def ask(
-    endpoint: str, service: str, verb: str, text: str, timeout_s: float = 10.0, logins: Mapping[str, str] | None = None
-) -> tuple[bool, str]:
+    endpoint: str, service: str, verb: str, text: str, logins: Mapping[str, str] | None = None
+) -> tuple[bool, str]:  # fmt: skip
     """Send a request, again until it is answered. Returns whether it succeeded, and the answer. Raises LinkError.
 
     logins: user and password, for a base that asks for them.
     """
-    deadline_s = time.monotonic() + timeout_s
+    deadline_s = time.monotonic() + _TIMEOUT_S
     try:
-        session = open_session(endpoint, "client", connect_timeout_s=0.0 if logins else timeout_s)
+        session = open_session(endpoint, "client", connect_timeout_s=0.0 if logins else _TIMEOUT_S)
     except LinkError:
         if not logins:
             raise
-        session = open_session(endpoint, "client", connect_timeout_s=timeout_s, logins=logins)
+        session = open_session(endpoint, "client", connect_timeout_s=_TIMEOUT_S, logins=logins)
     try:
         while (left_s := deadline_s - time.monotonic()) > 0.0:
             replies: queue.SimpleQueue[tuple[bool, str] | None] = queue.SimpleQueue()
             session.get(
-                f"{prefix(service)}/{verb}", direct(partial(_on_reply, replies), partial(replies.put, None)),
+                f"{_GROUP}/{service}/{verb}", direct(partial(_on_reply, replies), partial(replies.put, None)),
                 payload=text.encode(), encoding=zenoh.Encoding.APPLICATION_JSON, timeout=left_s,
             )  # fmt: skip
             with contextlib.suppress(queue.Empty):

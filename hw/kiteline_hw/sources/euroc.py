@@ -122,7 +122,7 @@ def _read_frames(images: list[Stamped], report: SourceReport) -> Iterator[Encode
         for t, path in images[0]:
             yield EncodedFrame(t, ImageFile(path))
         return
-    yield from frames_by_time(*images, report)
+    yield from frames_by_time(images[0], images[1], report)
 
 
 def _read_imu(path: Path, report: SourceReport) -> ImuSamples:

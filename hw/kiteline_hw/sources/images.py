@@ -54,7 +54,7 @@ def _recording(pattern: str, rig: CameraRig, sides: list[list[Path]], rate_hz: f
     stamped = [_stamped(side) for side in sides]
     times = [t for t, _ in stamped[0]]
     if rights and all(stamped):
-        return Recording(name, rig, len(lefts), lambda report: frames_by_time(*stamped, report))
+        return Recording(name, rig, len(lefts), lambda report: frames_by_time(stamped[0], stamped[1], report))
     if not times:
         if not rate_hz > 0:
             raise SourceError(f"rate_hz is {rate_hz:g}: expected images a second")
