@@ -1,13 +1,14 @@
 """Traffic of a link, from the logs of a flight: bytes in any second, delays of headers, gaps between poses."""
 
 from collections import deque
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
 from kiteline_agent.runtime import flight_log as agent_log
 from kiteline_basestation.runtime import flight_log as base_log
-from kiteline_codec.schema import KeyframeHeader, LivePose, WireError, messages
+from kiteline_codec.schema import KeyframeHeader, LivePose, Record, WireError, messages
 from kiteline_codec.transport.packet import parse
 from kiteline_hw.logs.mcap_log_read import LogReader
 from kiteline_hw.ports import SourceError
@@ -63,24 +64,27 @@ def arrivals(base_folder: Path, shift_ns: int, end_ns: int) -> tuple[list[float]
     """
     headers: dict[int, float] = {}
     poses_ns: list[int] = []
+    for now_ns, record in _headers_and_poses(base_folder):
+        if isinstance(record, KeyframeHeader):
+            headers.setdefault(record.keyframe, (now_ns + shift_ns - record.t_ns) / 1e9)
+        elif now_ns < end_ns:
+            poses_ns.append(now_ns)
+    gaps = [(b - a) / 1e9 for a, b in pairwise([*poses_ns, end_ns])] if poses_ns else []
+    return list(headers.values()), gaps
+
+
+def _headers_and_poses(base_folder: Path) -> Iterator[tuple[int, Record]]:
+    """Headers of keyframes and live poses of the first agent, with the time on the base's clock when they came."""
     with LogReader(base_folder / "log.mcap") as reader:
         for step in steps(reader):
-            now_ns = int(step.head["now_ns"])
             for packet in step.blobs(base_log.packets_in(0)):
                 try:
                     _, items = parse(packet, 1 << 20)
                 except WireError:
                     continue
                 for item in items:
-                    if item.key.kind not in (KeyframeHeader.KIND, LivePose.KIND) or not item.whole:
-                        continue
-                    record = messages.decode(item.key, item.data)
-                    if isinstance(record, KeyframeHeader):
-                        headers.setdefault(record.keyframe, (now_ns + shift_ns - record.t_ns) / 1e9)
-                    elif isinstance(record, LivePose) and now_ns < end_ns:
-                        poses_ns.append(now_ns)
-    gaps = [(b - a) / 1e9 for a, b in pairwise([*poses_ns, end_ns])] if poses_ns else []
-    return list(headers.values()), gaps
+                    if item.key.kind in (KeyframeHeader.KIND, LivePose.KIND) and item.whole:
+                        yield int(step.head["now_ns"]), messages.decode(item.key, item.data)
 
 
 def link_use(folder: Path, shift_ns: int, overhead_bytes: int) -> LinkUse:

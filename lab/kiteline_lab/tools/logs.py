@@ -10,6 +10,7 @@ from collections.abc import Iterable, Iterator
 from itertools import count, pairwise
 from pathlib import Path
 
+from mcap.records import Schema
 from mcap.writer import CompressionType, Writer
 
 from kiteline_hw.logs.mcap_file import McapFile, RawMessage
@@ -193,42 +194,61 @@ def _write(
     does what `begins` later than its file (in words; "" if it does not): it cannot be replayed.
     """
     written = 0
-    first_ns = min(file.first_ns for file in files)
-    schemas: dict[tuple[str, str, bytes], int] = {}
-    channels: dict[tuple[str, str, int, str], int] = {}
-    known: dict[tuple[int, int], int] = {}
     try:
         with path.open("wb") as stream:
             writer = Writer(stream, compression=CompressionType.ZSTD)
             writer.start("", "kiteline")
-            for file in files:
-                damage = {} if file.cut is None else {REPAIRED: file.cut}
-                if begins:
-                    damage[BEGINS] = begins
-                for record in file.metadata:
-                    facts = {**record.metadata, **damage}
-                    if file.first_ns > first_ns:
-                        facts.pop(BEGINS, None)  # it goes on where another part ends
-                    writer.add_metadata(record.name, facts)
+            _write_metadata(writer, files, begins)
+            channels = _Channels(writer, files, prefixes)
             for number, m in messages:
-                target = known.get((number, m.channel))
-                if target is None:
-                    file = files[number]
-                    channel, schema = file.channels[m.channel], file.schema_of(m.channel)
-                    schema_id = 0
-                    if schema is not None:
-                        key = (schema.name, schema.encoding, schema.data)
-                        if key not in schemas:
-                            schemas[key] = writer.register_schema(*key)
-                        schema_id = schemas[key]
-                    topic, notes = prefixes[number] + channel.topic, json.dumps(channel.metadata, sort_keys=True)
-                    name = (topic, channel.message_encoding, schema_id, notes)
-                    if name not in channels:
-                        channels[name] = writer.register_channel(*name[:3], channel.metadata)
-                    target = known[(number, m.channel)] = channels[name]
-                writer.add_message(target, m.log_ns, m.data, m.publish_ns, m.sequence)
+                writer.add_message(channels.number_of(number, m.channel), m.log_ns, m.data, m.publish_ns, m.sequence)
                 written += 1
             writer.finish()
     except OSError as error:
         raise SourceError(f"{path}: cannot be written: {error.strerror}") from error
     return written
+
+
+def _write_metadata(writer: Writer, files: list[McapFile], begins: str) -> None:
+    first_ns = min(file.first_ns for file in files)
+    for file in files:
+        damage = {} if file.cut is None else {REPAIRED: file.cut}
+        if begins:
+            damage[BEGINS] = begins
+        for record in file.metadata:
+            facts = {**record.metadata, **damage}
+            if file.first_ns > first_ns:
+                facts.pop(BEGINS, None)  # it goes on where another part ends
+            writer.add_metadata(record.name, facts)
+
+
+class _Channels:
+    """The channels of a new file, each added with its first message."""
+
+    def __init__(self, writer: Writer, files: list[McapFile], prefixes: list[str]) -> None:
+        self._writer, self._files, self._prefixes = writer, files, prefixes
+        self._schemas: dict[tuple[str, str, bytes], int] = {}
+        self._channels: dict[tuple[str, str, int, str], int] = {}
+        self._known: dict[tuple[int, int], int] = {}
+
+    def number_of(self, file: int, channel: int) -> int:
+        """The number here of a file's channel."""
+        if (file, channel) not in self._known:
+            self._known[file, channel] = self._register(self._files[file], channel, self._prefixes[file])
+        return self._known[file, channel]
+
+    def _register(self, file: McapFile, number: int, prefix: str) -> int:
+        channel = file.channels[number]
+        schema = self._schema(file.schema_of(number))
+        name = (prefix + channel.topic, channel.message_encoding, schema, json.dumps(channel.metadata, sort_keys=True))
+        if name not in self._channels:
+            self._channels[name] = self._writer.register_channel(*name[:3], channel.metadata)
+        return self._channels[name]
+
+    def _schema(self, schema: Schema | None) -> int:
+        if schema is None:
+            return 0
+        key = (schema.name, schema.encoding, schema.data)
+        if key not in self._schemas:
+            self._schemas[key] = self._writer.register_schema(*key)
+        return self._schemas[key]

@@ -1,5 +1,7 @@
 """A street along the paths: a road at their height, pavements, houses, parked cars, poles and trees."""
 
+from collections.abc import Callable
+
 import cv2
 import numpy as np
 
@@ -24,8 +26,9 @@ def build_street(points: F64, seed: int, bits: int) -> World:
     field, frame = ground_field(points)
     builder = Builder(rng, pool, points, CLEARANCE_M)
     along, sides = _stations(points)
-    _add_houses(builder, field, frame, along, sides)
-    _add_furniture(builder, field, frame, along, sides)
+    site = _Site(builder, field, frame)
+    _add_houses(builder, site, along, sides)
+    _add_furniture(site, along, sides)
     boxes, faces = builder.arrays()
     ground = np.stack(
         [
@@ -87,20 +90,32 @@ def _stations(points: F64) -> tuple[F64, F64]:
     return p[good], np.stack([-ahead[:, 1], ahead[:, 0]], 1)
 
 
-def _put_on_ground(
-    builder: Builder, field: F32, frame: F64, xy: F64, half: F64, yaw: float, faces: F64, lift: float = 0.0
-) -> bool:
-    """Add a box that stands on the ground, its bottom below the lowest ground under it; `lift` m higher if positive."""
-    reach = np.hypot(half[0], half[1]) * 0.7
-    around = xy + reach * np.array([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
-    height = bilinear(field[0], frame, around)
-    bottom = float(height[0]) + lift if lift > 0 else float(height.min()) - 0.1
-    top = float(height[0]) + lift + 2 * half[2]
-    size = np.array([half[0], half[1], 0.5 * (top - bottom)])
-    return builder.add(np.array([*xy, 0.5 * (top + bottom)]), size, yaw, faces)
+class _Site:
+    """The ground that boxes are put on."""
+
+    def __init__(self, builder: Builder, field: F32, frame: F64) -> None:
+        self._builder, self._field, self._frame = builder, field, frame
+        self.rng = builder.rng
+
+    def put(self, xy: F64, half: F64, yaw: float, faces: F64, lift: float = 0.0) -> bool:
+        """Add a box on the ground, its bottom below the lowest ground under it, or `lift` m above the ground.
+
+        False if it comes too near to a path.
+        """
+        reach = np.hypot(half[0], half[1]) * 0.7
+        around = xy + reach * np.array([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+        height = bilinear(self._field[0], self._frame, around)
+        bottom = float(height[0]) + lift if lift > 0 else float(height.min()) - 0.1
+        top = float(height[0]) + lift + 2 * half[2]
+        size = np.array([half[0], half[1], 0.5 * (top - bottom)])
+        return self._builder.add(np.array([*xy, 0.5 * (top + bottom)]), size, yaw, faces)
+
+    def faces(self, texture: str, contrast: float, brightness: float) -> F64:
+        """The six faces of a box of one material."""
+        return np.stack([self._builder.face(texture, contrast, brightness, False) for _ in range(6)])
 
 
-def _add_houses(builder: Builder, field: F32, frame: F64, along: F64, sides: F64) -> None:
+def _add_houses(builder: Builder, site: _Site, along: F64, sides: F64) -> None:
     """Add rows of houses on both sides, beyond the pavement and without overlap."""
     rng = builder.rng
     flat = along[:, :2]
@@ -126,63 +141,72 @@ def _add_houses(builder: Builder, field: F32, frame: F64, along: F64, sides: F64
             walls = np.tile(wall, (6, 1))
             walls[:, 2] = rng.uniform(0, 2048, 6)
             walls[4:] = builder.face("concrete", 0.5, 0.6, False)
-            _put_on_ground(builder, field, frame, xy, half, yaw, walls)
+            site.put(xy, half, yaw, walls)
             taken = np.vstack([taken, [*xy, half[0]]])
             if rng.random() < 0.8:  # a roof storey set back, of another material
                 attic = half * np.array([0.85, 0.7, 0.0]) + np.array([0.0, 0.0, rng.uniform(0.5, 1.4)])
-                roof = np.stack([builder.face("clutter", 0.5, 0.55, False) for _ in range(6)])
-                _put_on_ground(builder, field, frame, xy, attic, yaw, roof, lift=2 * half[2])
+                site.put(xy, attic, yaw, site.faces("clutter", 0.5, 0.55), lift=2 * half[2])
 
 
-def _add_furniture(builder: Builder, field: F32, frame: F64, along: F64, sides: F64) -> None:
-    """Add cars, poles, trees, hedges, bins and signs beside the road."""
-    rng = builder.rng
-
-    def faces(name: str, contrast: float, brightness: float) -> F64:
-        return np.stack([builder.face(name, contrast, brightness, False) for _ in range(6)])
-
+def _add_furniture(site: _Site, along: F64, sides: F64) -> None:
+    """Add cars, poles, trees, hedges, bins and signs on both sides of the road."""
     for sign in (-1.0, 1.0):
         i = 0
         while i < len(along):
             yaw = float(np.arctan2(-sides[i, 0], sides[i, 1]))
-            at, side = along[i, :2], sign * sides[i]
-            kind = rng.random()
-            if kind < 0.30:
-                half = rng.uniform([1.9, 0.8, 0.40], [2.4, 0.95, 0.55])
-                xy = at + side * rng.uniform(2.6, 3.1)
-                name = str(rng.choice(["clutter", "leaves", "concrete"]))
-                light = rng.uniform(0.35, 1.2)
-                if _put_on_ground(builder, field, frame, xy, half, yaw, faces(name, 0.35, light)):
-                    cabin = np.array([0.55 * half[0], 0.9 * half[1], 0.3])
-                    _put_on_ground(builder, field, frame, xy, cabin, yaw, faces("facade2", 0.5, 0.5), lift=2 * half[2])
-                i += int(rng.integers(11, 30))
-            elif kind < 0.50:
-                width = rng.uniform(0.06, 0.14)
-                half = np.array([width, width, rng.uniform(1.5, 4.0)])
-                xy = at + side * rng.uniform(4.2, 5.6)
-                if (
-                    _put_on_ground(builder, field, frame, xy, half, yaw, faces("concrete", 0.5, 0.7))
-                    and rng.random() < 0.6
-                ):
-                    board = np.array([0.04, rng.uniform(0.25, 0.6), rng.uniform(0.2, 0.5)])
-                    _put_on_ground(builder, field, frame, xy, board, yaw, faces("posters", 0.7, 1.1), lift=2 * half[2])
-                i += int(rng.integers(8, 24))
-            elif kind < 0.80:
-                trunk = np.array([0.15, 0.15, rng.uniform(0.9, 1.6)])
-                xy = at + side * rng.uniform(5.2, 9.0)
-                if _put_on_ground(builder, field, frame, xy, trunk, yaw, faces("concrete", 0.7, 0.45)):
-                    for _ in range(4):  # a crown of turned blocks
-                        crown = rng.uniform([0.5, 0.5, 0.5], [1.3, 1.3, 1.2])
-                        where = xy + rng.normal(0, 0.5, 2)
-                        lift = 2 * trunk[2] + rng.uniform(-0.3, 1.2)
-                        _put_on_ground(
-                            builder, field, frame, where, crown, rng.uniform(0, 3), faces("foliage", 0.75, 0.6), lift
-                        )
-                i += int(rng.integers(8, 26))
-            else:
-                half = rng.uniform([0.3, 0.25, 0.4], [2.5, 0.5, 0.8])
-                name = str(rng.choice(["foliage", "posters", "clutter", "leaves"]))
-                _put_on_ground(
-                    builder, field, frame, at + side * rng.uniform(5.0, 7.0), half, yaw, faces(name, 0.6, 0.8)
-                )
-                i += int(rng.integers(6, 20))
+            kind = site.rng.random()
+            add, gap = next((add, gap) for below, add, gap in _FURNITURE if kind < below)
+            add(site, along[i, :2], sign * sides[i], yaw)
+            i += int(site.rng.integers(*gap))
+
+
+def _add_car(site: _Site, at: F64, side: F64, yaw: float) -> None:
+    rng = site.rng
+    half = rng.uniform([1.9, 0.8, 0.40], [2.4, 0.95, 0.55])
+    xy = at + side * rng.uniform(2.6, 3.1)
+    name = str(rng.choice(["clutter", "leaves", "concrete"]))
+    if site.put(xy, half, yaw, site.faces(name, 0.35, rng.uniform(0.35, 1.2))):
+        cabin = np.array([0.55 * half[0], 0.9 * half[1], 0.3])
+        site.put(xy, cabin, yaw, site.faces("facade2", 0.5, 0.5), lift=2 * half[2])
+
+
+def _add_pole(site: _Site, at: F64, side: F64, yaw: float) -> None:
+    """A pole, on most of them a sign."""
+    rng = site.rng
+    width = rng.uniform(0.06, 0.14)
+    half = np.array([width, width, rng.uniform(1.5, 4.0)])
+    xy = at + side * rng.uniform(4.2, 5.6)
+    if site.put(xy, half, yaw, site.faces("concrete", 0.5, 0.7)) and rng.random() < 0.6:
+        board = np.array([0.04, rng.uniform(0.25, 0.6), rng.uniform(0.2, 0.5)])
+        site.put(xy, board, yaw, site.faces("posters", 0.7, 1.1), lift=2 * half[2])
+
+
+def _add_tree(site: _Site, at: F64, side: F64, yaw: float) -> None:
+    """A trunk with a crown of turned blocks."""
+    rng = site.rng
+    trunk = np.array([0.15, 0.15, rng.uniform(0.9, 1.6)])
+    xy = at + side * rng.uniform(5.2, 9.0)
+    if not site.put(xy, trunk, yaw, site.faces("concrete", 0.7, 0.45)):
+        return
+    for _ in range(4):
+        crown = rng.uniform([0.5, 0.5, 0.5], [1.3, 1.3, 1.2])
+        where = xy + rng.normal(0, 0.5, 2)
+        lift = 2 * trunk[2] + rng.uniform(-0.3, 1.2)
+        site.put(where, crown, rng.uniform(0, 3), site.faces("foliage", 0.75, 0.6), lift)
+
+
+def _add_low(site: _Site, at: F64, side: F64, yaw: float) -> None:
+    """A hedge, a bin or a box."""
+    rng = site.rng
+    half = rng.uniform([0.3, 0.25, 0.4], [2.5, 0.5, 0.8])
+    name = str(rng.choice(["foliage", "posters", "clutter", "leaves"]))
+    site.put(at + side * rng.uniform(5.0, 7.0), half, yaw, site.faces(name, 0.6, 0.8))
+
+
+# What stands beside the road: the draw in [0, 1) below which it is chosen, what adds it, and half metres to the next.
+_FURNITURE: tuple[tuple[float, Callable[[_Site, F64, F64, float], None], tuple[int, int]], ...] = (
+    (0.30, _add_car, (11, 30)),
+    (0.50, _add_pole, (8, 24)),
+    (0.80, _add_tree, (8, 26)),
+    (1.00, _add_low, (6, 20)),
+)

@@ -208,18 +208,23 @@ def posters(rng: Rng, side: int) -> F32:
         from_y, from_x = (np.arange(h) + sy) % side, (np.arange(w) + sx) % side
         image[np.ix_(ys, xs)] = base + contrast * source[np.ix_(from_y, from_x)]
         if source is tone:
-            row = 8
-            while row < h - 8:  # lines of words
-                size = int(rng.integers(2, 6))
-                column = 6
-                while column < w - 12:
-                    word = int(rng.integers(4, 18))
-                    if rng.random() < 0.85:
-                        cells = np.ix_(ys[row : row + size], xs[column : min(column + word, w - 6)])
-                        image[cells] = base - 55.0 + 12.0 * rng.standard_normal()
-                    column += word + int(rng.integers(2, 5))
-                row += size + int(rng.integers(3, 9))
+            _print_words(rng, image, ys, xs, base - 55.0)
     return np.asarray(image + 3.0 * pink(rng, side, 0.8), np.float32)
+
+
+def _print_words(rng: Rng, image: F32, ys: I64, xs: I64, ink: float) -> None:
+    """Print lines of words on a page of these rows and columns."""
+    row = 8
+    while row < len(ys) - 8:
+        size = int(rng.integers(2, 6))
+        column = 6
+        while column < len(xs) - 12:
+            word = int(rng.integers(4, 18))
+            if rng.random() < 0.85:
+                cells = np.ix_(ys[row : row + size], xs[column : min(column + word, len(xs) - 6)])
+                image[cells] = ink + 12.0 * rng.standard_normal()
+            column += word + int(rng.integers(2, 5))
+        row += size + int(rng.integers(3, 9))
 
 
 def asphalt(rng: Rng, side: int) -> F32:
