@@ -10,7 +10,6 @@ from kiteline_agent.governor.cost_model import PRICES_NS, cost_ns
 from kiteline_agent.governor.virtual_cpu import VirtualCpu
 from kiteline_bench.harness.recording import Recording
 from kiteline_bench.harness.run import FlyingAgent
-from kiteline_hw.system.cpu import process_cpu_ns
 
 _BEGIN_NS = 1_000_000_000  # at the start of a flight, in which no frame is skipped: the map begins
 _SKIPPED_NS = round(PRICES_NS["steps"])  # of a frame that is not tracked
@@ -72,9 +71,9 @@ def fly_limited(
         if passed_over:
             agent.drop(item)
             continue
-        cpu_ns = process_cpu_ns()
+        cpu_ns = time.process_time_ns()
         agent.step(item, cpu_ns=spent_ns)
-        spent_ns = process_cpu_ns() - cpu_ns if real else cost_ns(agent.box.work)
+        spent_ns = time.process_time_ns() - cpu_ns if real else cost_ns(agent.box.work)
         core.spend(spent_ns, t_ns)
         agent.run.cpu_ns[-1] = spent_ns
         if agent.run.estimates[-1] is not None and not real:

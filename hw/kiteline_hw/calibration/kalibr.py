@@ -8,7 +8,7 @@ from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraModel, Lens
-from kiteline_hw.calibration.checks import checked_camera, checked_readout, checked_rigid, names_lens, parse_lens
+from kiteline_hw.calibration.checks import checked_camera, checked_readout, names_lens, parse_lens
 from kiteline_hw.calibration.file_calibration import FileCalibration, FilePart
 from kiteline_hw.calibration.nodes import Node
 from kiteline_hw.ports import SourceError
@@ -38,11 +38,11 @@ def read_chain(node: Node) -> FilePart:
     tables = [node.get(name) for name in names]
     cameras = tuple(_camera(table) for table in tables)
     topics = tuple(t.get("rostopic").text() if "rostopic" in t.keys else "" for t in tables)
-    T_c_i = [_rigid(table.get("T_cam_imu")) if "T_cam_imu" in table.keys else None for table in tables]
+    T_c_i = [table.get("T_cam_imu").pose() if "T_cam_imu" in table.keys else None for table in tables]
     T_c_r = None
     if len(tables) == 2:
         if "T_cn_cnm1" in tables[1].keys:
-            T_c_r = se3.inverse(_rigid(tables[1].get("T_cn_cnm1")))
+            T_c_r = se3.inverse(tables[1].get("T_cn_cnm1").pose())
         elif T_c_i[0] is not None and T_c_i[1] is not None:
             T_c_r = T_c_i[0] @ se3.inverse(T_c_i[1])
     T_b_c = None if T_c_i[0] is None else se3.inverse(T_c_i[0])
@@ -53,7 +53,7 @@ def read_chain(node: Node) -> FilePart:
 def read_imu(node: Node) -> FilePart:
     """Noise densities of an IMU; those that the file lacks have their default. Raises SourceError."""
     table = node.get("imu0") if "imu0" in node.keys else node
-    if "T_i_b" in table.keys and not np.allclose(_rigid(table.get("T_i_b")), np.eye(4), atol=1e-9):
+    if "T_i_b" in table.keys and not np.allclose(table.get("T_i_b").pose(), np.eye(4), atol=1e-9):
         raise table.get("T_i_b").error("the identity: the body frame is that of the first IMU")
     imu = ImuCalibration(**imu_numbers(table, IMU_KEYS))
     where = str(node.path)
@@ -118,10 +118,6 @@ def _camera(table: Node) -> CameraModel:
     delay = table.get("line_delay").number("s between two rows") if "line_delay" in table.keys else 0.0
     readout_s = checked_readout(delay * height, where)
     return checked_camera(CameraModel(width, height, fx, fy, cx, cy, lens, coefficients, readout_s), where)
-
-
-def _rigid(node: Node) -> F64:
-    return checked_rigid(node.rows(4, 4), f"{node.path}: {node.key}")
 
 
 def _list(values: tuple[float, ...]) -> str:

@@ -11,6 +11,7 @@ import yaml
 
 from kiteline_core.arrays import F64
 from kiteline_core.errors import INPUT_FAULTS
+from kiteline_hw.calibration.checks import checked_rigid
 from kiteline_hw.ports import SourceError
 
 _MOST_BYTES = 1 << 16  # calibration files are a few kB
@@ -95,6 +96,10 @@ class Node:
         if not isinstance(self.value, list) or len(self.value) != rows:
             raise self.error(expected)
         return np.array([Node(self.path, self.key, row).numbers((columns,), expected) for row in self.value])
+
+    def pose(self) -> F64:
+        """A rigid motion (4,4) written as a list of rows."""
+        return checked_rigid(self.rows(4, 4), f"{self.path}: {self.key}")
 
     def matrix(self, shape: tuple[int, int] | None, expected: str) -> F64:
         """A matrix written as a table of rows, cols and data. shape: None for any."""

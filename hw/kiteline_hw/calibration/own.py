@@ -3,10 +3,9 @@
 import json
 from dataclasses import fields
 
-from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry.cameras import CameraModel
-from kiteline_hw.calibration.checks import checked_camera, checked_readout, checked_rigid, parse_lens
+from kiteline_hw.calibration.checks import checked_camera, checked_readout, parse_lens
 from kiteline_hw.calibration.file_calibration import FileCalibration, FilePart
 from kiteline_hw.calibration.kalibr import imu_numbers
 from kiteline_hw.calibration.nodes import Node
@@ -29,7 +28,7 @@ def read_own(node: Node) -> FilePart:
     if sides == ["right"]:
         raise node.get("left").error("the left camera")
     cameras = tuple(_camera(node.get(side)) for side in sides)
-    T_c_r, T_b_c = (_rigid(node.get(key)) if key in node.keys else None for key in ("T_c_r", "T_b_c"))
+    T_c_r, T_b_c = (node.get(key).pose() if key in node.keys else None for key in ("T_c_r", "T_b_c"))
     imu = ImuCalibration(**imu_numbers(node.get("imu"), _IMU_KEYS)) if "imu" in node.keys else None
     topics = tuple(node.get(s).get("topic").text() if "topic" in node.get(s).keys else "" for s in sides)
     where = str(node.path)
@@ -66,7 +65,3 @@ def _camera(table: Node) -> CameraModel:
     readout_s = table.get("readout_s").number("s of all rows") if "readout_s" in table.keys else 0.0
     readout_s = checked_readout(readout_s, where)
     return checked_camera(CameraModel(width, height, fx, fy, cx, cy, lens, coefficients, readout_s), where)
-
-
-def _rigid(node: Node) -> F64:
-    return checked_rigid(node.rows(4, 4), f"{node.path}: {node.key}")

@@ -11,7 +11,7 @@ from kiteline_hw.sources import kinds
 from kiteline_hw.sources.bags.bag_heads import MCAP_MAGIC, SQLITE_MAGIC, refuse_unreadable
 from kiteline_hw.sources.beside.odometry_file import with_odometry_file
 from kiteline_hw.sources.kinds import SourceKind
-from kiteline_hw.sources.overrides import with_calibration
+from kiteline_hw.sources.overrides import CalibratedView
 from kiteline_hw.system.process import home_path
 
 
@@ -44,7 +44,7 @@ def open_source(
     else:
         source = opener(argument, mono, imu, given) if kind.given and given.cameras else opener(argument, mono, imu)
         # a camera has nothing of its own that the given calibration is put over
-        source = with_calibration(source, given) if given.known and not is_live(source) else source
+        source = CalibratedView(source, given) if given.known and not is_live(source) else source
     if kind.argument == "DIR":
         return with_odometry_file(source, Path(argument))
     if kind.scheme == "images":

@@ -100,7 +100,12 @@ def with_other_imu(source: FrameSource, imu: ImuCalibration, T_b_c: F64 | None) 
     return _LiveOtherImuView(source, imu, T_b_c) if is_live(source) else _OtherImuView(source, imu, T_b_c)
 
 
-class _CalibratedView(SourceView):
+class CalibratedView(SourceView):
+    """With the cameras, extrinsics and IMU noise that are given. Raises SourceError if they do not fit the source.
+
+    Where the file says nothing of the body, the camera's place in it stays that of the source.
+    """
+
     def __init__(self, source: FrameSource, given: FileCalibration) -> None:
         super().__init__(source, mono=False, imu=True)
         rig = source.rig
@@ -130,11 +135,3 @@ def _check_size(given: CameraModel | None, found: CameraModel | None, where: str
             f"{where} is calibrated at {given.width}x{given.height} px, but {source} has {found.width}x{found.height}: "
             "calibrate at the size of the images"
         )
-
-
-def with_calibration(source: FrameSource, given: FileCalibration) -> FrameSource:
-    """A view with the cameras, extrinsics and IMU noise that are given. Raises SourceError if they do not fit it.
-
-    Where the file says nothing of the body, the camera's place in it stays that of the source.
-    """
-    return _CalibratedView(source, given)

@@ -1,4 +1,4 @@
-"""CPU time of this process, and a limit on processes by the kernel (cgroup v1 or v2)."""
+"""A limit on the CPU time of processes by the kernel (cgroup v1 or v2)."""
 
 import contextlib
 import math
@@ -14,11 +14,6 @@ from kiteline_hw.system.closing import Closing
 _PERIOD_US = 50_000  # us; a twentieth of the one-second window over which the limit must hold
 _MAX_PERIOD_US = 500_000  # us; for small limits, whose quota would fall below the minimum in a shorter period
 _MIN_QUOTA_US = 1_000  # us; the kernel accepts no less
-
-
-def process_cpu_ns() -> int:
-    """CPU time of this process over all its threads, user and system, ended threads included."""
-    return time.process_time_ns()
 
 
 class QuotaError(KitelineError):
