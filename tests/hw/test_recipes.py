@@ -9,6 +9,7 @@ import pytest
 
 from kiteline_core.frame import Frame
 from kiteline_hw.links import kinds as link_kinds
+from kiteline_hw.links.ends import LinkOptions
 from kiteline_hw.links.kinds import LinkKind, LinkTraits
 from kiteline_hw.links.open import open_link
 from kiteline_hw.mavlink import messages
@@ -100,7 +101,8 @@ def test_a_new_link(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     module = write_module(tmp_path, LINK, monkeypatch)
     kind = LinkKind("toy", "PLACE", "a toy", module, LinkTraits(3, "radio", thin=True))
     monkeypatch.setattr(link_kinds, "LINKS", (*link_kinds.LINKS, kind))
-    agent, hub = open_link("toy:here", "agent", 5), open_link("toy:here", "base", 5)
+    five = LinkOptions(5)
+    agent, hub = open_link("toy:here", "agent", five), open_link("toy:here", "base", five)
     assert agent.send(b"up") and hub.links()[5].send(b"down")
     assert hub.links()[5].receive() == [b"up"] and agent.receive() == [b"down"]
     assert link_kinds.link_traits("toy:here") == LinkTraits(3, "radio", thin=True)

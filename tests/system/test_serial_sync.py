@@ -7,6 +7,7 @@ from kiteline_codec.schema import Key, KeyframePose, NewLandmarks
 from kiteline_codec.sync.config import SyncConfig
 from kiteline_codec.sync.endpoint import Endpoint
 from kiteline_codec.transport.framing import StreamFramer
+from kiteline_hw.links.ends import LinkOptions
 from kiteline_hw.links.open import open_link
 from kiteline_hw.ports import ByteLink
 from kiteline_hw.sim.links.serial_pair import SerialPair
@@ -25,8 +26,8 @@ def test_endpoints_agree_over_a_noisy_serial_line() -> None:
     config = SyncConfig(packet_bytes=200, first_rto_ns=100_000_000)
     agent, base = Endpoint(config, 1), Endpoint(config, 1)
     with SerialPair(bit_errors=0.0005, seed=2) as pair:
-        up = open_link(f"serial:{pair.a}:57600", "agent", 1, framer=StreamFramer)
-        hub = open_link(f"serial:{pair.b}:57600", "base", 1, framer=StreamFramer)
+        up = open_link(f"serial:{pair.a}:57600", "agent", LinkOptions(1, StreamFramer))
+        hub = open_link(f"serial:{pair.b}:57600", "base", LinkOptions(1, StreamFramer))
         down = hub.links()[1]
         try:
             for i in range(60):

@@ -31,6 +31,7 @@ from kiteline_codec.transport.framing import StreamFramer
 from kiteline_codec.transport.seal import Direction, Opener, Sealer, suite_for
 from kiteline_codec.transport.seal_watch import SealWatch
 from kiteline_core.frame import ImuBatch, OdometryBatch
+from kiteline_hw.links.ends import LinkOptions
 from kiteline_hw.links.kinds import link_traits
 from kiteline_hw.links.open import open_link
 from kiteline_hw.links.sealed_link import SealedLink
@@ -85,10 +86,10 @@ def fly_live(
         stack.callback(runtime.close)
         clock = MonotonicClock()
         controller = controller_link(options, source, clock, stack)
+        logins = {} if key is None else login_of(options.agent, key)
         end = (None if controller is None else controller.tunnel_link()) or open_link(
-            options.link, "agent", options.agent, framer=StreamFramer, required=False,
-            logins=None if key is None else login_of(options.agent, key),
-        )  # fmt: skip
+            options.link, "agent", LinkOptions(options.agent, StreamFramer, required=False, logins=logins)
+        )
         stack.callback(end.close)
         base = _BaseEnd(options, end, key, numbers)
         if quota is not None:

@@ -22,6 +22,7 @@ from kiteline_codec.channel import CodedChannel
 from kiteline_codec.transport.framing import StreamFramer
 from kiteline_codec.transport.seal import Sealer
 from kiteline_core.ids import AgentId
+from kiteline_hw.links.ends import LinkOptions
 from kiteline_hw.links.kinds import link_traits
 from kiteline_hw.links.open import open_link
 from kiteline_hw.ports import LinkHub
@@ -54,8 +55,8 @@ def fly_live(options: BaseOptions, parent: process.Parent | None, stop: process.
         return True
     clock, closed = MonotonicClock(), list[bool]()
     with contextlib.ExitStack() as stack:
-        logins = logins_of(Path(options.key)) if options.paired_only else None
-        link = open_link(options.link, "base", framer=StreamFramer, required=False, logins=logins)
+        logins = logins_of(Path(options.key)) if options.paired_only else {}
+        link = open_link(options.link, "base", LinkOptions(framer=StreamFramer, required=False, logins=logins))
         stack.callback(link.close)
         seals = BaseSeals(options, link)
         page = _open_page(options, clock.now_ns(), stack)

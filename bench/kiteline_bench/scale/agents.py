@@ -21,6 +21,7 @@ from kiteline_codec.channel import CodedChannel, coded_channel
 from kiteline_codec.schema import KeyframePose, LivePose
 from kiteline_codec.sync.resumption import agent_session
 from kiteline_core.ids import AgentId, KeyframeId
+from kiteline_hw.links.ends import LinkOptions
 from kiteline_hw.links.kinds import link_traits
 from kiteline_hw.links.open import open_link
 from kiteline_hw.ports import ByteLink
@@ -127,7 +128,7 @@ def _serve(
     idle_share = _settled_share(base.pid)
     agents = [
         RecordedAgent(
-            flight, n, open_link(link, "agent", n),
+            flight, n, open_link(link, "agent", LinkOptions(n)),
             coded_channel(agent_session(1, n), link=replace(link_traits(link), profile="wifi")),
         )
         for n in range(count)

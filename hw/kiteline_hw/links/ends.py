@@ -10,14 +10,13 @@ from kiteline_hw.ports import ByteLink, Framer, link_messages
 class LinkOptions:
     """How one end of a link is opened.
 
-    agent: number of the agent at this end or, for a base on a serial line, at the other end. group: flights with
-    different group names on one network do not see each other (zenoh). framer: makes the framing of a byte stream
-    (serial). required: a port that cannot be opened is an error; else the link waits for it. logins: users and
-    passwords (zenoh): that of an agent, for bases that ask for one; those without which a base takes no connection.
+    agent: number of the agent at this end or, for a base on a serial line, at the other end. framer: makes the framing
+    of a byte stream (serial). required: a port that cannot be opened is an error; else the link waits for it. logins:
+    users and passwords (zenoh): that of an agent, for bases that ask for one; those without which a base takes no
+    connection.
     """
 
     agent: int = 0
-    group: str = "default"
     framer: Callable[[], Framer] | None = None
     required: bool = True
     logins: Mapping[str, str] = field(default_factory=dict)

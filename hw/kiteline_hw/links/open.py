@@ -1,35 +1,23 @@
 """Opens the links that users name: SCHEME:ADDRESS of the table in kinds.py."""
 
-from collections.abc import Callable, Mapping
 from importlib import import_module
 from typing import Literal, overload
 
 from kiteline_hw.links import kinds
 from kiteline_hw.links.ends import LinkOptions
-from kiteline_hw.ports import ByteLink, Framer, LinkError, LinkHub
+from kiteline_hw.ports import ByteLink, LinkError, LinkHub
+
+_PLAIN = LinkOptions()
 
 
 @overload
-def open_link(
-    spec: str, role: Literal["agent"], agent: int = ..., *,
-    group: str = ..., framer: Callable[[], Framer] | None = ..., required: bool = ...,
-    logins: Mapping[str, str] | None = ...,
-) -> ByteLink: ...  # fmt: skip
+def open_link(spec: str, role: Literal["agent"], options: LinkOptions = ...) -> ByteLink: ...
 @overload
-def open_link(
-    spec: str, role: Literal["base"], agent: int = ..., *,
-    group: str = ..., framer: Callable[[], Framer] | None = ..., required: bool = ...,
-    logins: Mapping[str, str] | None = ...,
-) -> LinkHub: ...  # fmt: skip
-def open_link(
-    spec: str, role: Literal["agent", "base"], agent: int = 0, *,
-    group: str = "default", framer: Callable[[], Framer] | None = None, required: bool = True,
-    logins: Mapping[str, str] | None = None,
-) -> ByteLink | LinkHub:  # fmt: skip
-    """Open one end of a link: a ByteLink for an agent, a LinkHub for a base. See LinkOptions. Raises LinkError."""
+def open_link(spec: str, role: Literal["base"], options: LinkOptions = ...) -> LinkHub: ...
+def open_link(spec: str, role: Literal["agent", "base"], options: LinkOptions = _PLAIN) -> ByteLink | LinkHub:
+    """Open one end of a link: a ByteLink for an agent, a LinkHub for a base. Raises LinkError."""
     module = import_module(kind_of(spec).module)
     address = spec.partition(":")[2]
-    options = LinkOptions(agent, group, framer, required, logins or {})
     end: ByteLink | LinkHub = (module.open_agent_end if role == "agent" else module.open_base_end)(address, options)
     return end
 

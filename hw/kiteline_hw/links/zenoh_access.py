@@ -3,7 +3,9 @@
 import time
 from typing import Any
 
-# Messages and keys below kiteline/1/GROUP. Nothing else passes, so that a base routes nothing between its clients: none
+PREFIX = "kiteline/1/default"  # of all keys
+
+# Messages and keys below PREFIX. Nothing else passes, so that a base routes nothing between its clients: none
 # reads what another sends, nor writes in the base's name. Tokens of an agent alone reach others.
 _FROM_CLIENTS = (
     (("put",), ("*/up",)),
@@ -23,11 +25,11 @@ _MOST_INSTANCES = 16  # that are remembered: strangers may announce any number
 _TOGETHER_S = 2.2  # s: longer than Zenoh remembers a process that died (the lease of a session)
 
 
-def access_of_base(prefix: str) -> dict[str, Any]:
-    """Zenoh's `access_control` of a base. prefix: kiteline/1/GROUP."""
+def access_of_base() -> dict[str, Any]:
+    """Zenoh's `access_control` of a base."""
     rules: list[dict[str, Any]] = [
         {"id": f"{flow}{i}", "permission": "allow", "flows": [flow], "messages": list(messages),
-         "key_exprs": [f"{prefix}/{key}" for key in keys]}
+         "key_exprs": [f"{PREFIX}/{key}" for key in keys]}
         for flow, allowed in (("ingress", _FROM_CLIENTS), ("egress", _TO_CLIENTS))
         for i, (messages, keys) in enumerate(allowed)
     ]  # fmt: skip

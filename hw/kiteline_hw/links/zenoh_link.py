@@ -1,6 +1,6 @@
 """Packets over Zenoh: the drone is a client, the base a peer that listens.
 
-Keys: kiteline/1/GROUP/AGENT/up and /down carry packets, /alive an agent's liveliness, kiteline/1/GROUP/base the base's.
+Keys below PREFIX: AGENT/up and AGENT/down carry packets, AGENT/alive an agent's liveliness, base the base's.
 A Zenoh put may block on a frozen peer, so packets go through a bounded outbox to a thread of their own and are dropped
 rather than waited for.
 """
@@ -18,7 +18,7 @@ import zenoh
 from kiteline_core.ids import MAX_AGENTS
 from kiteline_hw.links.ends import LinkOptions
 from kiteline_hw.links.queued_link import INBOX_BYTES, MOST_PACKET_BYTES, LinkCounters, QueuedLink
-from kiteline_hw.links.zenoh_access import Instances, access_of_base
+from kiteline_hw.links.zenoh_access import PREFIX, Instances, access_of_base
 from kiteline_hw.links.zenoh_session import (
     check_endpoint,
     close_session,
@@ -40,12 +40,6 @@ _LONGEST_SILENCE_S = 24.0
 _INBOXES_BYTES = 8 << 20  # memory for the packets of all agents: strangers may fill the inboxes of 256
 _JOIN_S = 0.3  # s for the sender thread to notice the end; it is a daemon and never keeps the process alive
 _EXIT_JOIN_S = 2.0  # s for the same at the end of the process, on a busy machine
-
-
-def _prefix(group: str) -> str:
-    if not group or any(c in group for c in "/*$#? "):
-        raise LinkError(f"group name {group!r} must be one word without any of / * $ # ?")
-    return f"kiteline/1/{group}"
 
 
 def _checked_agent(agent: int) -> int:
@@ -116,15 +110,12 @@ def _note_instance(instances: Instances, sample: Any) -> None:
 class ZenohLink(_PeerLink):
     """A drone's ByteLink. Connects and reconnects in the background; the constructor does not wait for a base."""
 
-    def __init__(
-        self, endpoint: str, agent: int, *, group: str = "default", logins: Mapping[str, str] | None = None
-    ) -> None:
+    def __init__(self, endpoint: str, agent: int, *, logins: Mapping[str, str] | None = None) -> None:
         """logins: user and password, for a base that asks for them."""
         super().__init__()
         self._logins, self._by_login = logins, False
         self._agent = _checked_agent(agent)
         self._endpoint = endpoint
-        self._prefix = _prefix(group)
         self._closed = threading.Event()
         self._silence_s = _SILENCE_S
         self._loses = endpoint.removeprefix("router/").startswith("udp/")  # declarations, too
@@ -198,7 +189,7 @@ class ZenohLink(_PeerLink):
                 _put(self, publisher, packet)
 
     def _declare(self, session: zenoh.Session) -> zenoh.Publisher:
-        key = f"{self._prefix}/{self._agent}"
+        key = f"{PREFIX}/{self._agent}"
         on_packet = _guarded(self.counters, self._on_packet)
         on_base = _guarded(self.counters, self.on_liveliness)
         self._declared = [
@@ -208,7 +199,7 @@ class ZenohLink(_PeerLink):
             session.liveliness().declare_subscriber(
                 f"{key}/alive/*", _guarded(self.counters, partial(_note_instance, self._instances)), history=True
             ),
-            session.liveliness().declare_subscriber(f"{self._prefix}/base", on_base, history=True),
+            session.liveliness().declare_subscriber(f"{PREFIX}/base", on_base, history=True),
         ]
         return _publisher(session, f"{key}/up")
 
@@ -242,25 +233,24 @@ class _AgentLink(_PeerLink):
 class ZenohHub(Closing):
     """The base's end: one ByteLink per agent, made when the agent appears. Raises LinkError if it cannot listen."""
 
-    def __init__(self, endpoint: str, *, group: str = "default", logins: Mapping[str, str] | None = None) -> None:
+    def __init__(self, endpoint: str, *, logins: Mapping[str, str] | None = None) -> None:
         """logins: users and passwords without which nobody connects; None: anyone may."""
-        self._prefix = prefix = _prefix(group)
         self._wake = threading.Condition()
         self._lock = threading.Lock()
         self._links: dict[int, _AgentLink] = {}
         self._closed = threading.Event()
         self.counters = LinkCounters()
-        self.session = open_session(endpoint, "base", access=access_of_base(prefix), logins=logins)
+        self.session = open_session(endpoint, "base", access=access_of_base(), logins=logins)
         on_packet, on_agent = _guarded(self.counters, self._on_packet), _guarded(self.counters, self._on_agent)
         try:
             liveliness = self.session.liveliness()
             self._declared: list[Any] = [
-                self.session.declare_subscriber(f"{prefix}/*/up", on_packet),
-                liveliness.declare_subscriber(f"{prefix}/*/alive", on_agent, history=True),
+                self.session.declare_subscriber(f"{PREFIX}/*/up", on_packet),
+                liveliness.declare_subscriber(f"{PREFIX}/*/alive", on_agent, history=True),
                 liveliness.declare_subscriber(
-                    f"{prefix}/*/alive/*", _guarded(self.counters, self._on_instance), history=True
+                    f"{PREFIX}/*/alive/*", _guarded(self.counters, self._on_instance), history=True
                 ),
-                liveliness.declare_token(f"{prefix}/base"),
+                liveliness.declare_token(f"{PREFIX}/base"),
             ]
         except zenoh.ZError as error:
             close_session(self.session)
@@ -274,7 +264,7 @@ class ZenohHub(Closing):
         with self._lock:
             link = self._links.get(agent)
             if link is None:
-                publisher = _publisher(self.session, f"{self._prefix}/{agent}/down")
+                publisher = _publisher(self.session, f"{PREFIX}/{agent}/down")
                 link = self._links[agent] = _AgentLink(self._wake, publisher)
                 for each in self._links.values():
                     each.inbox_limit = min(INBOX_BYTES, _INBOXES_BYTES // len(self._links))
@@ -332,10 +322,10 @@ class ZenohHub(Closing):
 def open_agent_end(address: str, options: LinkOptions) -> ZenohLink:
     """Connect to the base at an endpoint, in the background. Raises LinkError for one that is none."""
     check_endpoint(address)
-    return ZenohLink(address, options.agent, group=options.group, logins=options.logins)
+    return ZenohLink(address, options.agent, logins=options.logins)
 
 
 def open_base_end(address: str, options: LinkOptions) -> ZenohHub:
     """Listen on an endpoint. Raises LinkError."""
     check_endpoint(address)
-    return ZenohHub(address, group=options.group, logins=options.logins)
+    return ZenohHub(address, logins=options.logins)

@@ -15,11 +15,10 @@ from typing import Any
 
 import zenoh
 
-from kiteline_hw.links.zenoh_access import access_of_base
+from kiteline_hw.links.zenoh_access import PREFIX, access_of_base
 from kiteline_hw.links.zenoh_session import close_session, direct, open_session, reason_of
 from kiteline_hw.ports import LinkError
 
-_GROUP = "kiteline/1/default"
 _TIMEOUT_S = 10.0  # s in which a request must be answered
 _RETRY_S = 0.1  # s between two requests that nobody answered
 _MAX_WAITING = 64  # requests in the queue; more are refused
@@ -43,7 +42,7 @@ class QueryServer:
         logins: Mapping[str, str] | None = None,
     ) -> None:  # fmt: skip
         """logins: users and passwords without which nobody connects to the endpoint; None: anyone may."""
-        access = access_of_base(_GROUP)
+        access = access_of_base()
         self._own_session = open_session(endpoint, "base", access=access, logins=logins) if session is None else None
         self._arrived: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._open: dict[int, Any] = {}
@@ -51,10 +50,10 @@ class QueryServer:
         used = self._own_session if session is None else session
         assert used is not None
         try:
-            self._queryable = used.declare_queryable(f"{_GROUP}/{service}/*", direct(self._on_query), complete=True)
+            self._queryable = used.declare_queryable(f"{PREFIX}/{service}/*", direct(self._on_query), complete=True)
         except zenoh.ZError as error:
             self.close()
-            raise LinkError(f"cannot answer questions on {_GROUP}/{service}: {reason_of(error)}") from error
+            raise LinkError(f"cannot answer questions on {PREFIX}/{service}: {reason_of(error)}") from error
 
     def _on_query(self, query: Any) -> None:
         with contextlib.suppress(Exception):  # one bad question must not end the service
@@ -124,7 +123,7 @@ def ask(
         while (left_s := deadline_s - time.monotonic()) > 0.0:
             replies: queue.SimpleQueue[tuple[bool, str] | None] = queue.SimpleQueue()
             session.get(
-                f"{_GROUP}/{service}/{verb}", direct(partial(_on_reply, replies), partial(replies.put, None)),
+                f"{PREFIX}/{service}/{verb}", direct(partial(_on_reply, replies), partial(replies.put, None)),
                 payload=text.encode(), encoding=zenoh.Encoding.APPLICATION_JSON, timeout=left_s,
             )  # fmt: skip
             with contextlib.suppress(queue.Empty):

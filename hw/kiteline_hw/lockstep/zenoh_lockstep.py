@@ -14,6 +14,7 @@ from typing import Any
 
 import zenoh
 
+from kiteline_hw.links.zenoh_access import PREFIX
 from kiteline_hw.links.zenoh_session import close_session, direct, open_session, reason_of
 from kiteline_hw.ports import LinkError
 from kiteline_hw.system.closing import Closing
@@ -23,7 +24,7 @@ _RETRY_S = 0.05  # s between two looks for a base that is not there yet
 _REPEAT_S = (0.1, 2.0)  # s after which a message is repeated: before the first answer, and later
 _HEADER = struct.Struct("<IB")  # number of the message, and of an answer its kind
 _ANSWER, _REFUSAL = 0, 1
-_PREFIX = "kiteline/1/default/lockstep"
+_PREFIX = f"{PREFIX}/lockstep"
 
 
 class LockstepClient(Closing):

@@ -5,6 +5,7 @@ import time
 
 import pytest
 
+from kiteline_hw.links.ends import LinkOptions
 from kiteline_hw.links.open import open_link
 from kiteline_hw.ports import LinkError
 from kiteline_hw.sim.links.serial_pair import SerialPair
@@ -25,8 +26,8 @@ class Lines:
 
 
 def pass_one(base_spec: str, agent_spec: str) -> None:
-    hub = open_link(base_spec, "base", 3, framer=Lines)
-    agent = open_link(agent_spec, "agent", 3, framer=Lines)
+    hub = open_link(base_spec, "base", LinkOptions(3, Lines))
+    agent = open_link(agent_spec, "agent", LinkOptions(3, Lines))
     try:
         end_s = time.monotonic() + 8.0
         received: list[bytes] = []
@@ -78,7 +79,7 @@ def test_none() -> None:
 )
 def test_bad_names(spec: str, words: str, role: str) -> None:
     with pytest.raises(LinkError, match=words):
-        open_link(spec, role, framer=Lines)  # type: ignore[call-overload]
+        open_link(spec, role, LinkOptions(framer=Lines))  # type: ignore[call-overload]
 
 
 def test_serial_without_framing() -> None:

@@ -271,8 +271,6 @@ def test_an_endpoint_that_zenoh_would_try_in_vain_is_refused(endpoint: str, righ
         open_link(f"zenoh:{endpoint}" if endpoint else "zenoh:router/", "agent")
 
 
-def test_bad_numbers_and_names() -> None:
+def test_bad_numbers() -> None:
     with pytest.raises(LinkError, match="expected 0 to 255"):
         ZenohLink("tcp/127.0.0.1:1", 256)
-    with pytest.raises(LinkError, match="one word"):
-        ZenohLink("tcp/127.0.0.1:1", 1, group="a/b")
