@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -41,6 +42,14 @@ def imu_at(t_s: F64, haste: float, along: Callable[[float], F64] = path) -> ImuB
     return ImuBatch(np.round(t_s * 1e9).astype(np.int64), np.array(gyro), np.array(accel))
 
 
+@cache
+def taken(k: int, haste: float, along: Callable[[float], F64] = path) -> tuple[Frame, ImuBatch]:
+    """The k-th frame on the path `haste` times as fast, and the samples up to it."""
+    t_s = (k - 3) * 0.05
+    image = Frame(round(t_s * 1e9), room(along(3.0 + haste * (k - 3)))[0])
+    return image, imu_at(t_s - np.arange(9, -1, -1) * 0.005, haste, along)
+
+
 def test_an_imu_gives_metres_from_the_first_pose_on() -> None:
     near, far = plain_pair()
     config = AgentConfig(keyframe=KeyframeConfig(earlier=True))
@@ -49,9 +58,8 @@ def test_an_imu_gives_metres_from_the_first_pose_on() -> None:
     words: list[str] = []
     begin, end, haste = 4, 110, 1.7  # in full motion from the first frame on
     for k in range(begin, end):
-        t_s = (k - 3) * 0.05
-        image = Frame(round(t_s * 1e9), room(path(3.0 + haste * (k - 3)))[0])
-        output = one.step(StepInput(image, imu_at(t_s - np.arange(9, -1, -1) * 0.005, haste)), image.t_ns)
+        image, imu = taken(k, haste)
+        output = one.step(StepInput(image, imu), image.t_ns)
         assert output.estimate is not None
         estimates.append(output.estimate)
         words += output.events
@@ -97,31 +105,30 @@ def test_an_imu_gives_metres_from_the_first_pose_on() -> None:
     assert min(shared.values()) > 30  # corners as any keyframe has them, not only those that were followed
 
 
+@cache
+def fly_on_budget(cpu_percent: float) -> tuple[list[str], list[int], list[Estimate | None]]:
+    config = AgentConfig()
+    config = replace(config, governor=replace(config.governor, cpu_percent=cpu_percent))
+    one = Agent(RIG, ImuCalibration(), config, Identity(AgentId(0), 0), NoBaseChannel())
+    words: list[str] = []
+    costs: list[int] = []
+    estimates: list[Estimate | None] = []
+    for k in range(4, 190):
+        image, imu = taken(k, 1.7)
+        output = one.step(StepInput(image, imu, cpu_ns=costs[-1] if costs else 0), image.t_ns)
+        costs.append(cost_ns(one.work))
+        words += [word for word in output.events if word.startswith("mono")]
+        estimates.append(output.estimate)
+        if output.estimate is not None:
+            assert output.estimate.t_ns == image.t_ns  # none of a frame that waited
+    return words, costs, estimates
+
+
 @pytest.mark.parametrize("percent", [8.0, 30.0])
 def test_a_budget_delays_the_first_pose_and_nothing_else(percent: float) -> None:
     """The solution for the first map costs a tenth of a second and more: frames wait for it, and are tracked after."""
-
-    def fly(cpu_percent: float) -> tuple[list[str], list[int], list[Estimate | None]]:
-        config = AgentConfig()
-        config = replace(config, governor=replace(config.governor, cpu_percent=cpu_percent))
-        one = Agent(RIG, ImuCalibration(), config, Identity(AgentId(0), 0), NoBaseChannel())
-        words: list[str] = []
-        costs: list[int] = []
-        estimates: list[Estimate | None] = []
-        for k in range(4, 190):
-            t_s, haste = (k - 3) * 0.05, 1.7
-            image = Frame(round(t_s * 1e9), room(path(3.0 + haste * (k - 3)))[0])
-            imu = imu_at(t_s - np.arange(9, -1, -1) * 0.005, haste)
-            output = one.step(StepInput(image, imu, cpu_ns=costs[-1] if costs else 0), image.t_ns)
-            costs.append(cost_ns(one.work))
-            words += [word for word in output.events if word.startswith("mono")]
-            estimates.append(output.estimate)
-            if output.estimate is not None:
-                assert output.estimate.t_ns == image.t_ns  # none of a frame that waited
-        return words, costs, estimates
-
-    words, costs, estimates = fly(percent)
-    free, _, _ = fly(0.0)
+    words, costs, estimates = fly_on_budget(percent)
+    free, _, _ = fly_on_budget(0.0)
     assert words[0] == free[0] and words[0].startswith("mono: metric within")
     assert max(sum(costs[k : k + 20]) for k in range(len(costs) - 20)) <= percent * 1e7
     assert sum(e is not None and e.tracked for e in estimates[-20:]) > 3  # it has caught up
@@ -151,9 +158,7 @@ def test_images_alone_are_flown_where_the_imu_contradicts_them() -> None:
     estimates: list[Estimate] = []
     words: list[str] = []
     for k in range(begin, end):
-        t_s = (k - 3) * 0.05
-        image = Frame(round(t_s * 1e9), room(path(3.0 + haste * (k - 3)))[0])
-        imu = imu_at(t_s - np.arange(9, -1, -1) * 0.005, haste)
+        image, imu = taken(k, haste)
         turned = replace(imu, gyro=imu.gyro * [1.0, -1.0, -1.0], accel=imu.accel * [1.0, -1.0, -1.0])
         output = one.step(StepInput(image, turned), image.t_ns)
         assert output.estimate is not None
@@ -209,10 +214,8 @@ def test_an_imu_whose_samples_begin_late_gives_metres_to_the_map_that_is_tracked
     begin, samples, end, haste = 4, 100, 320, 1.7
     cpu_ns, metric = 0, 0
     for k in range(begin, end):
-        t_s = (k - 3) * 0.05
-        image = Frame(round(t_s * 1e9), room(swing(3.0 + haste * (k - 3)))[0])
-        imu = imu_at(t_s - np.arange(9, -1, -1) * 0.005, haste, swing) if k >= samples else None
-        output = one.step(StepInput(image, imu, cpu_ns=cpu_ns), image.t_ns)
+        image, imu = taken(k, haste, swing)
+        output = one.step(StepInput(image, imu if k >= samples else None, cpu_ns=cpu_ns), image.t_ns)
         cpu_ns = cost_ns(one.work)
         words += output.events
         if output.estimate is not None:  # a budget lets frames wait before there is a map

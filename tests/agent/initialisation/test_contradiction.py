@@ -27,13 +27,18 @@ from tests.agent.initialisation.window.test_window_bundle import CALIBRATION, PR
 Change = Callable[[CornerObservations, CutSamples], tuple[CornerObservations, CutSamples]]
 
 
-def start_with(monkeypatch: pytest.MonkeyPatch, change: Change, keyframes: int = 36) -> tuple[float, list[str]]:
-    """Seconds until a map begins (infinite if none does) on a changed window, and the warnings until then."""
+def start_with(monkeypatch: pytest.MonkeyPatch, change: Change) -> tuple[float, list[str]]:
+    """Seconds until a map begins (infinite if none does in 7) on a changed window, and the warnings until then.
+
+    A contradiction is told after half the usual time: each further window takes up to a second of CPU.
+    """
+    keyframes, config = 29, AgentConfig()
+    brief = replace(config.inertial_start, contradiction=replace(config.inertial_start.contradiction, lasts_s=2.5))
     corners, cut, _ = window(1, keyframes=keyframes, noise_px=0.2)
     corners, cut = change(corners, cut)
     monkeypatch.setattr(inertial_start, "window_points", lambda *_: SimpleNamespace(sigma_rho=np.ones(100)))
     monkeypatch.setattr(inertial_start, "realigned", lambda _keyframes, observations, *_: observations)
-    start = InertialStart(CAMERA, CALIBRATION, AgentConfig(), Work())
+    start = InertialStart(CAMERA, CALIBRATION, replace(config, inertial_start=brief), Work())
     start._tracks = Tracks(corners)  # type: ignore[assignment]
     monkeypatch.setattr(inertial_start, "WindowSamples", lambda *args: Recorded(cut, len(args[2])))
     monkeypatch.setattr(start, "_measured_noise", WindowNoise)
@@ -73,7 +78,7 @@ def in_degrees(corners: CornerObservations, cut: CutSamples) -> Any:
 
 def test_a_rig_as_calibrated_begins_a_map_and_warns_of_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     begun_s, warnings = start_with(monkeypatch, unchanged)
-    assert begun_s < 9.0
+    assert begun_s < 6.0
     assert warnings == []
 
 
