@@ -269,7 +269,7 @@ def _under_a_small_quota(source: str) -> tuple[LimitedFlight, list[LimitedFlight
     """A flight without and three with a governor, side by side, at about a quarter of the CPU time that they need."""
     usual_ms, percent = 5.3, 7.0  # of a machine on which this share of a core is about a quarter of the need
     # Rests as those between frames of so slow a flight: on some machines memory that rests becomes dear.
-    slower = float(np.median(yardstick_ms(source, rest_s=0.2, images=30))) / usual_ms
+    slower = float(np.median(yardstick_ms(source, rest_s=0.2, images=15))) / usual_ms
     percent *= min(max(1.0, slower), 3.5)  # more frames rest less: a higher share would be no limit
     options = ("quota", source, "--percent", f"{percent:.1f}", "--frames", "140")
     with ThreadPoolExecutor() as pool:  # each leaves a core nearly idle
