@@ -113,7 +113,7 @@ def fly_on_budget(cpu_percent: float) -> tuple[list[str], list[int], list[Estima
     words: list[str] = []
     costs: list[int] = []
     estimates: list[Estimate | None] = []
-    for k in range(4, 190):
+    for k in range(4, 150):
         image, imu = taken(k, 1.7)
         output = one.step(StepInput(image, imu, cpu_ns=costs[-1] if costs else 0), image.t_ns)
         costs.append(cost_ns(one.work))
@@ -151,7 +151,7 @@ def test_a_still_camera_with_an_imu_has_no_pose() -> None:
 
 def test_images_alone_are_flown_where_the_imu_contradicts_them() -> None:
     config = AgentConfig()
-    begin, end, haste = 4, 240, 0.8
+    begin, end, haste = 4, 180, 0.8
     start = config.inertial_start
     start = replace(start, contradiction=replace(start.contradiction, lasts_s=1.5, unsure_s=2.0))
     one = Agent(RIG, ImuCalibration(), replace(config, inertial_start=start), Identity(AgentId(0), 0), NoBaseChannel())
@@ -211,7 +211,7 @@ def test_an_imu_whose_samples_begin_late_gives_metres_to_the_map_that_is_tracked
     one = Agent(RIG, ImuCalibration(), config, Identity(AgentId(0), 0), near)
     flown: dict[int, Estimate] = {}
     words: list[str] = []
-    begin, samples, end, haste = 4, 100, 320, 1.7
+    begin, samples, end, haste = 4, 100, 270, 1.7
     cpu_ns, metric = 0, 0
     for k in range(begin, end):
         image, imu = taken(k, haste, swing)
