@@ -44,25 +44,33 @@ def texture(seed: int) -> U8:
 
 @cache
 def rays() -> F64:
-    """Rays (h,w,3) of the pixels, in camera axes."""
+    """Rays (n,3) of the pixels, row by row, in camera axes."""
     u, v = np.meshgrid(np.arange(float(W)), np.arange(float(H)))
-    return np.stack([(u - CAMERA.cx) / FOCAL, (v - CAMERA.cy) / FOCAL, np.ones_like(u)], -1)
+    return np.stack([(u - CAMERA.cx) / FOCAL, (v - CAMERA.cy) / FOCAL, np.ones_like(u)], -1).reshape(-1, 3)
 
 
 def room(T_w_c: F64) -> tuple[U8, F64]:
     """What a camera sees of the room, (h,w) grey, and the depths (h,w)."""
-    ray = rays() @ T_w_c[:3, :3].T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        depths = np.stack([(d - normal @ T_w_c[:3, 3]) / (ray @ normal) for normal, d, _, _ in PLANES])
-    depths = np.where(depths > 1e-6, depths, np.inf)
-    best, nearest = depths.min(axis=0), depths.argmin(axis=0)
-    hit = T_w_c[:3, 3] + ray * np.where(np.isfinite(best), best, 0.0)[..., None]
-    place, image = (hit * 60.0).astype(np.float32) % 510, np.zeros((H, W), np.uint8)
-    for seed, (_, _, a, b) in enumerate(PLANES):
-        here = (nearest == seed) & np.isfinite(best)
-        if here.any():
-            image[here] = cv2.remap(texture(seed), place[..., a], place[..., b], cv2.INTER_LINEAR)[here]
-    return image, best
+    ray = np.ascontiguousarray((rays() @ T_w_c[:3, :3].T).T)  # (3,n): four times as fast as (n,3)
+    depth, nearest = np.full(W * H, np.inf), np.full(W * H, len(PLANES), np.uint8)
+    for k, (normal, d, _, _) in enumerate(PLANES):
+        axis = int(np.argmax(np.abs(normal)))
+        with np.errstate(divide="ignore"):
+            here = (d - normal @ T_w_c[:3, 3]) / (ray[axis] * normal[axis])
+        nearer = (here > 1e-6) & (here < depth)
+        depth[nearer], nearest[nearer] = here[nearer], k
+    hit = T_w_c[:3, 3, None] + ray * np.where(np.isfinite(depth), depth, 0.0)
+    place = (hit * 60.0).astype(np.float32)
+    if np.abs(place).max() < 510.0:
+        np.add(place, np.float32(510.0), out=place, where=place < 0.0)  # as below, in a tenth of the time
+    else:
+        place %= 510.0
+    place, image = place.reshape(3, H, W), np.zeros((H, W), np.uint8)
+    for k, (_, _, a, b) in enumerate(PLANES):
+        shown = (nearest == k).reshape(H, W)
+        if shown.any():
+            image[shown] = cv2.remap(texture(k), place[a], place[b], cv2.INTER_LINEAR)[shown]
+    return image, depth.reshape(H, W)
 
 
 def path(k: float) -> F64:
