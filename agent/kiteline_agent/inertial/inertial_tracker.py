@@ -151,7 +151,7 @@ class InertialTracker:
             return None
         # a frame may have been taken later than it is stamped
         end_ns = max(self.clock.taken_ns(t_ns) + self._offset_ns, self._interval_end_ns + 1)
-        samples = self._buffer.extended(imu).between(self._interval_end_ns, end_ns)
+        samples = self._buffer.extended(imu).ahead(self._interval_end_ns, end_ns)
         if samples is None:
             return None
         state, samples = self._smoother.state, self.self_calibration.correct(samples)

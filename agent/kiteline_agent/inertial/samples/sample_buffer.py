@@ -121,6 +121,13 @@ class SampleBuffer:
             self._densities(steps, lo, hi),
         )
 
+    def ahead(self, from_ns: int, to_ns: int) -> Samples | None:
+        """`between`, but that forces which have not come yet are the mean of the newest ones: one alone vibrates."""
+        samples = self.between(from_ns, to_ns)
+        if samples is not None and to_ns > self._t[-1]:
+            samples.accel[-1] = 2.0 * self.last_accel - samples.accel[-2]  # with the sample before, the mean
+        return samples
+
     def within(self, from_ns: int, to_ns: int) -> F64:
         """The samples (n,6) between two instants."""
         first, last = self._t.searchsorted(from_ns, "left"), self._t.searchsorted(to_ns, "right")
