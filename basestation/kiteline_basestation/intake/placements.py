@@ -202,8 +202,14 @@ class SubmapPlacements:
                 self.unmerged[submap] = sim3.scaled_about(self.unmerged[submap], factor, first)
 
     def separate(self, split: Collection[SubmapId]) -> None:
-        """Move submaps that were split from a map back to where they lay before; others have no placement any more."""
-        for submap in sorted(set(split) & self.S_w_m.keys() - {self.first}):
+        """Move submaps of maps that were one back to where they lay before, but those in the map that defines w.
+
+        Others have no placement any more.
+        """
+        here = None if self.first is None else self._map.map_id(self.first)
+        for submap in sorted(set(split) & self.S_w_m.keys()):
+            if self._map.map_id(submap) == here:
+                continue
             self._recognised.discard(submap)
             if submap in self.unmerged:
                 self._set(submap, self.unmerged[submap])

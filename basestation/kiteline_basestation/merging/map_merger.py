@@ -258,7 +258,7 @@ class MapMerger:
             if submap != merge.map_id:
                 sparse_map.root_submaps[submap] = merge.map_id
             sparse_map.move_submap(submap, S_w_m)
-        return result + MergeResult(moved=frozenset({rest, merge.map_id}), split=split)
+        return result + MergeResult(frozenset({rest, merge.map_id}), split=split.union(sparse_map.submaps_of_map(rest)))
 
     # -- saved state -------------------------------------------------------------------------------------------------
 

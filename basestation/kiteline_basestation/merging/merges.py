@@ -102,9 +102,9 @@ class MergeResult:
     """Changes of whole maps that the mapper has to apply.
 
     moved: ids of maps in which all keyframes may have moved. rescaled: factors by which units of submaps grew in their
-    map. scale_sigma: relative deviations of lengths, by map id, where accelerations told them. split: submaps that no
-    longer belong to the map that they were merged into. requeried: keyframes for which loop closures were searched
-    again; local bundles are due around them. bent: rows of keyframes that a bundle of a part of a large map moved.
+    map. scale_sigma: relative deviations of lengths, by map id, where accelerations told them. split: all submaps of
+    maps that were one. requeried: keyframes for which loop closures were searched again; local bundles are due around
+    them. bent: rows of keyframes that a bundle of a part of a large map moved.
     """
 
     moved: frozenset[SubmapId] = frozenset()

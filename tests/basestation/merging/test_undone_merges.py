@@ -13,6 +13,7 @@ from kiteline_basestation.management import Command
 from kiteline_basestation.mapper import Mapper, MapperInput
 from kiteline_basestation.merging import map_merger
 from kiteline_basestation.store.integrity import contradictions
+from kiteline_codec.schema import Key, SubmapPlacement
 from kiteline_core.geometry import se3
 from kiteline_core.ids import submap_of_keyframe
 from tests.basestation.feeding import STEP_NS, WITHOUT_GRID, feed
@@ -62,6 +63,25 @@ def test_a_map_that_matched_a_wrongly_merged_one_alone_goes_with_it(
     assert contradictions(mapper) == []
     T_b_c = mapper.map.submap_pose(maps[1]), mapper.map.submap_pose(maps[2])
     assert np.allclose(se3.inverse(T_b_c[0]) @ T_b_c[1], ELSEWHERE, atol=0.03)
+
+
+@pytest.mark.parametrize("stereo", [True, False])
+def test_a_map_that_took_in_the_one_that_defines_w_loses_its_place_with_it(
+    make_flight: MakeFlight, words: Any, stereo: bool
+) -> None:
+    """Its place rested on the undone merge alone."""
+    first = make_flight(keyframes=12, turns=0.3, stereo=stereo)
+    other = make_flight(keyframes=12, turns=0.3, seed=9, agent=1)
+    mapper, clock = Mapper(WITHOUT_GRID, words), itertools.count(10**12, STEP_NS)
+    feed(mapper, [first, other])
+    maps = [submap_of_keyframe(flight.keyframes[0]) for flight in (first, other)]
+    order(mapper, "merge", clock, map="0.1.0", into="1.1.0", T_into_map=ELSEWHERE.ravel().tolist())
+    assert mapper.map.map_id(maps[0]) == maps[1] and list(mapper.placements) == maps
+    output = mapper.step(MapperInput((), (), (Command(1, "split", '{"map": "0.1.0"}'),)), next(clock))
+    assert output.withdrawn == ((other.agent, Key(SubmapPlacement.KIND, maps[1], 0)),)
+    rest(mapper, clock, output)
+    assert list(mapper.placements) == maps[:1]
+    assert contradictions(mapper) == []
 
 
 @pytest.mark.parametrize("requested", [False, True])
