@@ -130,7 +130,10 @@ def path_length(sparse_map: SparseMap, a: KeyframeId, b: KeyframeId) -> float:
 
 def has_depth_relief(sparse_map: SparseMap, matches: Sequence[LoopMatch], config: LoopConfig) -> bool:
     """True if enough matched landmarks lie off their common plane; a flat picture may hang in two places."""
-    ids = np.concatenate([m.old_landmarks for m in matches])
+    side = submap_of_keyframe(matches[-1].old)  # landmarks of one map: how the other lies to it is still to be accepted
+    ids = np.concatenate(
+        [m.old_landmarks if submap_of_keyframe(m.old) == side else m.new_landmarks for m in matches]
+    )  # fmt: skip
     xyz, known = sparse_map.positions(np.unique(sparse_map.find_landmarks(ids)))
     xyz = xyz[known]
     if len(xyz) < config.min_inliers:

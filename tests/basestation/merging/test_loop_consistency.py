@@ -14,7 +14,16 @@ from kiteline_basestation.merging.loop_consistency import agreeing
 from kiteline_basestation.merging.loop_detector import LoopClosure, LoopDetector
 from kiteline_basestation.merging.loop_edges import LoopMatch, correction_of, depth_of
 from kiteline_core.geometry import se3, sim3
-from kiteline_core.ids import NO_KEYFRAME, KeyframeId, keyframe_id, submap_id, submap_of_keyframe
+from kiteline_core.geometry.cameras import RectifiedCamera
+from kiteline_core.ids import (
+    NO_KEYFRAME,
+    KeyframeId,
+    agent_of_submap,
+    keyframe_id,
+    point_id,
+    submap_id,
+    submap_of_keyframe,
+)
 
 A, B = submap_id(0, 1, 0), submap_id(1, 1, 0)
 
@@ -120,3 +129,32 @@ def test_keyframes_that_see_two_places_do_not_agree(drifted: Any, words: Any) ->
     elsewhere = [replace(m, old=keyframe_id(A, 0), T_old_new=away @ m.T_old_new) for m in matches]
     both = [m for pair in zip(elsewhere, matches, strict=True) for m in pair]
     assert weighed(sparse_map, both, words) == [None] * 24
+
+
+def test_a_flat_picture_is_flat_also_where_matches_lead_both_ways() -> None:
+    """Points of two maps that are not aligned yet lie in no common plane: each map's own tell."""
+    sparse_map, rng = SparseMap(), np.random.default_rng(1)
+    picture = np.column_stack([rng.uniform(-1.5, 1.5, (60, 2)), np.full(60, 3.0)])
+    camera = RectifiedCamera(752, 480, 420.0, 420.0, 376.0, 240.0, 0.11, True, np.eye(4))
+    for submap, T_w_m in ((A, np.eye(4)), (B, se3.exp(np.array([2.0, 1.0, -3.0, 0.3, 0.8, 0.1])))):
+        sparse_map.set_camera(agent_of_submap(submap), camera)
+        for k in range(2):
+            keyframe = keyframe_id(submap, k)
+            sparse_map.add_keyframe(keyframe, k, NO_KEYFRAME, np.eye(4), len(picture))
+            n = np.arange(len(picture))
+            uv = 420.0 * picture[:, :2] / picture[:, 2:] + [376.0, 240.0]
+            sparse_map.put_new_landmarks(
+                keyframe, 0, n.astype(np.uint16), uv.astype(np.float32), (1.0 / picture[:, 2]).astype(np.float32),
+                *np.zeros((2, len(n)), np.uint8), np.zeros((len(n), 32), np.uint8),
+            )  # fmt: skip
+        sparse_map.move_submap(submap, T_w_m)
+
+    def match(new: KeyframeId, old: KeyframeId) -> LoopMatch:
+        ids = (point_id(k, 0) + np.arange(len(picture)) for k in (new, old))
+        return LoopMatch(new, old, np.eye(4), len(picture), 3.0, 1.0, *ids)
+
+    matches = [match(keyframe_id(A, k), keyframe_id(B, k)) for k in range(2)]
+    matches += [match(keyframe_id(B, k), keyframe_id(A, 1 - k)) for k in range(2)]
+    assert not loop_consistency.has_depth_relief(sparse_map, matches[:2], LoopConfig())
+    assert not loop_consistency.has_depth_relief(sparse_map, matches, LoopConfig())
+    assert not loop_consistency.has_depth_relief(sparse_map, matches[::-1], LoopConfig())

@@ -107,6 +107,22 @@ def test_similar_rooms_are_not_merged(
     assert mapper.summary()["maps"] == 2
 
 
+def test_agents_in_two_similar_rooms_are_merged_by_room(
+    make_flight: MakeFlight, half_papered: tuple[Any, Any], words: Any
+) -> None:
+    flights = [
+        make_flight(keyframes=26, turns=0.9, scene=scene, start=start, variant=agent, agent=agent, T_w_m=T_w_m)
+        for agent, (scene, start, T_w_m) in enumerate(
+            (scene, start, T_w_m) for scene in half_papered for start, T_w_m in ((0.1, np.eye(4)), (0.5, ELSEWHERE))
+        )
+    ]
+    mapper = Mapper(WITHOUT_GRID, words)
+    feed(mapper, flights)
+    maps = [mapper.map.map_id(submap_of_keyframe(flight.keyframes[0])) for flight in flights]
+    assert maps[0] == maps[1] != maps[2] == maps[3]
+    assert mapper.summary()["merges_undone"] == 0
+
+
 @pytest.mark.parametrize(("predecessors", "merges"), [(0, 0), (4, 1)])
 def test_predecessors_of_a_matched_keyframe_are_verified(
     make_flight: MakeFlight, words: Any, predecessors: int, merges: int
