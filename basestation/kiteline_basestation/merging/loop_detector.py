@@ -148,9 +148,12 @@ class LoopDetector:
             found = found or self._weigh(match) or self._verify_neighbours(match)
         return found
 
-    def contradict(self, pairs: Iterable[SubmapPair]) -> None:
-        """A full bundle rejected the matches of these submaps: more of them, and others, have to merge them again."""
-        for key in {_pair(*pair) for pair in pairs}:
+    def contradict(self, pairs: Iterable[SubmapPair], weighed: SubmapPair | None = None) -> None:
+        """The matches of these submaps made a wrong merge: more of them, and others, have to merge them again.
+
+        weighed: submaps whose matches contradicted it, which stay to be weighed against each other.
+        """
+        for key in {_pair(*pair) for pair in pairs} - {weighed}:
             self._matches.pop(key, None)
             self._contradicted[key] = self._contradicted.get(key, 0) + 1
 

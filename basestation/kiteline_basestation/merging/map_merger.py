@@ -299,7 +299,10 @@ class MapMerger:
         if isinstance(found, Contradiction):
             a, b = found.submaps
             wrong = next((m for m in reversed(self.merges) if (a in m.moved) != (b in m.moved)), None)
-            return NOTHING if wrong is None else self.undo(wrong)
+            if wrong is None:
+                return NOTHING
+            self.detector.contradict(edges_out_of(wrong.moved, self._edges), found.submaps)
+            return self.undo(wrong)
         return NOTHING if found is None else self._close(found, keyframe)
 
     def _close(self, closure: LoopClosure, keyframe: KeyframeId) -> MergeResult:
@@ -386,10 +389,7 @@ class MapMerger:
         ids = self._map.keyframes.id[window.rows]
         poses = np.linalg.inv(result.T_c_m[free])
         targets = {KeyframeId(k): pose for k, pose in zip(ids[free].tolist(), poses)}
-        for keyframe in map(KeyframeId, ids[~free].tolist()):
-            pose = self._map.world_pose(keyframe)
-            assert pose is not None
-            targets[keyframe] = pose
+        targets |= zip(map(KeyframeId, ids[~free].tolist()), self._map.keyframes.T_w_k[window.rows[~free]])
         before = self._map.keyframes.T_w_k.copy()
         moved = move_keyframes(self._map, map_id, targets, self._publisher, self._config.publish)
         apply_bundle(self._map, window, result, self._publisher, self._config.publish)

@@ -12,6 +12,7 @@ from kiteline_basestation.job_kinds import run_job
 from kiteline_basestation.management import Command
 from kiteline_basestation.mapper import Mapper, MapperInput
 from kiteline_basestation.merging import map_merger
+from kiteline_basestation.merging.loop_detector import Contradiction
 from kiteline_basestation.store.integrity import contradictions
 from kiteline_codec.schema import Key, SubmapPlacement
 from kiteline_core.geometry import se3
@@ -101,3 +102,26 @@ def test_a_merge_that_bundles_contradict_is_not_made_again_at_each_keyframe(
     feed(mapper, [a, b])
     assert 1 <= merger.undone < 10  # of 80 keyframes
     assert merger.detector.state().contradicted == {pair: merger.undone} and not merger.detector.requested
+
+
+def test_matches_that_made_a_merge_do_not_make_it_again_once_others_contradict_it(
+    make_flight: MakeFlight, words: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Those of two other submaps of the same maps contradict it: one match more made it anew, in every step."""
+    a = make_flight(keyframes=20, turns=0.6)
+    beside = make_flight(keyframes=8, turns=0.1, seed=9, agent=2)
+    b = make_flight(keyframes=20, turns=0.6, start=0.3, variant=1, agent=1, T_w_m=ELSEWHERE)
+    mapper, clock = Mapper(WITHOUT_GRID, words), itertools.count(10**12, STEP_NS)
+    feed(mapper, [a, beside])
+    order(mapper, "merge", clock, map="2.1.0", into="0.1.0", T_into_map=ELSEWHERE_TOO.ravel().tolist())
+    feed(mapper, [b])
+    merger = mapper.merger
+    assert merger is not None
+    maps = [submap_of_keyframe(flight.keyframes[0]) for flight in (a, b, beside)]
+    assert {mapper.map.map_id(submap) for submap in maps} == {maps[0]}
+    assert (maps[0], maps[1]) in merger.detector.state().matches
+    monkeypatch.setattr(merger.detector, "query", lambda keyframe: Contradiction((maps[1], maps[2])))
+    merger.add_keyframe(b.keyframes[-1])
+    assert [mapper.map.map_id(submap) for submap in maps] == [maps[0], maps[1], maps[0]]
+    state = merger.detector.state()
+    assert state.contradicted == {(maps[0], maps[1]): 1} and (maps[0], maps[1]) not in state.matches
