@@ -243,6 +243,22 @@ def corridor() -> Scene:
     return straight(10, 3.0, 1.0, 12)
 
 
+@pytest.fixture(scope="session")
+def shelves() -> Scene:
+    """Four times the same 4 m of shelf, 2 m deep. The path leads along it, in metres."""
+    rng = np.random.default_rng(3)
+    n = 220
+    one = rng.uniform([0.0, 1.5, -1.2], [4.0, 3.5, 1.2], (n, 3))
+    descriptors = rng.integers(0, 256, (n, 32), dtype=np.uint8)
+    size, direction = rng.uniform(-0.4, 1.4, n), rng.integers(0, 256, n)
+    world = np.concatenate([one + [4.0 * k, 0.0, 0.0] for k in range(4)])
+
+    def path(metres: float) -> F64:
+        return look(np.array([metres, -0.5, 0.0]), np.array([0.2, 1.0, 0.0]))
+
+    return Scene(world, np.tile(descriptors, (4, 1)), np.tile(size, 4), np.tile(direction, 4), path)
+
+
 def two_rooms(shared: float, seed: int) -> tuple[Scene, Scene]:
     """Two rooms of 8 x 7 x 3 m and 10 x 9 x 3 m: of each wall's paper this share is the same in both."""
     first = room(np.random.default_rng(seed), 900)

@@ -158,3 +158,22 @@ def test_a_flat_picture_is_flat_also_where_matches_lead_both_ways() -> None:
     assert not loop_consistency.has_depth_relief(sparse_map, matches[:2], LoopConfig())
     assert not loop_consistency.has_depth_relief(sparse_map, matches, LoopConfig())
     assert not loop_consistency.has_depth_relief(sparse_map, matches[::-1], LoopConfig())
+
+
+@pytest.mark.parametrize(("tilt_rad", "merged"), [(0.0, True), (0.3, False)])
+def test_maps_are_not_merged_that_gravity_would_tilt(drifted: Any, words: Any, tilt_rad: float, merged: bool) -> None:
+    sparse_map, _ = drifted([])
+    tilt = se3.from_rt(se3.so3_exp(np.array([tilt_rad, 0.0, 0.0])), np.zeros(3))
+    matches = []
+    for k in range(6):
+        new, old = keyframe_id(B, k), keyframe_id(A, k)
+        sparse_map.add_keyframe(new, k, NO_KEYFRAME, se3.from_rt(np.eye(3), np.array([0.5 * k, 0.0, 0.0])), 0)
+        for keyframe in (new, old):
+            sparse_map.up[keyframe] = np.array([0.0, -1.0, 0.0]), 0.005
+        there = se3.inverse(sparse_map.world_pose(old)) @ tilt @ sparse_map.world_pose(new)
+        matches.append(LoopMatch(new, old, there, 60, 3.0))
+    detector = LoopDetector(LoopConfig(), sparse_map, words)
+    detector._is_ambiguous = lambda keyframe: False  # type: ignore[method-assign]
+    found = [detector._weigh(match) for match in matches]
+    assert any(isinstance(closure, LoopClosure) for closure in found) == merged
+    assert detector.refused == (0 if merged else len(matches))

@@ -107,6 +107,17 @@ def test_similar_rooms_are_not_merged(
     assert mapper.summary()["maps"] == 2
 
 
+def test_a_map_is_not_merged_by_a_place_that_the_other_map_has_twice(
+    make_flight: MakeFlight, shelves: Any, words: Any
+) -> None:
+    long = make_flight(keyframes=30, turns=13.0, scene=shelves, drift_m=0.002)
+    short = make_flight(keyframes=8, turns=2.0, start=5.0, scene=shelves, variant=1, agent=1)
+    mapper = Mapper(WITHOUT_GRID, words)
+    feed(mapper, [long, short], [0, 30])
+    assert mapper.summary()["loop_matches"] > 0
+    assert mapper.summary()["merges"] == mapper.summary()["merges_undone"] == 0
+
+
 def test_agents_in_two_similar_rooms_are_merged_by_room(
     make_flight: MakeFlight, half_papered: tuple[Any, Any], words: Any
 ) -> None:
