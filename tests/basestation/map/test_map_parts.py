@@ -97,6 +97,25 @@ def test_a_part_tells_all_that_it_moves_also_what_came_since_it_began(make_fligh
     assert changes.bent == frozenset(moved)
 
 
+def test_what_a_part_holds_stays_where_it_is(make_flight: MakeFlight) -> None:
+    """Keyframes that follow a part hang on its last ones: they moved along, unlike the landmarks that held them."""
+    flight, config = make_flight(keyframes=30), BaseConfig()
+    mapper = Mapper(replace(config, graph=replace(config.graph, max_full=16)), _no_words())
+    feed(mapper, [flight])
+    submap = submap_of_keyframe(flight.keyframes[0])
+    window = full_bundle_window(mapper.map, submap, (), mapper.config, (submap, 0))
+    held = window.rows[~window.problem.free]
+    assert mapper.map.rows[flight.keyframes[16]] in held
+    T_c_m = window.problem.T_c_m.copy()
+    T_c_m[window.problem.free] = T_c_m[window.problem.free] @ se3.exp(np.array([0.1, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    kept = np.ones(len(window.slots), np.bool_)
+    result = BundleResult(T_c_m, window.problem.points, kept, 0.0, 0.0, 1, 0)
+    before = mapper.map.keyframes.T_w_k.copy()
+    mapper.merger._apply_full_bundle(FullBundle(submap, window, (), part=(submap, 0)), result)
+    assert np.array_equal(mapper.map.keyframes.T_w_k[held], before[held])
+    assert not np.array_equal(mapper.map.keyframes.T_w_k, before)
+
+
 def _no_words() -> Any:
     from kiteline_core.places.place_index import Vocabulary, nodes
 
