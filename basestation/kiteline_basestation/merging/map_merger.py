@@ -135,7 +135,6 @@ class MapMerger:
         units, lengths = apply_scales(self._map, map_id, dict(zip(keyframes, result.scale.tolist())), self._publisher)
         if lengths:
             self._edges = [rescaled(e, lengths) for e in self._edges]
-            self._unfused = {s: [rescaled(m, lengths) for m in matches] for s, matches in self._unfused.items()}
             self.detector.rescale(lengths)
         targets = dict(zip(keyframes, result.T_w_k))
         move_keyframes(self._map, map_id, targets, self._publisher, self._config.publish)
