@@ -214,7 +214,9 @@ def test_submap_after_a_loss_is_merged_and_split_again(make_flight: MakeFlight, 
     feed(mapper, [a, b], [0, 20])
     assert mapper.summary()["merges"] == 1
     assert np.sqrt(np.mean(joint_error_m(mapper, [a, b]) ** 2)) < 0.02
+    assert mapper.merger is not None and mapper.merger.edges
     output = mapper.step(MapperInput(((a.agent, ()),), (), (Command(1, "split", '{"map": "0.1.1"}'),)), 10**12)
+    assert not mapper.merger.edges  # they would bend both maps if these became one by others
     table, sparse_map = mapper.map.keypoints, mapper.map
     slots = np.flatnonzero(table.root[: sparse_map.slots] >= 0)
     here = sparse_map.keyframes.id[table.row[slots]] >> SEQUENCE_BITS
