@@ -34,8 +34,6 @@ def align_points(a: F64, b: F64, chosen: Bool, with_scale: bool, S_a_b: F64) -> 
                 spread_b += (b[i, k] - mean_b[k]) ** 2
                 for j in range(3):
                     m[k, j] += (b[i, k] - mean_b[k]) * (a[i, j] - mean_a[j])
-    if spread_a < 1e-18 or spread_b < 1e-18:
-        return False
     h = np.empty((4, 4))
     h[0, 0] = m[0, 0] + m[1, 1] + m[2, 2]
     h[1, 1] = m[0, 0] - m[1, 1] - m[2, 2]

@@ -243,6 +243,20 @@ def test_parts_that_no_edge_ties_stay_where_they_are(make_flight: Callable[..., 
     assert np.allclose(optimise(graph).T_w_k, graph.T_w_k, atol=1e-6)
 
 
+def test_the_first_keyframe_of_the_root_is_held_and_loops_tell_their_scale(make_flight: Callable[..., Any]) -> None:
+    a = make_flight(keyframes=10, turns=0.2, stereo=False)
+    b = make_flight(keyframes=10, turns=0.2, seed=9, agent=1, stereo=False)
+    mapper = Mapper(WITHOUT_GRID)
+    feed(mapper, [b, a])
+    older, newer = (submap_of_keyframe(flight.keyframes[0]) for flight in (b, a))
+    mapper.map.root_submaps[newer] = older  # the map is named after the higher id
+    tie = LoopEdge(a.keyframes[4], b.keyframes[4], np.eye(4), 50, 3.0, 1.2)
+    graph = essential_graph_of(mapper.map, older, [tie], GraphConfig())
+    assert graph is not None and graph.scaled is not None
+    assert graph.keyframes[graph.held].tolist() == [b.keyframes[0]]
+    assert graph.scaled.scale[graph.loop].tolist() == [1.2] and (graph.scaled.scale[~graph.loop] == 1.0).all()
+
+
 def test_a_first_keyframe_without_a_pose_is_left_out(make_flight: Callable[..., Any]) -> None:
     """Its parent never came, and it came after the submap was begun without it: the next loop ended the base."""
     flight = make_flight(keyframes=12, turns=0.3)

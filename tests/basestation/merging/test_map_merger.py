@@ -277,6 +277,7 @@ def test_undoing_an_inner_merge_cancels_the_jobs_of_the_outer_map(make_flight: M
     merger.search_overlap(maps[1], maps[0])
     mapper.step(MapperInput(()), next(clock))
     assert merger.undone == 1 and mapper.map.map_id(maps[2]) == maps[2]
+    assert [set(merge.moved) for merge in merger.merges] == [{maps[1]}]  # the outer merge would move it, if undone
     mapper.step(MapperInput((), tuple(run_job(job) for job in jobs)), next(clock))
     errors_m = [np.linalg.norm((mapper.map.pose(k) - T)[:3, 3]) for k, T in zip(inner.keyframes, inner.true_T_m_k)]
     assert max(errors_m) < 0.1

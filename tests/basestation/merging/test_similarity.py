@@ -73,3 +73,35 @@ def test_points_give_a_similarity(seed: int, xi: list[float], scale: float) -> N
     points = np.random.default_rng(seed).normal(0.0, 2.0, (12, 3))
     S = align_points(scale * points @ T[:3, :3].T + T[:3, 3], points, with_scale=True)
     assert np.allclose(S, sim3.of(scale, T), atol=1e-7)
+
+
+def views(n: int) -> tuple[np.ndarray, ...]:
+    """Points (n,3) in two cameras, their pixels (n,2) in both, and octaves (n,)."""
+    points, T_a, uv_a = scene(np.random.default_rng(7), n)
+    a = se3.transform(T_a, points)
+    b = se3.transform(se3.inverse(se3.exp(np.array([0.9, -0.5, 0.3, 0.05, -0.1, 0.08]))), a)
+    return a, uv_a, b, b[:, :2] / b[:, 2:] * CAMERA[:2] + CAMERA[2:4], np.zeros(n, np.uint8)
+
+
+def test_pairs_have_to_agree_in_both_images() -> None:
+    a, uv_a, b, uv_b, octave = views(60)
+    a[:12] *= 1.5  # each still lies on its pixel, and is seen elsewhere from the other camera
+    b[12:24] *= 1.5
+    fit = align_views(a, uv_a, octave, CAMERA, b, uv_b, octave, CAMERA, with_scale=False, seed=1)
+    assert not fit.inlier[:24].any() and fit.inlier[24:].all()
+
+
+def test_a_similarity_is_that_of_all_its_inliers() -> None:
+    a, uv_a, b, uv_b, octave = views(60)
+    noisy = a + np.random.default_rng(8).normal(0.0, 0.002, a.shape)
+    fit = align_views(noisy, uv_a, octave, CAMERA, b, uv_b, octave, CAMERA, with_scale=True, seed=1)
+    assert fit.inliers == 60  # also by three of them alone
+    assert np.allclose(fit.S_a_b, align_points(noisy, b, with_scale=True), atol=1e-12)
+
+
+def test_one_point_alone_gives_no_similarity() -> None:
+    rng = np.random.default_rng(9)
+    for _ in range(50):
+        same, others = np.repeat(rng.normal(0.0, 3.0, (1, 3)), 3, axis=0), rng.normal(0.0, 3.0, (3, 3))
+        assert align_points(same, others, with_scale=True) is None
+        assert align_points(others, same, with_scale=True) is None

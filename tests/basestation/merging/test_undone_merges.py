@@ -76,10 +76,12 @@ def test_a_map_that_took_in_the_one_that_defines_w_loses_its_place_with_it(
     mapper, clock = Mapper(WITHOUT_GRID, words), itertools.count(10**12, STEP_NS)
     feed(mapper, [first, other])
     maps = [submap_of_keyframe(flight.keyframes[0]) for flight in (first, other)]
+    before = mapper.map.submap_pose(maps[0])
     order(mapper, "merge", clock, map="0.1.0", into="1.1.0", T_into_map=ELSEWHERE.ravel().tolist())
     assert mapper.map.map_id(maps[0]) == maps[1] and list(mapper.placements) == maps
     output = mapper.step(MapperInput((), (), (Command(1, "split", '{"map": "0.1.0"}'),)), next(clock))
     assert output.withdrawn == ((other.agent, Key(SubmapPlacement.KIND, maps[1], 0)),)
+    assert np.array_equal(mapper.map.submap_pose(maps[0]), before)
     rest(mapper, clock, output)
     assert list(mapper.placements) == maps[:1]
     assert contradictions(mapper) == []
