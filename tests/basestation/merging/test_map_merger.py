@@ -283,6 +283,24 @@ def test_undoing_an_inner_merge_cancels_the_jobs_of_the_outer_map(make_flight: M
     assert max(errors_m) < 0.1
 
 
+def test_a_full_bundle_of_a_map_that_is_merged_meanwhile_is_void(make_flight: MakeFlight, words: Any) -> None:
+    """It would take the keyframes back to where they were before the merge."""
+    a = make_flight(keyframes=12, turns=0.3)
+    b = make_flight(keyframes=12, turns=0.3, seed=9, agent=1)
+    mapper = Mapper(WITHOUT_GRID, words)
+    feed(mapper, [a, b])
+    merger = mapper.merger
+    assert merger is not None
+    older, newer = (submap_of_keyframe(flight.keyframes[0]) for flight in (a, b))
+    merger._corrections.request_bundle(newer)
+    jobs = mapper.step(MapperInput(()), 10**12).jobs
+    assert [job.kind for job in jobs] == [FULL_BUNDLE.name]
+    merger.merge(newer, older, ELSEWHERE)
+    merged = [mapper.map.world_pose(k) for k in b.keyframes]
+    mapper.step(MapperInput((), tuple(run_job(job) for job in jobs)), 10**12 + STEP_NS)
+    assert np.allclose([mapper.map.world_pose(k) for k in b.keyframes], merged, atol=0.1)
+
+
 def test_a_local_bundle_of_a_map_that_the_same_step_separates_is_void(
     make_flight: MakeFlight, words: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
