@@ -209,7 +209,7 @@ def test_keyframes_that_see_two_places_do_not_agree(drifted: Any, words: Any) ->
 
 def twice(points: np.ndarray) -> tuple[SparseMap, Callable[[KeyframeId, KeyframeId], LoopMatch]]:
     """Two maps with two keyframes each, which all see points (n,3); makes matches of two of these."""
-    sparse_map, n = SparseMap(), np.arange(len(points))
+    sparse_map, n, none = SparseMap(), np.arange(len(points)), np.zeros(len(points), np.uint8)
     camera = RectifiedCamera(752, 480, 420.0, 420.0, 376.0, 240.0, 0.11, True, np.eye(4))
     uv = (420.0 * points[:, :2] / points[:, 2:] + [376.0, 240.0]).astype(np.float32)
     for submap, T_w_m in ((A, np.eye(4)), (B, se3.exp(np.array([2.0, 1.0, -3.0, 0.3, 0.8, 0.1])))):
@@ -219,7 +219,7 @@ def twice(points: np.ndarray) -> tuple[SparseMap, Callable[[KeyframeId, Keyframe
             sparse_map.add_keyframe(keyframe, k, NO_KEYFRAME, np.eye(4), len(points))
             sparse_map.put_new_landmarks(
                 keyframe, 0, n.astype(np.uint16), uv, (1.0 / points[:, 2]).astype(np.float32),
-                *np.zeros((2, len(points)), np.uint8), np.zeros((len(points), 32), np.uint8),
+                none, none, np.zeros((len(points), 32), np.uint8),
             )  # fmt: skip
         sparse_map.move_submap(submap, T_w_m)
 
