@@ -362,19 +362,6 @@ def test_metre_and_vertical_that_come_together_are_applied_together(make_flight:
     np.testing.assert_allclose(sim3.rigid(S_w_m)[:3, :3], tilt.T_l_m[:3, :3], atol=1e-9)
 
 
-@pytest.mark.parametrize(("metres", "merges"), [(1.0, 1), (1.4, 0)])
-def test_a_map_with_a_wrong_metre_is_not_merged(
-    make_flight: MakeFlight, words: Any, metres: float, merges: int
-) -> None:
-    pair = make_flight(keyframes=14, turns=0.4)
-    eye = make_flight(keyframes=14, turns=0.4, start=0.1, variant=1, agent=1, T_w_m=ELSEWHERE, stereo=False)
-    eye = in_own_unit(eye, metres)
-    eye.records[0].append(SubmapScale(submap_of_keyframe(eye.keyframes[0]), 1.0))
-    mapper = Mapper(WITHOUT_GRID, words)
-    feed(mapper, [pair, eye])
-    assert mapper.summary()["merges"] == merges
-
-
 def test_a_later_submap_is_scaled_where_it_begins_and_the_next_one_goes_with_it(make_flight: MakeFlight) -> None:
     mapper, (first, own, last) = told_metres(make_flight, first_in_metres=True)
     before = {f.keyframes[0]: placed(mapper, f) for f in (first, own, last)}

@@ -1,9 +1,11 @@
-"""What a pose graph that changes lengths along a monocular map makes of all that is measured in it."""
+"""Lengths of monocular maps: what a pose graph that changes them takes along, and that wrong ones merge nothing."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pytest
 
 from kiteline_basestation.jobs import JobDone
 from kiteline_basestation.mapper import Mapper
@@ -11,10 +13,13 @@ from kiteline_basestation.merging.correction import keyframes_of
 from kiteline_basestation.merging.essential_graph import GraphResult
 from kiteline_basestation.merging.graph_job import POSE_GRAPH
 from kiteline_basestation.merging.loop_edges import LoopEdge, LoopMatch, graph_edge_of
+from kiteline_codec.schema import SubmapScale
 from kiteline_core.arrays import F64
-from kiteline_core.geometry import se3
+from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import KeyframeId, submap_of_keyframe
 from tests.basestation.feeding import WITHOUT_GRID, feed
+
+ELSEWHERE = se3.exp(np.array([3.0, -1.0, 0.2, 0.02, -0.03, 1.1]))
 
 
 def distances(mapper: Mapper, keyframe: KeyframeId) -> F64:
@@ -56,3 +61,17 @@ def test_edges_pending_matches_and_depths_are_stretched_with_the_map(
         T_after, ratio_after = graph_edge_of(sparse_map, stretched)
         assert np.allclose(T_after[:3, 3], growth[0] * T[:3, 3])
         assert np.isclose(ratio_after, ratio * growth[0] / growth[-2])
+
+
+@pytest.mark.parametrize(("metres", "merges"), [(1.0, 1), (1.4, 0)])
+def test_a_map_with_a_wrong_metre_is_not_merged(
+    make_flight: Callable[..., Any], words: Any, metres: float, merges: int
+) -> None:
+    pair = make_flight(keyframes=14, turns=0.4)
+    eye = make_flight(keyframes=14, turns=0.4, start=0.1, variant=1, agent=1, T_w_m=ELSEWHERE, stereo=False)
+    for records in eye.records:
+        records[0] = replace(records[0], T_p_k=sim3.with_scaled_translation(records[0].T_p_k, metres))
+    eye.records[0].append(SubmapScale(submap_of_keyframe(eye.keyframes[0]), 1.0))
+    mapper = Mapper(WITHOUT_GRID, words)
+    feed(mapper, [pair, eye])
+    assert mapper.summary()["merges"] == merges
