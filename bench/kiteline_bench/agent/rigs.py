@@ -64,7 +64,7 @@ def _recording(bench: Bench, options: dict[str, Any]) -> Recording:
     every = int(options.pop("depth_every", 1))
     flight = {"seed": SEED, "seconds": SECONDS, "trajectory": path, "start": START_S, "miscalibration": 0.0, **options}
     source = open_sim("room", os.cpu_count() or 1, **flight)
-    items = (_measured_depth(item, k) if k % every == 0 else _without(item) for k, item in enumerate(items_of(source)))
+    items = (measured_depth(item, k) if k % every == 0 else _without(item) for k, item in enumerate(items_of(source)))
     return Recording(source.rig, source.imu, tuple(items))
 
 
@@ -73,7 +73,7 @@ def _without(item: Item) -> Item:
     return replace(item, frame=replace(item.frame, depth_m=None))
 
 
-def _measured_depth(item: Item, number: int) -> Item:
+def measured_depth(item: Item, number: int) -> Item:
     """The item with the depth of a real camera: noise, a near and a far end, holes, millimetres."""
     true = item.frame.depth_m
     if true is None:

@@ -7,11 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kiteline_bench.harness.recording import Item, Recording
-from kiteline_core.arrays import U8
+from kiteline_core.arrays import U8, Bool
 from kiteline_core.frame import Frame, ImuBatch, chosen, joined
 
 Change = Callable[[Frame], Frame]
 Fault = Callable[[Recording], Recording]
+Spans = Sequence[tuple[float, float]]  # from and to, in s after the first frame
 
 _WALL_GREY, _BLACK_GREY = 120.0, 6.0
 _NOISE_GREY = 1.3  # deviation of a camera's noise
@@ -93,6 +94,14 @@ def _each(recording: Recording, change: Callable[[int, Frame], Frame]) -> Record
     return replace(recording, items=tuple(items))
 
 
+def within(seconds: NDArray[np.floating], spans: Spans) -> Bool:
+    """Mask (n,) of the times that lie in one of the spans."""
+    inside = np.zeros(len(seconds), bool)
+    for begin_s, end_s in spans:
+        inside |= (seconds >= begin_s) & (seconds < end_s)
+    return inside
+
+
 def _each_batch(recording: Recording, change: Callable[[ImuBatch], ImuBatch | None]) -> Recording:
     """Change each batch of inertial samples; None: it is left out."""
     items = (replace(item, imu=None if item.imu is None else change(item.imu)) for item in recording.items)
@@ -130,15 +139,27 @@ def without_samples(recording: Recording, every_s: float, length_s: float) -> Re
     return _each_batch(recording, kept)
 
 
-def samples_from(recording: Recording, begin_s: float) -> Recording:
-    """Leave out the inertial samples of the first `begin_s`: an agent that runs before its flight controller."""
-    begin_ns = recording.items[0].frame.t_ns + round(1e9 * begin_s)
+def samples_between(recording: Recording, spans: Spans) -> Recording:
+    """Leave out the inertial samples outside of these spans. The rig has an IMU all the same, if nothing is left."""
+    first_ns = recording.items[0].frame.t_ns
 
     def kept(imu: ImuBatch) -> ImuBatch | None:
-        keep = imu.t_ns >= begin_ns
+        keep = within((imu.t_ns - first_ns) * 1e-9, spans)
         return chosen(imu, keep) if keep.any() else None
 
     return _each_batch(recording, kept)
+
+
+def samples_from(recording: Recording, begin_s: float) -> Recording:
+    """Leave out the inertial samples of the first `begin_s`: an agent that runs before its flight controller."""
+    return samples_between(recording, ((begin_s, np.inf),))
+
+
+def dark_between(recording: Recording, spans: Spans) -> Recording:
+    """Nothing is to be seen in the images of these spans; a depth camera measures on."""
+    first_ns = recording.items[0].frame.t_ns
+    dark = within(np.array([(item.frame.t_ns - first_ns) * 1e-9 for item in recording.items]), spans)
+    return _each(recording, lambda k, frame: black(frame) if dark[k] else frame)
 
 
 def late_samples(recording: Recording, late_s: float) -> Recording:

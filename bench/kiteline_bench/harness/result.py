@@ -149,11 +149,8 @@ class AgentRun:
             start = start or (e.T_o_b, true)
             odometry = pose_error(start, e.T_o_b, true)
             claimed = odometry if e.T_m_b is None else pose_error(start, e.T_m_b, true)
-            tilt = float("nan")
-            if e.T_l_b is not None:
-                tilt = float(np.arccos(np.clip((e.T_l_b[:3, :3] @ true[:3, :3].T)[2, 2], -1.0, 1.0)))
             position, rotation = (float(np.linalg.norm(part)) for part in (claimed[:3], claimed[3:]))
-            out.append(PoseError(e, odometry, position, rotation, tilt))
+            out.append(PoseError(e, odometry, position, rotation, tilt_rad(e, true)))
         return out
 
     def load_percent(self, period_ns: int) -> float:
@@ -163,6 +160,13 @@ class AgentRun:
     def peak_percent(self, settled_ns: int) -> float:
         """Largest CPU time of any one-second window that ends `settled_ns` after the start or later."""
         return 100.0 * busiest_window(np.array(self.t_ns, np.int64), np.array(self.cpu_ns, np.int64), settled_ns)
+
+
+def tilt_rad(estimate: Estimate, truth: F64) -> float:
+    """Tilt of T_l_b against the true T_w_b (4,4); nan while it is withheld."""
+    if estimate.T_l_b is None:
+        return float("nan")
+    return float(np.arccos(np.clip((estimate.T_l_b[:3, :3] @ truth[:3, :3].T)[2, 2], -1.0, 1.0)))
 
 
 def pose_error(start: tuple[F64, F64], T_a_b: F64, truth: F64) -> F64:

@@ -13,6 +13,7 @@ from kiteline_agent.runtime.frame_counts import live_pose
 from kiteline_basestation.runtime.flight_summary import keyframe_poses
 from kiteline_basestation.station import Station
 from kiteline_bench.harness.bars import Bar, Bench, at_most
+from kiteline_bench.harness.faults import Spans
 from kiteline_bench.harness.recording import Recording
 from kiteline_bench.harness.result import AgentRun
 from kiteline_bench.harness.run import FlyingAgent, fly_recording
@@ -107,8 +108,11 @@ class Flown:
         tracked = {e.t_ns for e in self.run.tracked}
         return sum(t not in tracked for t in self.run.t_ns if t >= after)
 
-    def false_metric(self) -> float:
-        """Largest scale error of live poses in a window of 5 s that were all said to be metric; 0 if none were."""
+    def false_metric(self, without: Spans = ()) -> float:
+        """Largest scale error of live poses in a window of 5 s that were all said to be metric; 0 if none were.
+
+        without: windows that touch these spans are left out.
+        """
         worst, begin_s = 0.0, self.metric_after_s
         metric = dict(zip(self.run.t_ns, self.run.metric, strict=True))
         truth = _truth(self.run)
@@ -117,7 +121,8 @@ class Flown:
         end_s = (self.run.t_ns[-1] - self.begin_ns) * 1e-9
         while np.isfinite(begin_s) and begin_s < end_s - 0.5 * _WINDOW_S:
             poses = self.poses("live", begin_s, begin_s + _WINDOW_S)
-            if len(poses) > 20 and all(metric[t] for t, _ in poses):
+            touched = any(begin_s < b and a < begin_s + _WINDOW_S for a, b in without)
+            if len(poses) > 20 and not touched and all(metric[t] for t, _ in poses):
                 true = metrics.truth_at(np.array([t for t, _ in poses], np.int64), truth)[1]
                 path_m = float(np.linalg.norm(np.diff(true[:, :3, 3], axis=0), axis=1).sum())
                 if path_m >= _LEAST_PATH_M:

@@ -9,7 +9,7 @@ from kiteline_bench.harness.bars import Bar, Bench, table
 from kiteline_bench.harness.recording import load
 from kiteline_bench.harness.run import fly_alone
 from kiteline_bench.harness.simulated import random_flight
-from kiteline_bench.reality.euroc import FLIGHT
+from kiteline_bench.reality.one_camera.euroc import FLIGHT
 
 FLIGHTS = tuple(range(200, 230))  # numbers of random flights
 REAL_STARTS_S = (0.0, 3.0, 6.0, 9.0, 12.0, 15.0)  # of 35 s

@@ -2,20 +2,9 @@
 
 from kiteline_bench.agent import altitude, bent, rigs, slants
 from kiteline_bench.base import real_places
-from kiteline_bench.reality import (
-    base,
-    cpu,
-    difficult,
-    euroc,
-    imu,
-    metric,
-    motion,
-    nees,
-    people,
-    starts,
-    street,
-    worn,
-)
+from kiteline_bench.reality import base, cpu, difficult, nees, people, street, worn
+from kiteline_bench.reality.one_camera import euroc, metric, starts
+from kiteline_bench.reality.sensors import imu, missing, motion
 
 PARTS = {
     "euroc": ("Reality: monocular with a real IMU", euroc.run),
@@ -24,6 +13,7 @@ PARTS = {
     "street": ("Reality: a street", street.run),
     "motion": ("Reality: starts in motion", motion.run),
     "imu": ("Reality: stereo with a real IMU, and with wrong ones", imu.run),
+    "sensors": ("Reality: sensors that come late, have holes, or end", missing.run),
     "base": ("Reality: the base beside the tracker alone", base.run),
     "metric": ("Reality: metric said from a hundred starts", metric.run),
     "starts": ("Reality: random monocular starts, forward and backward", starts.run),

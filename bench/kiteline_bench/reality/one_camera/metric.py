@@ -5,8 +5,8 @@ from pathlib import Path
 from kiteline_bench.harness.bars import Bar, Bench, is_true, table
 from kiteline_bench.harness.recording import load
 from kiteline_bench.harness.simulated import random_flight
-from kiteline_bench.reality.euroc import FLIGHT
 from kiteline_bench.reality.flown import start_of, wrong_metres
+from kiteline_bench.reality.one_camera.euroc import FLIGHT
 
 _SIMULATED = tuple(range(300, 327))  # numbers of random flights; every second one by a worn rig
 _SIMULATED_STARTS_S = (0.0, 2.0, 4.0)

@@ -5,8 +5,8 @@ import numpy as np
 from kiteline_bench.harness.bars import Bar, Bench, at_most, table
 from kiteline_bench.harness.faults import samples_from
 from kiteline_bench.harness.recording import load
-from kiteline_bench.reality.euroc import FLIGHT
 from kiteline_bench.reality.flown import Flown, flown, spread, start_of, wrong_metres
+from kiteline_bench.reality.one_camera.euroc import FLIGHT
 
 _AT_REST = "euroc_v101_start"  # moves by a few centimetres in two seconds: no scale is to be told
 _RENDERED = "room_flight.mcap"
