@@ -12,6 +12,7 @@ from kiteline_bench.harness.faults import dark_between, samples_between, within
 from kiteline_bench.harness.odometer import NOISE_M_S, SCALE, measured_along, with_odometer_between
 from kiteline_bench.harness.recording import Recording, load
 from kiteline_bench.reality.flown import Flown, flown
+from kiteline_bench.reality.sensors import figures as judging
 from kiteline_bench.reality.sensors.cases import CASES, DARK, IMUS, ODOMETERS, Case
 from kiteline_bench.reality.sensors.figures import judged, off_after_dark_m
 from kiteline_bench.reality.sensors.missing import _spread
@@ -127,7 +128,7 @@ def test_a_good_flight_is_within_its_bounds(flight: Flown) -> None:
     assert judged(PLAIN, flight, None).untold == 1.0
 
 
-def test_errors_of_a_flight_are_found(flight: Flown) -> None:
+def test_errors_of_a_flight_are_found(flight: Flown, monkeypatch: pytest.MonkeyPatch) -> None:
     imu = Case(IMU, NO_ODOMETER, BRIGHT)
     lean, true = se3.so3_exp(np.radians([3.0, 0.0, 0.0])), [T[:3, :3] for T in flight.run.truth]
     tilted = with_estimates(flight, lambda k, e: replace(e, R_l_o=lean @ true[k] @ e.T_o_b[:3, :3].T))
@@ -146,6 +147,9 @@ def test_errors_of_a_flight_are_found(flight: Flown) -> None:
         flight, lambda k, e: replace(e, T_m_b=moved(k, e.T_m_b), T_o_b=moved(k, e.T_o_b), T_w_b=None)
     )
     over = judged(imu, stepped, flight).over
+    monkeypatch.setattr(judging, "_LEAST_WAY_M", 0.1)
+    after = judged(Case(IMU, NO_ODOMETER, replace(DARK_1, spans=((0.7, 0.75),))), stepped, flight)
+    assert after.live_scale < 2.0 < judged(imu, stepped, flight).live_scale  # a step in the dark is no scale
     assert over["odometry"] > 2.0 and over["live"] > 2.0 and over["base"] <= 0.5
 
 

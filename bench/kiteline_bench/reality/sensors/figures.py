@@ -16,6 +16,7 @@ TIMES, LEAST_M = 2.0, 0.02  # of the flight with images alone, or m, whichever i
 ONE_CAMERA_M = {"odometry": 0.1, "live": 0.1, "base": 0.05}  # as for one camera and a whole IMU
 _BLIND_M, _BLIND_SHARE = 0.02, 0.02  # off at the end of the dark by an odometer: m, and share of the way
 _BLIND_M_S, _BLIND_M_S2 = 0.02, 0.04  # and by an IMU: error of its velocity, and of tilt and bias together
+_LEAST_WAY_M = 1.0  # over which a scale is judged
 _NAN = float("nan")
 
 
@@ -25,8 +26,8 @@ class Figures:
 
     wait_s: before lengths are said to be metres: with an IMU or odometer and images, or after the first image of
     cameras that measure depth. untold: 1 if that is said though nothing tells it. false, live_scale, base_scale:
-    percent. over: ATE of each path over what is allowed. tilt_deg: at the end. quality: median of frames with images.
-    lost: frames with images and without a pose.
+    percent; the live one after dark images, as what is off at their end is no scale. over: ATE of each path over what
+    is allowed. tilt_deg: at the end. quality: median of frames with images. lost: those of them without a pose.
     """
 
     name: str
@@ -49,7 +50,7 @@ def judged(case: Case, flight: Flown, plain: Flown | None) -> Figures:
     if plain is None:
         wait_s = case.metre_s(metric_s) if np.isfinite(metric_s) else np.inf if np.isfinite(metre_from_s) else _NAN
     known_from_s = max(metric_s, metre_from_s)
-    live_from_s = max(known_from_s, _upright_from_s(case))
+    live_from_s = max([known_from_s, *(end_s for _, end_s in (*case.upright, *case.dark.spans))])
     live_scale = 100.0 * _scale(flight, "live", live_from_s) if _carried(case) else _NAN
     return Figures(
         case.name, wait_s, float(plain is None and not case.metre_s(np.inf) and np.isfinite(metric_s)),
@@ -100,7 +101,7 @@ def _upright_from_s(case: Case) -> float:
 def _scale(flight: Flown, path: str, from_s: float) -> float:
     """Share by which lengths are off from then on; nan if too little is flown."""
     found = flight.matched(path, TrajectoryAlignment.SIM3, from_s) if np.isfinite(from_s) else None
-    if found is None or _way_m(found.truth) < 1.0:
+    if found is None or _way_m(found.truth) < _LEAST_WAY_M:
         return _NAN
     return abs(1.0 / found.scale - 1.0)
 
