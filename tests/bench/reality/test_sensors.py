@@ -14,7 +14,7 @@ from kiteline_bench.harness.recording import Recording, load
 from kiteline_bench.reality.flown import Flown, flown
 from kiteline_bench.reality.sensors import figures as judging
 from kiteline_bench.reality.sensors.cases import CASES, DARK, IMUS, ODOMETERS, Case
-from kiteline_bench.reality.sensors.figures import judged, off_after_dark_m
+from kiteline_bench.reality.sensors.figures import _drifting, judged, off_after_dark_m
 from kiteline_bench.reality.sensors.missing import _spread
 from kiteline_core.frame import ImuBatch, Trajectory
 from kiteline_core.geometry import se3
@@ -171,6 +171,13 @@ def test_frames_in_the_dark_are_not_lost_and_what_nothing_measures_is_not_judged
     assert np.isnan(judged(Case(NO_IMU, NO_ODOMETER, early), blind, None).lost)  # one camera has no metre then
     imu_before = replace(IMU_ENDS, spans=((-np.inf, 0.5),))
     assert np.isnan(judged(Case(imu_before, NO_ODOMETER, early), blind, flight).tilt_deg)
+
+
+def test_steps_that_are_no_scale_are_left_out() -> None:
+    assert _drifting(PLAIN) == ()
+    assert _drifting(Case(IMU, NO_ODOMETER, DARK_1)) == ((10.0, 11.5),)
+    assert _drifting(Case(IMU_ENDS, NO_ODOMETER, DARK_1)) == ((10.0, np.inf),)
+    assert _drifting(Case(LATE_IMU, ODOMETER, BRIGHT)) == ((5.0, 6.0),)
 
 
 def test_the_worst_flight_is_named(flight: Flown) -> None:

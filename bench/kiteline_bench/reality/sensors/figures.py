@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kiteline_bench.harness.faults import within
+from kiteline_bench.harness.faults import Spans, within
 from kiteline_bench.harness.result import tilt_rad
 from kiteline_bench.reality.flown import Flown
 from kiteline_bench.reality.sensors.cases import Case
@@ -54,7 +54,7 @@ def judged(case: Case, flight: Flown, plain: Flown | None) -> Figures:
     live_scale = 100.0 * _scale(flight, "live", live_from_s) if _carried(case) else _NAN
     return Figures(
         case.name, wait_s, float(plain is None and not case.metre_s(np.inf) and np.isfinite(metric_s)),
-        100.0 * flight.false_metric((*case.dark.spans, *case.upright)), live_scale,
+        100.0 * flight.false_metric(_drifting(case)), live_scale,
         100.0 * _scale(flight, "base", known_from_s),
         {path: _over(case, flight, plain, path) for path in PATHS}, _tilt_deg(case, flight), _quality(case, flight),
         _lost(case, flight) if plain is not None or _carried(case) else _NAN,
@@ -80,6 +80,15 @@ def off_after_dark_m(case: Case, way_m: float) -> float:
 def _carried(case: Case) -> bool:
     """True if there are images all the time, or a sensor that measures the motion where there are none."""
     return not case.dark.spans or case.through_the_dark(case.odometer) or case.through_the_dark(case.imu)
+
+
+def _drifting(case: Case) -> Spans:
+    """Spans whose live poses have a step that is no scale: the world is turned, or the motion is reckoned or guessed.
+
+    What was guessed is set right when the base sees the place again.
+    """
+    dark = case.dark.spans if _carried(case) else ((case.dark.spans[0][0], np.inf),)
+    return (*dark, *case.upright)
 
 
 def _over(case: Case, flight: Flown, plain: Flown | None, path: str) -> float:
