@@ -58,9 +58,10 @@ def _one_camera(camera: str, found: Sequence[Figures]) -> list[Bar]:
 
 
 def _depth(camera: str, found: Sequence[Figures]) -> list[Bar]:
-    """Metres come from the camera, and no other sensor may change them. Of live poses ATE says it."""
+    """Metres come from the camera, and no other sensor may change them."""
     return [
         *_spread(f"{camera}: metres after the first image", found, lambda f: f.wait_s, None, 0.0, "s", 1),
+        *_spread(f"{camera}: scale, live off by", found, lambda f: f.live_scale, _DEPTH_SCALE, _DEPTH_SCALE, "%", 2),
         *_spread(f"{camera}: scale, base off by", found, lambda f: f.base_scale, _DEPTH_SCALE, _DEPTH_SCALE, "%", 2),
         *_spread(f"{camera}: frames with images and without a pose", found, lambda f: f.lost, _LOST, _LOST, "", 0),
     ]  # fmt: skip
