@@ -1,7 +1,8 @@
 """The table of LINK kinds: the parser, the help texts, the error messages and the codec's settings come from it.
 
 It imports nothing heavy, because `kiteline --help` prints it. The module of a row has
-`open_agent_end(address, options) -> ByteLink` and `open_base_end(address, options) -> LinkHub`.
+`open_agent_end(address, options) -> ByteLink` and `open_base_end(address, options) -> LinkHub`; where an address may
+have a wrong form, also `check_address(address)`, which raises LinkError.
 """
 
 from dataclasses import dataclass

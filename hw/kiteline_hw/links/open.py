@@ -22,6 +22,13 @@ def open_link(spec: str, role: Literal["agent", "base"], options: LinkOptions = 
     return end
 
 
+def check_link(spec: str) -> None:
+    """Raise LinkError for a LINK of no kind, or whose address is not of its form."""
+    check = getattr(import_module(kind_of(spec).module), "check_address", None)
+    if check is not None:
+        check(spec.partition(":")[2])
+
+
 def kind_of(spec: str) -> kinds.LinkKind:
     """The kind of a LINK. Raises LinkError if it is of none, or its address is missing or not wanted."""
     scheme, _, address = spec.partition(":")

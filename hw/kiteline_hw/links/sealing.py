@@ -8,7 +8,7 @@ import ipaddress
 from dataclasses import dataclass
 from typing import Literal
 
-from kiteline_hw.links.open import kind_of
+from kiteline_hw.links.open import check_link
 from kiteline_hw.ports import LinkError
 from kiteline_hw.system import key_store
 
@@ -36,7 +36,7 @@ def sealing_of(link: str, role: Literal["agent", "base"], agent: int, key: str, 
         return Sealing(key)
     if link == "none":
         return Sealing("")
-    kind_of(link)  # a link that does not exist is no question of keys
+    check_link(link)  # a link that cannot be opened is no question of keys
     if insecure:
         return Sealing("", (f"--insecure: {_UNSEALED}",))
     path = key_store.default_path()

@@ -85,6 +85,11 @@ class SerialHub(OneLinkHub):
         return super().alive() if self._link.alive else frozenset()
 
 
+def check_address(address: str) -> None:
+    """Raise LinkError for anything but DEVICE:BAUD."""
+    parse_serial(address)
+
+
 def open_agent_end(address: str, options: LinkOptions) -> SerialLink:
     """Open DEVICE:BAUD. Raises LinkError."""
     if options.framer is None:

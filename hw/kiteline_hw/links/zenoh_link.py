@@ -319,6 +319,11 @@ class ZenohHub(Closing):
         close_session(self.session)
 
 
+def check_address(address: str) -> None:
+    """Raise LinkError for an endpoint without protocol or port."""
+    check_endpoint(address)
+
+
 def open_agent_end(address: str, options: LinkOptions) -> ZenohLink:
     """Connect to the base at an endpoint, in the background. Raises LinkError for one that is none."""
     check_endpoint(address)

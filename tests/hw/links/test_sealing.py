@@ -3,7 +3,7 @@
 import stat
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import pytest
 import zenoh
@@ -54,6 +54,24 @@ def test_an_agent_on_a_network_is_paired_first() -> None:
         sealing_of("zenoh:tcp/10.0.0.1:7447", "agent", 3, "", insecure=False)
     pair(default_path(), 3, new_code())
     assert sealing_of("zenoh:tcp/10.0.0.1:7447", "agent", 3, "", insecure=False).key == str(default_path())
+
+
+@pytest.mark.parametrize("role", ["agent", "base"])
+@pytest.mark.parametrize(
+    ("link", "words"),
+    [
+        ("zenoh:10.0.0.1:7447", "write tcp/10.0.0.1:7447"),
+        ("serial:/dev/ttyUSB0", "expected DEVICE:BAUD"),
+        ("mavlink:/dev/ttyUSB0:57600", "expected udp:HOST:PORT"),
+        ("tcp/10.0.0.1:7447", "expected zenoh:tcp/HOST:PORT"),
+    ],
+)
+def test_an_address_that_cannot_be_opened_is_told_before_keys_are_asked_for(
+    link: str, words: str, role: Literal["agent", "base"]
+) -> None:
+    with pytest.raises(LinkError, match=words):
+        sealing_of(link, role, 3, "", insecure=False)
+    assert not default_path().exists()
 
 
 @pytest.mark.parametrize(

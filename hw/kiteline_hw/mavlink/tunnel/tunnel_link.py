@@ -117,6 +117,11 @@ class TunnelHub:
         self._link.close()
 
 
+def check_address(address: str) -> None:
+    """Raise LinkError for anything but the address of a flight controller."""
+    parse_mavlink_url(address)
+
+
 def open_agent_end(address: str, options: LinkOptions) -> MavlinkTunnelLink:
     """Open the agent's end. Raises LinkError."""
     return MavlinkTunnelLink(address, AGENT_END, required=options.required)
