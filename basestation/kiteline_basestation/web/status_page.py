@@ -43,3 +43,8 @@ def open_page(where: str, now_ns: int) -> StatusPage:
         return StatusPage(where, now_ns)
     except ValueError as error:
         raise LinkError(f"--web: {error}") from error
+    except OSError as error:
+        raise LinkError(
+            f"--web {where}: cannot listen there ({error.strerror}): is the port another program's, and is the address "
+            "one of this machine? Choose another, such as 0.0.0.0:8081 for all addresses"
+        ) from error

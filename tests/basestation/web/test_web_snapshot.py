@@ -1,6 +1,7 @@
 """The status page's snapshot of a station that has flown."""
 
 import json
+import socket
 import urllib.request
 from collections.abc import Callable
 from typing import Any
@@ -17,11 +18,12 @@ from kiteline_basestation.station import Station
 from kiteline_basestation.web import snapshot
 from kiteline_basestation.web.messages import status
 from kiteline_basestation.web.snapshot import empty_snapshot, take_snapshot
-from kiteline_basestation.web.status_page import StatusPage
+from kiteline_basestation.web.status_page import StatusPage, open_page
 from kiteline_codec.channel import CodedChannel
 from kiteline_codec.sync.config import SyncConfig
 from kiteline_core.geometry import se3
 from kiteline_core.ids import AgentId
+from kiteline_hw.ports import LinkError
 
 S = 1_000_000_000
 
@@ -111,6 +113,13 @@ def test_the_page_tells_what_is_wrong_with_the_base() -> None:
             assert json.load(answer)["troubles"] == ["store maps: not written: the disk is full"]
     finally:
         page.close()
+
+
+def test_a_port_that_is_taken_is_told_with_the_mend() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        where = f"127.0.0.1:{other.getsockname()[1]}"
+        with pytest.raises(LinkError, match=f"--web {where}: cannot listen there .*another program's.*Choose another"):
+            open_page(where, 0)
 
 
 def test_points_are_taken_again_when_maps_move_or_go(make_flight: Callable[..., Any]) -> None:
