@@ -57,6 +57,9 @@ _TOLD_AT_AGENT = {
     Trouble.EARLIER_BOOT: "the base has seen a later start of agent {n} and refuses this one: are there two agents {n} "
     "(--agent N), or was the state folder lost or copied?",
 }
+# A notice that does not fit how this end sends is the answer to another sender, with its number.
+_OTHER_BASE = "agent {n} hears another base, with other seals than this one: stop one of the two"
+_OTHER_AGENT = "the base hears another agent {n}, with other seals than this one: give each its own --agent N"
 
 
 def notice(trouble: Trouble) -> bytes:
@@ -103,7 +106,7 @@ class SealWatch:
         told = read_notice(packet)
         if told is not None:
             self._sound[agent] = 0
-            self._say(agent, (_TOLD_AT_BASE if self._at_base else _TOLD_AT_AGENT)[told])
+            self._say(agent, self._words_of(told))
             return None, None
         trouble: Trouble | None
         if self._opener is None:
@@ -136,6 +139,13 @@ class SealWatch:
         """What is new since the last call."""
         lines, self._lines = self._lines, []
         return lines
+
+    def _words_of(self, told: Trouble) -> str:
+        """What a notice means here."""
+        impossible = Trouble.SEALED if self._opener is None else Trouble.UNSEALED
+        if told is impossible:
+            return _OTHER_BASE if self._at_base else _OTHER_AGENT
+        return (_TOLD_AT_BASE if self._at_base else _TOLD_AT_AGENT)[told]
 
     def _looks_sealed(self, agent: int, packet: bytes) -> bool:
         """True if a packet begins as the peer's sealed ones do."""

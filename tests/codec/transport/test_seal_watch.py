@@ -66,6 +66,18 @@ def test_seals_on_one_side_and_other_keys_are_named_on_both(
     assert exchange(agent, base, 200)[1:] == ([], [])  # once is enough
 
 
+@pytest.mark.parametrize(("key", "trouble"), [(OURS, Trouble.UNSEALED), (None, Trouble.SEALED)])
+def test_a_notice_that_is_the_answer_to_another_sender_is_not_said_of_this_end(
+    key: bytes | None, trouble: Trouble
+) -> None:
+    """Two agents of one number: the one with the key was told that it has none."""
+    for side, words in ((Direction.UP, "give each its own --agent N"), (Direction.DOWN, "another base")):
+        end = End(side, key)
+        end.watch.take(AGENT, notice(trouble))
+        (line,) = end.watch.lines()
+        assert words in line and "key" not in line
+
+
 @pytest.mark.parametrize("key", [None, OURS])
 def test_ends_that_understand_each_other_say_nothing(key: bytes | None) -> None:
     agent, base = End(Direction.UP, key), End(Direction.DOWN, key)
