@@ -47,6 +47,7 @@ from kiteline_hw.system.start_numbers import Start, StartNumbers
 _Batch = TypeVar("_Batch", ImuBatch, OdometryBatch)
 _IDLE_TICK_S = 0.05  # s between two steps while no frame is due: keeps acknowledgements and heartbeats moving
 _DRAIN_S = 10.0  # s that a live flight waits at its end for the link to become quiet
+_DRAIN_TOLD_S = 1.5  # s of that wait after which the user is told of it: over a fast link it is over by then
 _FIRST_WORD_NS = 3_000_000_000  # ns after which it is said that no base answers: connections take less
 _SILENCE_NS = 10_000_000_000  # ns of silence after which it is said of one that did: a link that comes back takes less
 _QUIET_S = 1.0  # s that the link has to stay quiet: the base may still be working on the last keyframe
@@ -175,14 +176,21 @@ class _LiveFlight:
         if self._parent is not None:
             self._parent.send_event("frames_over")
         now_ns = quiet_ns = self._clock.now_ns()
-        end_ns = now_ns + round(_DRAIN_S * 1e9)
+        end_ns, told_ns = now_ns + round(_DRAIN_S * 1e9), now_ns + round(_DRAIN_TOLD_S * 1e9)
+        told = self._parent is not None
         while not self._stop and now_ns < end_ns and now_ns - quiet_ns < _QUIET_S * 1e9:
             self._stop.wait(_IDLE_TICK_S / 2)
             now_ns = self._clock.now_ns()
             self._base.send(runtime.step(StepInput(packets=tuple(self._base.receive())), now_ns), runtime.session)
             if not all(settled(runtime.channel)):
                 quiet_ns = now_ns
+                if not told and now_ns > told_ns:
+                    told = True
+                    process.print_lines([f"waiting, {_DRAIN_S:g} s at most, until the base has it all; Ctrl-C ends it"])
             process.notify("WATCHDOG=1")
+        if self._parent is None and now_ns >= end_ns:
+            add = "`kiteline base --store DIR --import LOG` adds it" if runtime.options.log_name else "it was not logged"
+            process.print_lines([f"not all has reached the base: {add}"])
 
     def _wait(self) -> list[str]:
         """Wait for the next frame, the next pose, or one idle tick. Returns messages of the camera."""
