@@ -189,7 +189,9 @@ class _LiveFlight:
                     process.print_lines([f"waiting, {_DRAIN_S:g} s at most, until the base has it all; Ctrl-C ends it"])
             process.notify("WATCHDOG=1")
         if self._parent is None and now_ns >= end_ns:
-            add = "`kiteline base --store DIR --import LOG` adds it" if runtime.options.log_name else "it was not logged"
+            add = (
+                "`kiteline base --store DIR --import LOG` adds it" if runtime.options.log_name else "it was not logged"
+            )
             process.print_lines([f"not all has reached the base: {add}"])
 
     def _wait(self) -> list[str]:

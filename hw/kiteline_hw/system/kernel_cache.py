@@ -24,6 +24,7 @@ COMPILE_S = 900.0  # s that a slow board may take to compile all
 _KERNELS = "_kernels"  # suffix of kernel modules
 _RECORD = "kiteline-compiled"  # file that lists compiled modules, beside their kernels
 _POLL_S = 0.1  # s between two looks at the compiler
+_SAID_S = 15.0  # s between two lines that say that it still compiles
 _ROOM_BYTES = 32 << 20  # bytes that must be free: all kernels take 15 MB
 
 
@@ -49,16 +50,27 @@ def fill(modules: Sequence[str], stop: StopSignal | None = None, parent: Parent 
         )  # fmt: skip
         with compiler:
             try:
-                if _ended(compiler, stop) and compiler.returncode == 0:
+                if _ended(compiler, stop, parent) and compiler.returncode == 0:
                     mark()
             finally:
                 compiler.kill()
     return filled()
 
 
-def _ended(compiler: subprocess.Popen[bytes], stop: StopSignal | None) -> bool:
+def still_compiling(seconds: int) -> str:
+    """The line for a user who waits."""
+    return f"compiling kernels: {seconds} s so far"
+
+
+def _ended(compiler: subprocess.Popen[bytes], stop: StopSignal | None, parent: Parent | None) -> bool:
     """Wait for the compiler to end; False if a signal came first. Raises TimeoutExpired."""
-    for _ in range(round(COMPILE_S / _POLL_S)):
+    for k in range(round(COMPILE_S / _POLL_S)):
+        seconds = round(k * _POLL_S)
+        if k > 0 and k % round(_SAID_S / _POLL_S) == 0:
+            if parent is None:
+                print_lines([still_compiling(seconds)])
+            else:
+                parent.send_event("compiling", seconds=seconds)
         with contextlib.suppress(subprocess.TimeoutExpired):
             compiler.wait(_POLL_S)
             return True

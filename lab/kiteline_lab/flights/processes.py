@@ -83,7 +83,7 @@ class _Supervisor:
         self._kill_wanted = False  # the base that flies now is to be killed
         self._flying = {f"agent{spec.agent}" for spec in agents}
         self._base_up = True
-        self._compiles = False  # a child compiles kernels, and the user knows
+        self._compiling_s: int | None = None  # s for which children compile kernels, as the user knows
         self._live = not base.link.startswith("lockstep:")
         self._over: set[str] = set()  # live agents that have flown their last frame
         self._errors: dict[str, str] = {}
@@ -118,7 +118,7 @@ class _Supervisor:
             case "ready" if agent is None and self._live:
                 self._start_agents()
             case "compiling":
-                self._tell_of_compilation()
+                self._tell_of_compilation(event.values.get("seconds", 0))
             case "progress" if agent is not None:
                 self._show(agent, event.values["frames"])
             case "result" if agent is not None:
@@ -152,11 +152,14 @@ class _Supervisor:
         if self._progress is not None:
             self._progress.update(sum(self._frames))
 
-    def _tell_of_compilation(self) -> None:
-        """Say once for all children why nothing flies yet."""
-        if self._progress is not None and not self._compiles:
-            process.print_lines([kernel_cache.COMPILING])
-        self._compiles = True
+    def _tell_of_compilation(self, seconds: int) -> None:
+        """Say why nothing flies yet; of several children that compile, one tells how long."""
+        if self._compiling_s is not None and seconds <= self._compiling_s:
+            return
+        self._compiling_s = seconds
+        if self._progress is not None:
+            line = kernel_cache.COMPILING if seconds == 0 else kernel_cache.still_compiling(seconds)
+            process.print_lines([line])
 
     def _ended(self, event: Event, agent: int | None) -> None:
         code = event.values["code"]

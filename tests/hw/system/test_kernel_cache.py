@@ -53,6 +53,32 @@ def test_a_child_process_compiles_each_source_once(tmp_path: Path) -> None:
     assert fly(tmp_path, "tiny_warm", "child") == (["compiling", "False", "True", "0"], "")  # its parent is told
 
 
+SLOW = """
+import sys
+from types import SimpleNamespace
+from kiteline_hw.system import kernel_cache
+
+kernel_cache._SAID_S = 0.2
+kernel_cache.filled = lambda: False
+kernel_cache._no_room = lambda: ""
+parent = SimpleNamespace(send_event=lambda event, **values: print(event, *values)) if sys.argv[1] == "child" else None
+"""
+
+
+def test_a_user_who_waits_for_a_compilation_hears_of_it(tmp_path: Path) -> None:
+    """A small board compiles for minutes."""
+    (tmp_path / "slow_warm.py").write_text("import time\n\ntime.sleep(1.0)\n\n\ndef warm():\n    pass\n")
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}
+
+    def said(kind: str) -> subprocess.CompletedProcess[str]:
+        code = f"{SLOW}kernel_cache.fill(['slow_warm'], parent=parent)"
+        words = [sys.executable, "-c", code, kind]
+        return subprocess.run(words, env=environment, capture_output=True, text=True, check=True)
+
+    assert said("alone").stderr.splitlines()[1:3] == ["compiling kernels: 0 s so far"] * 2
+    assert said("child").stdout.splitlines()[:2] == ["compiling", "compiling seconds"]
+
+
 FULL = """
 import errno, os, shutil, sys
 import numba.core.caching as caching
