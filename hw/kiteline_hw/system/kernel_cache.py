@@ -6,13 +6,14 @@ The compiler keeps 200 MiB that its process never returns, so it must not run in
 import contextlib
 import errno
 import hashlib
+import importlib.util
 import os
 import platform
 import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -88,6 +89,33 @@ def filled() -> bool:
         return False
 
 
+def holds_current(folders: Iterable[Path]) -> bool:
+    """True if kernels below the folders are compiled, all of them for the present modules and this processor.
+
+    It loads no module, so one of which nothing was ever compiled is not missed.
+    """
+    try:
+        records = [record for folder in folders for record in folder.rglob(_RECORD)]
+        kept = {line.split()[0]: line for record in records for line in record.read_text().splitlines()}
+        versions = _versions()
+        present = {name: line for name in kept if (line := _line(name, versions))}
+        return bool(present) and all(kept[name] == line for name, line in present.items())
+    except (OSError, ValueError, IndexError):
+        return False
+
+
+def _line(name: str, versions: str) -> str:
+    """What is recorded of a module once it is compiled; "" for a module that is gone."""
+    try:
+        spec = importlib.util.find_spec(name)
+    except ImportError:
+        return ""
+    if spec is None or spec.origin is None:
+        return ""
+    file = os.stat(spec.origin)
+    return f"{name} {file.st_mtime_ns} {file.st_size} {versions}"
+
+
 def _no_room() -> str:
     """Why the folders of compiled kernels do not take them; "" if they do."""
     try:
@@ -146,13 +174,18 @@ def compiled_for() -> tuple[str, str]:
     return str(llvm.get_host_cpu_name()), str(llvm.get_host_cpu_features().flatten())
 
 
-def _needed() -> dict[Path, set[str]]:
-    """One line per module, with everything its compiled code depends on, by the folder of its compiled kernels."""
+def _versions() -> str:
+    """What compiled code depends on beside its source."""
     import numba
 
     machine = " ".join(compiled_for())
     compiler = hashlib.blake2b(machine.encode(), digest_size=8).hexdigest()
-    versions = f"{platform.python_version()} {numba.__version__} {compiler}"
+    return f"{platform.python_version()} {numba.__version__} {compiler}"
+
+
+def _needed() -> dict[Path, set[str]]:
+    """One line per module, with everything its compiled code depends on, by the folder of its compiled kernels."""
+    versions = _versions()
     needed: dict[Path, set[str]] = {}
     for name, module in _modules():
         folder, file = folder_of(module), os.stat(module.__file__)

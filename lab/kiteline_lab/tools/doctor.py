@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import asdict
 from pathlib import Path
 
+from kiteline_hw.system import process
 from kiteline_lab.tools.checks.check import DoctorCheck, Severity
 from kiteline_lab.tools.checks.controller import check_controller
 from kiteline_lab.tools.checks.keys import check_keys
@@ -74,23 +75,32 @@ def check_packages() -> Iterable[DoctorCheck]:
 
 
 def check_kernel_cache() -> Iterable[DoctorCheck]:
-    """Check that numba can keep compiled kernels: without a cache each start compiles for many seconds."""
-    spec = importlib.util.find_spec("kiteline_core")
-    beside = Path(spec.submodule_search_locations[0] if spec and spec.submodule_search_locations else ".")
+    """Check that numba can keep compiled kernels, and whether it has: without them a start compiles for a minute."""
+    from kiteline_hw.system import kernel_cache
+
+    beside = [path for path in map(_folder_of, ("kiteline_core", "kiteline_codec", "kiteline_agent")) if path]
     named = os.environ.get("NUMBA_CACHE_DIR")
     user = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "numba"
-    for folder in [Path(named)] if named else [beside / "__pycache__", user]:
-        if _writable(folder):
-            yield DoctorCheck(
-                Severity.OK, "kernel cache", f"{folder} can be written; fill it with: kiteline doctor --warm"
-            )
-            return
+    for folder in [Path(named)] if named else [beside[0] / "__pycache__", user]:
+        if not _writable(folder):
+            continue
+        if kernel_cache.holds_current(beside if folder.parent == beside[0] else [folder]):
+            yield DoctorCheck(Severity.OK, "kernel cache", f"{folder}: kernels are compiled")
+        else:
+            text = f"{folder}: kernels are not compiled yet, so the next start takes a minute, several on a small board"
+            yield DoctorCheck(Severity.NOTE, "kernel cache", text, "kiteline doctor --warm")
+        return
     yield DoctorCheck(
         Severity.FAIL,
         "kernel cache",
-        f"cannot write {named or beside}: each start would compile for many seconds",
+        f"cannot write {named or beside[0]}: each start would compile for many seconds",
         "set NUMBA_CACHE_DIR to a folder that this user may write",
     )
+
+
+def _folder_of(package: str) -> Path | None:
+    spec = importlib.util.find_spec(package)
+    return Path(spec.submodule_search_locations[0]) if spec and spec.submodule_search_locations else None
 
 
 def check_processor() -> Iterable[DoctorCheck]:
@@ -270,13 +280,15 @@ def main(argv: list[str]) -> int:
     p.add_argument("--calibration", metavar="FILE[,FILE]", default="", help="of the cameras, as the agent's")
     p.add_argument("--json", action="store_true", help="print the results as JSON")
     a = p.parse_args(argv)
+    warmed = warm() if a.warm else []  # first, so that the checks find the kernels compiled
     results = run_checks()
     if a.mavlink:
+        process.print_lines(["asking the flight controller, for some ten seconds"])
         results += check_controller(a.mavlink, a.mavlink_key)
     if a.camera:
+        process.print_lines(["watching the cameras, for some seconds"])
         results += _cameras(a.camera, a.calibration)
-    if a.warm:
-        results += warm()
+    results += warmed
     if a.json:
         lines = [{**asdict(f), "severity": f.severity.name.lower()} for f in results]
         print(json.dumps({"failed": any(f.severity is Severity.FAIL for f in results), "checks": lines}, indent=1))

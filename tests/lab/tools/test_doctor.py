@@ -13,7 +13,7 @@ import pytest
 from kiteline_hw.mavlink.codec import MavlinkCodec
 from kiteline_hw.mavlink.transport.signing import Signing, StampFile, read_key
 from kiteline_hw.sim.autopilot import ModelledAutopilot
-from kiteline_hw.system import clock, key_store
+from kiteline_hw.system import clock, kernel_cache, key_store
 from kiteline_lab.tools import doctor
 from kiteline_lab.tools.checks import keys, vehicle
 from kiteline_lab.tools.checks.check import DoctorCheck, Severity
@@ -53,12 +53,27 @@ def test_a_package_that_does_not_load_is_named(monkeypatch: pytest.MonkeyPatch) 
 
 def test_the_cache_folder_must_be_writable(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
-    assert [f.severity for f in doctor.check_kernel_cache()] == [Severity.OK]
+    (empty,) = doctor.check_kernel_cache()
+    assert empty.severity is Severity.NOTE and empty.remedy == "kiteline doctor --warm"
     (tmp_path / "file").touch()
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "file" / "below"))  # nobody may write there, root included
     found = next(iter(doctor.check_kernel_cache()))
     assert found.severity is Severity.FAIL
     assert "NUMBA_CACHE_DIR" in found.remedy
+
+
+def test_a_filled_cache_is_told_from_one_of_another_version(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    name = "kiteline_core.geometry.se3"  # any module
+    line = kernel_cache._line(name, kernel_cache._versions())
+    record = tmp_path / "some" / "kiteline-compiled"
+    record.parent.mkdir()
+    record.write_text(f"{line}\nkiteline_core.that_is_gone 1 2 3\n")
+    (filled,) = doctor.check_kernel_cache()
+    assert filled.severity is Severity.OK and "kernels are compiled" in filled.text
+    record.write_text(line.replace(line.split()[1], "1") + "\n")
+    (other,) = doctor.check_kernel_cache()
+    assert other.severity is Severity.NOTE
 
 
 def test_keys_that_others_may_read_fail_with_the_mend(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
