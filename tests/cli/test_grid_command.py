@@ -5,8 +5,11 @@ from kiteline_cli import main as cli
 
 def test_grid_without_eval_says_how(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["grid"]) == 2
-    assert "kiteline grid eval EST.yaml TRUE.yaml" in capsys.readouterr().err
+    assert "eval EST.yaml TRUE.yaml" in capsys.readouterr().err
     assert cli.main(["grid", "--help"]) == 0
+    assert "the shortest path on which a vehicle touches nothing" in capsys.readouterr().out
+    assert cli.main(["grid", "paht"]) == 2
+    assert "no verb 'paht': expected eval, path, truth" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ def aligned(est: GridFile, true: GridFile, T_true_est: F64) -> F64:
     row, column = np.nonzero(est.state == OCCUPIED)
     solid = true.state == OCCUPIED
     if not len(row) or not solid.any():
-        raise GridFileError("grids without obstacles cannot be aligned")
+        raise GridFileError("grids without obstacles cannot be aligned: leave out --align, or fly longer")
     chosen = np.random.default_rng(0).permutation(len(row))[:_POINTS]
     points = est.points(np.column_stack([column[chosen] + 0.5, row[chosen] + 0.5]).astype(np.float64))
     middle = points.mean(0)
