@@ -55,15 +55,16 @@ def check_python() -> Iterable[DoctorCheck]:
 
 def check_packages() -> Iterable[DoctorCheck]:
     """Import every plain dependency; extras may be absent."""
-    versions, broken = [], []
+    versions, broken = [], dict[str, str]()
     for distribution, module in PLAIN.items():
         try:
             importlib.import_module(module)
             versions.append(f"{distribution} {importlib.metadata.version(distribution)}")
         except Exception as error:  # a wheel for another processor fails in its own way
-            broken.append(f"{distribution} ({error})")
+            broken[distribution] = f"{distribution} ({error})"
     if broken:
-        yield DoctorCheck(Severity.FAIL, "packages", "; ".join(broken), "pip install --force-reinstall kiteline")
+        remedy = f"pip install --force-reinstall {' '.join(broken)}"
+        yield DoctorCheck(Severity.FAIL, "packages", "; ".join(broken.values()), remedy)
     else:
         yield DoctorCheck(Severity.OK, "packages", ", ".join(versions))
     for extra, packages in EXTRAS.items():

@@ -68,7 +68,7 @@ def shipped_folder() -> Path:
             found = Path(str(file.locate())).resolve()
             if found.is_file():
                 return found.parent
-    raise UnitError("the units are not part of this installation: pip install --force-reinstall --no-deps kiteline")
+    raise UnitError("the units are not part of this installation: install the wheel that `pip wheel --no-deps .` makes")
 
 
 def installed_files(place: Place, roles: Sequence[str], programs: Path) -> dict[Path, str]:
@@ -129,5 +129,6 @@ def check_programs(programs: Path, interpreter: Path) -> None:
         if any(path.is_relative_to(unseen) for unseen in _UNSEEN):
             raise UnitError(
                 f"{path} is in a home folder, which services cannot see: install kiteline where they can, with "
-                "python3 -m venv /opt/kiteline; /opt/kiteline/bin/pip install kiteline; or take --user"
+                "python3 -m venv /opt/kiteline; /opt/kiteline/bin/pip install ./kiteline-*.whl, "
+                "which `pip wheel --no-deps .` makes in a checkout; or take --user"
             )

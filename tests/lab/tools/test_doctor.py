@@ -49,6 +49,7 @@ def test_a_package_that_does_not_load_is_named(monkeypatch: pytest.MonkeyPatch) 
     found = next(iter(doctor.check_packages()))
     assert found.severity is Severity.FAIL
     assert "numpy (No module named 'no_such_module_here')" in found.text
+    assert found.remedy == "pip install --force-reinstall numpy"  # no registry has kiteline itself
 
 
 def test_the_cache_folder_must_be_writable(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
