@@ -23,7 +23,7 @@ def run(argv: list[str]) -> int | None:
         stream = sys.stdout if wants_help else sys.stderr
         print("usage: kiteline grid VERB ...; see kiteline grid VERB --help\n", file=stream)
         for name, (arguments, about, _) in _ACTIONS.items():
-            print(f"  {name} {arguments}".ljust(28) + about, file=stream)
+            print(f"  {name} {arguments}".ljust(29) + about, file=stream)
         if argv and not wants_help:
             print(f"kiteline grid: error: no verb {argv[0]!r}: expected {', '.join(_ACTIONS)}", file=stream)
         return 0 if wants_help else 2
