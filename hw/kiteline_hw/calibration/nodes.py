@@ -102,8 +102,14 @@ class Node:
         return checked_rigid(self.rows(4, 4), f"{self.path}: {self.key}")
 
     def matrix(self, shape: tuple[int, int] | None, expected: str) -> F64:
-        """A matrix written as a table of rows, cols and data. shape: None for any."""
-        rows, columns = (round(self.get(key).number(f"the number of {key}")) for key in ("rows", "cols"))
+        """A matrix written as a table of rows, cols and data. shape: None for any.
+
+        OpenCV 5 writes an array of one dimension with `sizes` in place of rows and cols: it is a column.
+        """
+        if "sizes" in self.keys:
+            rows, columns = (round(v) for v in [*self.get("sizes").numbers((1, 2), "one or two sizes"), 1.0][:2])
+        else:
+            rows, columns = (round(self.get(key).number(f"the number of {key}")) for key in ("rows", "cols"))
         if not (0 <= rows <= _MOST_ROWS and 0 <= columns <= _MOST_ROWS):
             raise self.error(expected)
         if shape is not None and (rows, columns) != shape:

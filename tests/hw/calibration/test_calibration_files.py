@@ -164,6 +164,19 @@ def test_two_ros_files_without_a_baseline_are_no_pair(tmp_path: Path) -> None:
     assert c.rig(mono=True).right is None
 
 
+def test_arrays_of_one_dimension_as_opencv_5_writes_them(tmp_path: Path) -> None:
+    """`FileStorage.write` of a flat array has `sizes` in place of rows and cols."""
+    usual = PAIR.format(t=-0.1)
+    flat = usual.replace("opencv-matrix { rows: 1, cols: 5,", "opencv-nd-matrix { sizes: [ 5 ],")
+    flat = flat.replace("opencv-matrix { rows: 3, cols: 1,", "opencv-nd-matrix { sizes: [ 3 ],")
+    assert flat.count("sizes") == 2
+    found, expected = (told(tmp_path, pair=text).rig() for text in (flat, usual))
+    assert found.right == expected.right
+    np.testing.assert_array_equal(found.T_c_r, expected.T_c_r)
+    with pytest.raises(SourceError, match=r"D2\.sizes to be one or two sizes"):
+        told(tmp_path, pair=flat.replace("sizes: [ 5 ]", "sizes: [ ]"))
+
+
 def test_opencv_files(tmp_path: Path) -> None:
     c = told(tmp_path, camera=OPENCV)
     assert c.cameras[0].fx == 803.12345678901234 and c.cameras[0].distortion[4] == 0.23839153080878486
