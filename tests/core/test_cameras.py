@@ -162,7 +162,7 @@ def test_unusable_calibrations_say_why() -> None:
         Rectifier(CameraRig(eye, eye, np.eye(4), np.eye(4)))
     swapped = np.eye(4)
     swapped[0, 3] = -0.1
-    with pytest.raises(CalibrationError, match="right of the left"):
+    with pytest.raises(CalibrationError, match=r"lies -0.1 m to the right of the left one.*exchange left and right"):
         Rectifier(CameraRig(eye, eye, np.eye(4), swapped))
     other = CameraModel(640, 480, 458.0, 458.0, 320.0, 240.0)
     with pytest.raises(CalibrationError, match="640x480"):

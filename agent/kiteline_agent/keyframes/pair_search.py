@@ -25,8 +25,8 @@ class Fault(Enum):
     CORNERS = "images: too few corners to begin a map: dark, blurred, or of something plain"
     DEPTH = "images: too few corners have a depth: no right image comes, or depth images have another scale or view"
     PAIR = (
-        "images: the right one shows hardly anything of what the left one shows: check that they are not exchanged, of "
-        "one instant and of one pair of cameras, the lenses, and the calibration"
+        "images: the right one shows hardly anything of what the left one shows: check that they are not exchanged "
+        "or upside down, of one instant and of one pair of cameras, the lenses, and the calibration"
     )
     PARALLAX = (
         "images: no two views of one camera tell depths, and there is no pose before: move it sideways, do not only "

@@ -346,7 +346,10 @@ def _stereo_rotations(rig: CameraRig) -> tuple[F64, F64, F64]:
     half = se3.so3_exp(0.5 * se3.so3_log(rig.T_c_r[:3, :3]))  # from the mean orientation to the left camera
     baseline = half.T @ rig.T_c_r[:3, 3]
     if abs(baseline[0]) < abs(baseline[1]) or baseline[0] < 0:
-        raise CalibrationError("the right camera must lie to the right of the left one (x of T_c_r positive)")
+        raise CalibrationError(
+            f"the right camera lies {baseline[0]:.3g} m to the right of the left one and {baseline[1]:.3g} m below it: "
+            "expected it on the right; exchange left and right, or mend the calibration (x of T_c_r is positive)"
+        )
     x = baseline / np.linalg.norm(baseline)
     y = np.cross(np.array([0.0, 0.0, 1.0]), x)
     y /= np.linalg.norm(y)

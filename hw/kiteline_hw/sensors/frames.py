@@ -158,7 +158,7 @@ def decode_frames(
         paired += frame.depth_m is not None if rig.right is None else frame.right is not None
         yield frame
     if delivered == 0 or ((rig.right is not None or rig.has_depth) and paired == 0):
-        why = "; ".join(report.notes) or "it holds no images"
+        why = "; ".join(_first_of_each(report)) or "it holds no images"
         pair = "pair of images" if rig.right is not None else "image with its depth"
         raise SourceError(f"{name}: not one usable {'frame' if delivered == 0 else pair} ({why})")
     apart_ns = (last_ns - first_ns) / max(delivered - 1, 1)
@@ -171,6 +171,15 @@ def decode_frames(
             f"imu: its samples begin {1e-9 * (int(late.t_ns[0]) - last_ns):.1f} s after the last image by their "
             "stamps, and none is used: expected stamps of one clock for both"
         )
+
+
+def _first_of_each(report: SourceReport) -> list[str]:
+    """The first note of each reason, with how many more items were skipped for it."""
+    first: dict[str, str] = {}
+    for note in report.notes:
+        first.setdefault(note.partition(":")[0], note)
+    more = {reason: report.skipped.get(reason, 1) - 1 for reason in first}
+    return [f"{note}, and {more[reason]} more" if more[reason] else note for reason, note in first.items()]
 
 
 class _WrongSize(Exception):

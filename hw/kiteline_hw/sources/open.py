@@ -37,6 +37,9 @@ def open_source(
         if kind.argument == "DIR" and not path.is_dir():
             raise SourceError(f"{path}: expected a folder with the layout of {kind.scheme}")
         argument = str(path)
+    first, comma, second = argument.partition("?")[0].partition(",")
+    if comma and first == second:
+        raise SourceError(f"{spec}: left and right are the same: name the right one after the comma")
     opener: Callable[..., FrameSource] = import_module(kind.module).open_source
     given = read_calibration(calibration) if isinstance(calibration, str) and calibration else calibration
     if isinstance(given, str):

@@ -184,6 +184,15 @@ def test_intrinsics_of_another_size_are_doubted(tmp_path: Path) -> None:
     assert source.report.notes[0].startswith("calibration: the centre of the right camera, (12, 8) px, is far from")
 
 
+@pytest.mark.parametrize(
+    "spec", ["images:a/*.png,a/*.png", "v4l2:/dev/video0,/dev/video0?fps=20", "ros2:/left,/left", "stream:u,u"]
+)
+def test_one_camera_named_twice_is_no_pair(spec: str) -> None:
+    """Its images flew as a pair: the rows of the right one were found 12 px off, and depths meant nothing."""
+    with pytest.raises(SourceError, match="left and right are the same"):
+        open_source(spec)
+
+
 def test_euroc_left_and_right_are_paired_by_time(tmp_path: Path) -> None:
     root = euroc(tmp_path)
     late = (root / "mav0/cam1/data.csv").read_text().splitlines()
@@ -197,8 +206,9 @@ def test_euroc_left_and_right_are_paired_by_time(tmp_path: Path) -> None:
     ]
     (root / "mav0/cam1/data.csv").write_text("\n".join(shifted))
     source = open_source(str(root))
-    with pytest.raises(SourceError, match="not one usable pair of images"):
+    with pytest.raises(SourceError, match="not one usable pair of images") as told:
         read(source)
+    assert str(told.value).count("missing right image") == 1 and "and 3 more" in str(told.value)
     assert source.report.skipped == {"missing right image": 4, "missing left image": 4}
 
 
