@@ -59,6 +59,37 @@ def test_names_of_the_code_are_in_the_code(page: str) -> None:
     assert not missing, f"{page} names what no source holds: {missing}"
 
 
+def test_names_in_other_pages_are_in_the_code_too() -> None:
+    """A class, function, field, option or module; what stands in capitals may be a flight controller's."""
+    files = [p for room in ROOMS for p in ROOT.glob(f"{room}/**/*") if p.suffix in (".py", ".env", ".service", ".js")]
+    texts = "\n".join(p.read_text(encoding="utf-8") for p in files)
+    known = (
+        set(re.findall(r"\w+", texts))
+        | {p.stem for p in files}
+        | {"linuxpy", "pyv4l2", "v4l2py", "oom", "activating", "R_a_b"}
+    )
+    for page in sorted({*ROOT.glob("docs/**/*.md")} - {ROOT / "docs/results.md"}):
+        named = set(re.findall(r"`(_?[A-Za-z]\w*(?:\.[A-Za-z_]\w*)*)(?:\([^`]*\))?`", text_of(page)))
+        named = {
+            name
+            for name in named
+            if not re.fullmatch("[A-Z0-9_x]+", name) and not name.endswith((".tum", ".msg", ".hpp"))
+        }
+        missing = [name for name in named if not set(name.removesuffix(".py").split(".")) <= known]
+        assert not missing, f"{page.name} names what no source holds: {missing}"
+
+
+def test_options_of_commands_that_are_named_exist() -> None:
+    rooms = ("agent", "basestation", "lab", "bench", "cli")
+    texts = "\n".join(p.read_text(encoding="utf-8") for room in rooms for p in ROOT.glob(f"{room}/**/*.py"))
+    known = set(re.findall(r'"(--[a-z][a-z-]*)"', texts))
+    for page in PAGES:
+        for line in re.findall(r"^.*\bkiteline [a-z-]+ .*$", page.read_text(encoding="utf-8"), re.MULTILINE):
+            for command in re.findall(r"\bkiteline [a-z][a-z-]* [^`#;|]*", line):
+                missing = set(re.findall(r"(?<=\s)--[a-z][a-z-]+", command)) - known
+                assert not missing or page.name == "results.md", f"{page.name}: {command}: {missing}"
+
+
 def test_commands_that_are_named_exist() -> None:
     commands = {c.name for group in find_commands().values() for c in group}
     for page in PAGES:
