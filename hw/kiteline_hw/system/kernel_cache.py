@@ -9,6 +9,7 @@ import hashlib
 import importlib.util
 import os
 import platform
+import re
 import shutil
 import subprocess
 import sys
@@ -23,6 +24,8 @@ from kiteline_hw.system.process import Parent, StopSignal, print_lines
 COMPILING = "compiling kernels, once for this version: about a minute, several on a small board"
 COMPILE_S = 900.0  # s that a slow board may take to compile all
 _KERNELS = "_kernels"  # suffix of kernel modules
+_OURS = "kiteline_"  # prefix of packages whose files may change at any time; others have versions
+_IMPORT = re.compile(r"^from (\S+) import", re.MULTILINE)
 _RECORD = "kiteline-compiled"  # file that lists compiled modules, beside their kernels
 _POLL_S = 0.1  # s between two looks at the compiler
 _SAID_S = 15.0  # s between two lines that say that it still compiles
@@ -104,16 +107,52 @@ def holds_current(folders: Iterable[Path]) -> bool:
         return False
 
 
+def drop_stale() -> None:
+    """Delete the compiled kernels of loaded modules that changed, or that import one that did: numba itself looks at a
+    kernel's own file alone, and would go on with what it compiled in of others. Nobody else may compile meanwhile.
+    """
+    with contextlib.suppress(OSError, ValueError):
+        for folder, lines in _needed().items():
+            for line in lines - _recorded(folder):
+                for index in folder.glob(f"{line.split()[0].rpartition('.')[2]}.*.nbi"):
+                    index.unlink(missing_ok=True)
+
+
 def _line(name: str, versions: str) -> str:
     """What is recorded of a module once it is compiled; "" for a module that is gone."""
+    stamps: dict[str, str] = {}
+    _add_stamps(name, stamps)
+    if not stamps[name]:
+        return ""
+    digest = hashlib.blake2b(repr(sorted(stamps.items())).encode(), digest_size=8).hexdigest()
+    return f"{name} {stamps[name]} {digest} {versions}"
+
+
+def _add_stamps(name: str, stamps: dict[str, str]) -> None:
+    """Add time and size of a module's file, and of those that it imports from: their kernels and constants are part of
+    its compiled code. "" for a module that is gone.
+    """
+    stamps[name], path = _stamp(name)
+    if path:
+        for other in _imports(path, stamps[name]):
+            if other not in stamps and (other.startswith(_OURS) or other.endswith(_KERNELS)):
+                _add_stamps(other, stamps)
+
+
+def _stamp(name: str) -> tuple[str, str]:
     try:
         spec = importlib.util.find_spec(name)
-    except ImportError:
-        return ""
+    except (ImportError, ValueError):
+        return "", ""
     if spec is None or spec.origin is None:
-        return ""
+        return "", ""
     file = os.stat(spec.origin)
-    return f"{name} {file.st_mtime_ns} {file.st_size} {versions}"
+    return f"{file.st_mtime_ns} {file.st_size}", spec.origin
+
+
+@cache
+def _imports(path: str, _stamp: str) -> tuple[str, ...]:
+    return tuple(_IMPORT.findall(Path(path).read_text(encoding="utf-8")))
 
 
 def _no_room() -> str:
@@ -188,9 +227,9 @@ def _needed() -> dict[Path, set[str]]:
     versions = _versions()
     needed: dict[Path, set[str]] = {}
     for name, module in _modules():
-        folder, file = folder_of(module), os.stat(module.__file__)
+        folder = folder_of(module)
         if folder is not None:
-            needed.setdefault(folder, set()).add(f"{name} {file.st_mtime_ns} {file.st_size} {versions}")
+            needed.setdefault(folder, set()).add(_line(name, versions))
     return needed
 
 

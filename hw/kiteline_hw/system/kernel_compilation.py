@@ -37,6 +37,7 @@ def main(arguments: list[str]) -> None:
     modules = [import_module(name) for name in arguments]
     lines = {line for module in modules for line in listed(module)}
     with _in_turn(modules):
+        kernel_cache.drop_stale()
         share_out(by_module(lines), processes(len(os.sched_getaffinity(0)), ComputerReader().read()))
         for module in modules:
             module.warm()

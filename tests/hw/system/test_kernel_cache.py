@@ -53,6 +53,37 @@ def test_a_child_process_compiles_each_source_once(tmp_path: Path) -> None:
     assert fly(tmp_path, "tiny_warm", "child") == (["compiling", "False", "True", "0"], "")  # its parent is told
 
 
+CALLED = "from kiteline_core.jit import helper\n\n@helper\ndef times(x):\n    return {n} * x\n"
+CALLER = (
+    "from kiteline_core.jit import njit\nfrom low_kernels import times\n\n@njit\ndef both(x):\n    return times(x)\n"
+)
+CALL = """
+import high_kernels
+from kiteline_hw.system import kernel_cache
+was = kernel_cache.filled()
+print(was, kernel_cache.fill(["high_warm"]), high_kernels.both(10), sum(high_kernels.both.stats.cache_misses.values()))
+"""
+
+
+def test_a_kernel_is_compiled_anew_when_one_that_it_calls_has_changed(tmp_path: Path) -> None:
+    """An update of a checkout flew with the old code of helpers in all files that had not changed themselves."""
+    (tmp_path / "high_kernels.py").write_text(CALLER)
+    (tmp_path / "high_warm.py").write_text("import high_kernels\n\ndef warm():\n    high_kernels.both(1)\n")
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path]),
+                   "NUMBA_CACHE_DIR": str(tmp_path / "cache")}  # fmt: skip
+
+    def called(times: int) -> str:
+        low = tmp_path / "low_kernels.py"
+        if not low.exists() or low.read_text() != CALLED.format(n=times):
+            low.write_text(CALLED.format(n=times))
+        words = [sys.executable, "-c", CALL]
+        return subprocess.run(words, env=environment, capture_output=True, text=True, check=True).stdout
+
+    assert called(2) == "False True 20 0\n"
+    assert called(2) == "True True 20 0\n"
+    assert called(300) == "False True 3000 0\n"
+
+
 SLOW = """
 import sys
 from types import SimpleNamespace
