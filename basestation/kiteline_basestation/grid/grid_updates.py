@@ -9,9 +9,10 @@ import numpy as np
 
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.grid.kept_scan import KeptScan, keep
+from kiteline_basestation.grid.landmark_ground import LandmarkGround
 from kiteline_basestation.grid.scan_grid import ScanGrid
-from kiteline_basestation.grid.sparse_scan import sparse_scan
-from kiteline_basestation.map.map_tables import LANDMARK
+from kiteline_basestation.grid.sparse_scan import sparse_ground, sparse_scan
+from kiteline_basestation.map.map_tables import LANDMARK, NO_POSE
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_codec.schema import KeyframeScan
 from kiteline_core.arrays import F64, I32, U8
@@ -22,6 +23,7 @@ _MOST_WAITS = 3  # busy steps in a row that leave the drawing to the next one
 _LOOKED = 16  # keyframes looked at for each that one step may draw: most may not have moved
 _SPARSE_LAG = 5  # keyframes after which the landmarks of one without a scan are drawn again: they are refined by then
 _SPARSE_WINDOW = 4  # keyframes before and after it whose landmarks tell where its ground lies
+_GROUND_MOVED_M = 0.05  # m by which the ground below a keyframe has to be known better until its scan is made again
 _GROUND_KEYFRAMES = 20  # newest keyframes among which one must know the height of the ground: 20 s
 
 
@@ -49,6 +51,8 @@ class GridUpdates:
         self._due: dict[KeyframeId, None] = {}  # may have moved, or are new
         self._unplaced: dict[SubmapId, dict[KeyframeId, None]] = {}  # have scans, and no place in w yet
         self._unmade: dict[KeyframeId, None] = {}  # their scan is to be made from landmarks
+        self._ground = LandmarkGround()  # of keyframes whose landmarks are drawn
+        self._planes: dict[KeyframeId, F64 | None] = {}  # the ground that their scans were made with; None: unknown
         self._waited = 0  # busy steps since something could be drawn
 
     def expect_scans(self, agent: AgentId) -> None:
@@ -56,7 +60,7 @@ class GridUpdates:
         if agent in self._scanning:
             return
         self._scanning.add(agent)
-        for keyframe in [k for k in self._scans if agent_of_keyframe(k) == agent]:
+        for keyframe in [k for k in self._scans.keys() | self._planes.keys() if agent_of_keyframe(k) == agent]:
             self._drop(keyframe)
         self._unmade = {k: None for k in self._unmade if agent_of_keyframe(k) != agent}
 
@@ -89,7 +93,7 @@ class GridUpdates:
             if agent_of_keyframe(keyframes[0]) in self._scanning:
                 self._due.update(dict.fromkeys(keyframes))
             elif submap in self._placements:
-                self._unmade.update({k: None for k in keyframes if k not in self._scans})
+                self._unmade.update({k: None for k in keyframes if k not in self._planes})
                 self._due.update(dict.fromkeys(keyframes))
 
     def remove(self, keyframes: Sequence[KeyframeId]) -> None:
@@ -118,7 +122,8 @@ class GridUpdates:
 
     def make_all(self) -> None:
         """Make the scans of all landmarks that wait for one: those of a restored map in which no step follows."""
-        self._make_some(len(self._unmade))
+        for _ in range(2):  # once more where later keyframes tell of the ground below earlier ones
+            self._make_some(len(self._unmade))
 
     def _make_some(self, most: int) -> None:
         """Make scans of landmarks, of the oldest keyframes first."""
@@ -209,6 +214,8 @@ class GridUpdates:
     def _drop(self, keyframe: KeyframeId) -> None:
         for part in self._scans.pop(keyframe, {}):
             self.grid.remove((keyframe, part))
+        self._ground.remove(keyframe)
+        self._planes.pop(keyframe, None)
         self._due.pop(keyframe, None)
         self._unplaced.get(submap_of_keyframe(keyframe), {}).pop(keyframe, None)
         self._unmade.pop(keyframe, None)
@@ -243,8 +250,17 @@ class GridUpdates:
         scale = self._map.scale(submap)
         unit_m = sim3.scale_of(S_w_k)
         local = (xyz @ T_k_map[:3, :3].T + T_k_map[:3, 3]) * (unit_m / scale)
-        made = sparse_scan(self._config, camera, S_w_k, local, np.isin(around, seen))
+        view = sparse_ground(self._config, S_w_k, local, unit_m)
+        if view is None:
+            return
+        self._ground.put(keyframe, view)
+        plane = self._know_ground(keyframe, S_w_k)
+        made = None
+        if plane is not None:
+            made = sparse_scan(self._config, camera, S_w_k, local, np.isin(around, seen), plane)
         if made is None:
+            self._labels.pop(keyframe, None)
+            self._hang(keyframe, 0, None)
             return
         scan, labels = made
         table = self._map.keypoints
@@ -256,3 +272,29 @@ class GridUpdates:
         kept = keep(self._config, scan, camera.bf, unit_m)
         if kept is not None:
             self._hang(keyframe, 0, kept)
+
+    def _know_ground(self, keyframe: KeyframeId, S_w_k: F64) -> F64 | None:
+        """The ground below a keyframe, as in `GroundView.plane`. Others whose ground it tells are to be made again."""
+        submaps = self._map.submaps_of_map(submap_of_keyframe(keyframe))
+        viewed, poses = list[KeyframeId](), list[F64]()
+        for submap in submaps:
+            if not self._is_placed(submap):
+                continue
+            some = [k for k in self._map.submaps.get(submap, []) if k in self._ground]
+            rows = np.array([self._map.rows[k] for k in some], np.int64)
+            posed = self._map.keyframes.pose_source[rows] != NO_POSE
+            viewed += [k for k, one in zip(some, posed.tolist(), strict=True) if one]
+            poses.append(self._placements[submap] @ self._map.keyframes.T_m_k[rows[posed]])
+        planes = self._ground.heights(S_w_k[:3, 3], viewed, np.concatenate(poses))
+        for other, plane in planes.items():
+            if other != keyframe and other in self._planes and _differ(plane, self._planes[other]):
+                self._unmade[other] = None
+        self._planes[keyframe] = planes[keyframe]
+        return planes[keyframe]
+
+
+def _differ(plane: F64 | None, before: F64 | None) -> bool:
+    """True if the ground is known now and was not, or the other way round, or lies elsewhere."""
+    if plane is None or before is None:
+        return plane is not before
+    return abs(float(plane[0] - before[0])) > _GROUND_MOVED_M

@@ -16,22 +16,28 @@ _SLOPE = 0.25  # m/m; steepest ground: a ramp, or a map whose z is 10 degrees of
 _PEAK_SHARE = 0.25  # of the highest peak; the lowest peak with this share is the ground, below it is noise
 _MIN_PEAK_POINTS = 4.0  # points of a peak
 _PLANE_BANDS_M = (0.3, 0.2, 0.12, 0.1)  # m; half-widths around the plane, from a bin's error to noise
+_KNOWN_BANDS = 2  # of these that ground which is known about does not need
 _MIN_PLANE_POINTS = 12.0  # points that a patch needs for a fit of its plane
 _SLOPE_PRIOR_M = 0.3  # m; points with less horizontal spread than this leave the slope near zero
 
 
-def ground_heights(points: F64, camera_z: F64) -> F64:
+def ground_heights(points: F64, camera_z: F64, plane: F64 | None = None) -> F64:
     """z of the ground at each point (n,). points: (n,3) in w. camera_z: (n,) z of the lowest camera that observes it.
 
+    plane: (3,) z at x = y = 0 and slopes along x and y of ground that is known about; None: the lowest peaks tell.
     NaN at all points if the histogram of heights below the cameras has no peak.
     """
     below = points[:, 2] < camera_z - _CAMERA_ABOVE_M
     patches = _Patches(_PATCH_M, points)
-    ground_z = _lowest_peaks(patches, points[:, 2], below)
-    if ground_z is None:
-        return np.full(len(points), np.nan)
-    planes = np.stack([ground_z, np.zeros_like(ground_z), np.zeros_like(ground_z)])
-    for band_m in _PLANE_BANDS_M:
+    bands_m: tuple[float, ...] = _PLANE_BANDS_M
+    if plane is not None:
+        planes, bands_m = patches.of_plane(plane), _PLANE_BANDS_M[_KNOWN_BANDS:]
+    else:
+        ground_z = _lowest_peaks(patches, points[:, 2], below)
+        if ground_z is None:
+            return np.full(len(points), np.nan)
+        planes = np.stack([ground_z, np.zeros_like(ground_z), np.zeros_like(ground_z)])
+    for band_m in bands_m:
         near = below & (np.abs(points[:, 2] - patches.heights(planes)) < band_m)
         planes = _fit(patches, points[:, 2], near, planes)
     return patches.heights(planes)
@@ -41,9 +47,9 @@ class _Patches:
     """Points in square patches of the x-y plane."""
 
     def __init__(self, side_m: float, points: F64) -> None:
-        corner = points[:, :2].min(axis=0)
+        self.corner: F64 = points[:, :2].min(axis=0)
         self.side_m = side_m
-        self.xy = points[:, :2] - corner
+        self.xy = points[:, :2] - self.corner
         self.at = np.asarray((self.xy // side_m).astype(np.int64))  # (n,2) column, row
         self.columns, self.rows = (int(v) + 1 for v in self.at.max(axis=0))
         self.flat: I64 = self.at[:, 1] * self.columns + self.at[:, 0]
@@ -57,6 +63,12 @@ class _Patches:
         """x and y (rows, columns) of the centres."""
         r, c = np.indices((self.rows, self.columns)).astype(np.float64)
         return (c + 0.5) * self.side_m, (r + 0.5) * self.side_m
+
+    def of_plane(self, plane: F64) -> F64:
+        """One plane (3,) as planes (3, rows, columns)."""
+        x, y = self.centres()
+        z = plane[0] + plane[1] * (x + self.corner[0]) + plane[2] * (y + self.corner[1])
+        return np.stack([z, np.full_like(z, plane[1]), np.full_like(z, plane[2])])
 
     def heights(self, planes: F64) -> F64:
         """z (n,) at the points, interpolated between the four nearest planes.

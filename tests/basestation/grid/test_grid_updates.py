@@ -5,6 +5,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pytest
 
 from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.grid.grid_view import dense
@@ -310,3 +311,43 @@ def floor_and_walls() -> Any:
     scene.world[:700, 2] = -1.5
     scene.world[:700, :2] = rng.uniform(-1, 1, (700, 2)) * [3.9, 3.4]
     return scene
+
+
+def test_what_was_drawn_above_a_platform_is_taken_back_once_the_floor_is_seen(make_flight: MakeFlight) -> None:
+    """One half of the room is a platform that a camera sees first, the other half shows the floor."""
+    scene = floor_and_walls()
+    high = scene.world[:, 0] > 0.0
+    scene.world[high & (scene.world[:, 2] == -1.5), 2] = -0.8
+    scene.world[high & (scene.world[:, 2] < -0.8), 2] += 1.0
+    flight = make_flight(keyframes=40, turns=1.0, scene=scene, start=-0.11)
+    mapper = Mapper()
+    feed(mapper, flight, flight.records[:9])
+    early = [mapper.grid_updates.ground_below(k) for k in flight.keyframes[:9]]
+    assert early == pytest.approx([-0.8] * 9, abs=0.1)
+    mapper = Mapper()
+    published = feed(mapper, flight, flight.records, more=30)
+    late = [mapper.grid_updates.ground_below(k) for k in flight.keyframes]
+    assert late[:6] == [None] * 6
+    assert None not in late[15:] and late[15:] == pytest.approx([-1.5] * 25, abs=0.1)
+    landmarks = mapper.map.live_landmarks()
+    xyz, _ = mapper.map.positions(landmarks)
+    on_top = (xyz[:, 0] > 0.8) & (xyz[:, 0] < 3.0) & (np.abs(xyz[:, 2] + 0.8) < 0.05)
+    assert np.mean(mapper.labels(landmarks[on_top]) == 1) < 0.05
+
+    own = {messages.key(r): r for r in published}
+    again = Mapper()
+    records = (CameraIntrinsics(flight.agent, flight.camera), *(r for group in flight.records for r in group))
+    again.restore(flight.agent, records, tuple(own[key] for key in sorted(own)), 0)
+    again.restore_state(mapper.state())
+    again.grid_updates.make_all()
+    restored = [again.grid_updates.ground_below(k) for k in flight.keyframes]
+    assert restored[:6] == [None] * 6
+    assert None not in restored[15:] and restored[15:] == pytest.approx([-1.5] * 25, abs=0.1)
+
+
+def test_walls_and_boxes_without_a_floor_draw_nothing(make_flight: MakeFlight) -> None:
+    flight = make_flight(keyframes=16, turns=0.8, points=1500)
+    mapper = Mapper()
+    feed(mapper, flight, flight.records)
+    assert len(mapper.map.submaps) == 1 and len(mapper.grid) == 0
+    assert (mapper.labels(mapper.map.live_landmarks()) == 0).all()

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from kiteline_basestation.config import GridConfig
 from kiteline_basestation.grid import ground_kernels as kernels
 from kiteline_basestation.grid.ground_height import ground_heights
-from kiteline_basestation.grid.sparse_scan import GROUND, OBSTACLE, UNLABELLED, label, sparse_scan
+from kiteline_basestation.grid.sparse_scan import GROUND, OBSTACLE, UNLABELLED, label, sparse_ground, sparse_scan
 from kiteline_core.arrays import F64, I64
 from kiteline_core.geometry.cameras import RectifiedCamera
 from tests.basestation.flat_rooms import camera
@@ -44,7 +44,9 @@ def test_landmarks_of_a_hall_make_a_scan(slope: float) -> None:
     points = np.concatenate([floor, wall, box])
     points[:, 2] += slope * points[:, 0]
     points_k = np.column_stack([-points[:, 1], -points[:, 2], points[:, 0]])
-    made = sparse_scan(GridConfig(), CAMERA, camera(0.0, 0.0, 0.0), points_k, np.ones(len(points), bool))
+    view = sparse_ground(GridConfig(), camera(0.0, 0.0, 0.0), points_k, 1.0)
+    assert view is not None and view.plane is not None
+    made = sparse_scan(GridConfig(), CAMERA, camera(0.0, 0.0, 0.0), points_k, np.ones(len(points), bool), view.plane)
     assert made is not None
     scan, labels = made
     assert np.mean(labels[: len(floor)] == GROUND) > 0.97 and np.mean(labels[len(floor) :] == OBSTACLE) > 0.97
@@ -61,8 +63,26 @@ def test_landmarks_of_a_hall_make_a_scan(slope: float) -> None:
 def test_without_a_floor_there_is_no_scan() -> None:
     rng = np.random.default_rng(0)
     ceiling = np.column_stack([rng.uniform(-3, 3, 200), np.full(200, -1.5), rng.uniform(1, 6, 200)])
-    assert sparse_scan(GridConfig(), CAMERA, camera(0.0, 0.0, 0.0), ceiling, np.ones(200, bool)) is None
-    assert sparse_scan(GridConfig(), CAMERA, camera(0.0, 0.0, 0.0), np.full((3, 3), np.nan), np.ones(3, bool)) is None
+    level = np.array([-1.0, 0.0, 0.0])
+    for points in (ceiling, np.full((3, 3), np.nan)):
+        seen = np.ones(len(points), bool)
+        assert sparse_scan(GridConfig(), CAMERA, camera(0.0, 0.0, 0.0), points, seen, level) is None
+    view = sparse_ground(GridConfig(), camera(0.0, 0.0, 0.0), ceiling, 1.0)
+    assert view is not None and view.plane is None and np.isnan(view.lowest_m)
+    assert sparse_ground(GridConfig(), camera(0.0, 0.0, 0.0), np.full((3, 3), np.nan), 1.0) is None
+
+
+def test_ground_that_is_known_about_is_found_below_a_box_that_shows_more() -> None:
+    rng = np.random.default_rng(2)
+    floor = np.column_stack([rng.uniform([1, -2], [5, 2], (40, 2)), rng.normal(-1.0, 0.01, 40)])
+    box = np.column_stack([rng.uniform([1, -2], [3, 2], (500, 2)), rng.normal(-0.6, 0.01, 500)])
+    points = np.concatenate([floor, box])
+    assert ground_heights(points, np.zeros(540)) == pytest.approx(-0.6, abs=0.1), "lowest peak"
+    known = ground_heights(points, np.zeros(540), np.array([-1.08, 0.0, 0.0]))
+    assert known == pytest.approx(-1.0, abs=0.05)
+    floor[:, 2] += 0.2 * floor[:, 0] - 0.1 * floor[:, 1]
+    known = ground_heights(floor, np.full(40, 1.0), np.array([-1.0, 0.2, -0.1]))
+    assert known == pytest.approx(floor[:, 2], abs=0.08)
 
 
 def ground_reference(count: F64, seed: int, seed_bin: int, reach: int, share: float, least: float) -> I64:
