@@ -167,7 +167,7 @@ class _Around(NamedTuple):
             level = np.abs(self.foot[:, None] - self.foot[None, :]) <= _AGREE_M + np.minimum(
                 _CLIMB * across, _MOST_CLIMB_M
             )
-        same = level & (apart <= _KNOWN_WITHIN_M) & seen[None, :] & seen[:, None]
+        same = level & (apart <= _KNOWN_WITHIN_M) & seen[None, :]
         moved = (same & (apart >= _APART_M)).any(1)
         n = np.maximum(same.sum(1), 1)
         x, y = self.centre[:, 0], self.centre[:, 1]

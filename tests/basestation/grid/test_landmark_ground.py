@@ -36,6 +36,27 @@ def test_a_box_is_no_ground_where_landmarks_lie_lower_and_three_of_them_are_erro
     assert ground_of(many).plane is not None, "of many landmarks more may be errors"
 
 
+def test_landmarks_a_little_below_are_those_of_the_ground() -> None:
+    floor = np.concatenate([patch((1.0, 2.5), (-1.0, 1.0), -0.8, 60), WALL])
+    assert ground_of(np.concatenate([floor, patch((1.0, 2.5), (-1.0, 1.0), -0.88, 30)])).plane is not None
+    assert ground_of(np.concatenate([floor, patch((1.0, 2.5), (-1.0, 1.0), -1.0, 4)])).plane is None
+
+
+def test_what_stands_on_the_ground_does_not_lift_it_and_is_less_than_half_of_it() -> None:
+    floor = patch((1.0, 4.0), (-1.0, 1.0), -1.0, 60)
+    assert ground_of(np.concatenate([floor, patch((1.0, 4.0), (-1.0, 1.0), -0.9, 24)])).plane == pytest.approx(
+        [-1.0, 0.0, 0.0], abs=0.02
+    )
+    assert ground_of(np.concatenate([floor, patch((1.0, 4.0), (-1.0, 1.0), -0.86, 36)])).plane is None
+
+
+def test_a_narrow_strip_of_ground_tells_no_slope_across() -> None:
+    strip = patch((1.0, 8.0), (-0.05, 0.05), -1.5, 300)
+    strip[:, 2] += 0.15 * strip[:, 0] + 0.3 * strip[:, 1]
+    plane = ground_of(strip).plane
+    assert plane is not None and abs(plane[2]) < 0.05 and plane[1] == pytest.approx(0.15, abs=0.02)
+
+
 def test_a_few_landmarks_are_no_ground() -> None:
     floor = patch((1.0, 4.0), (-2.0, 2.0), -1.0, 8)
     assert ground_of(floor).plane is not None
@@ -83,11 +104,14 @@ def seen(height_m: float = 1.0, lowest_m: float = 1.0, spread_m2: float = 2.0, u
     return GroundView(np.array([-height_m, 0.0, 0.0]), lowest_m, np.array([0.0, height_m, 2.0]), spread_m2, unit_m)
 
 
+MOVED = camera(30.0, -20.0, 2.0, 5.0) @ np.linalg.inv(camera(0.0, 0.0, 0.0))  # what is seen does not depend on it
+
+
 def heights(*views: tuple[GroundView, tuple[float, float, float]], scale: float = 1.0) -> list[float]:
     """Height of the ground below the camera by each of these views at these places; NaN: unknown."""
     ground = LandmarkGround()
     keyframes = [KeyframeId(k) for k in range(len(views))]
-    poses = np.array([camera(x, y, 0.0, z) for _, (x, y, z) in views])
+    poses = np.array([MOVED @ camera(x, y, 0.0, z) for _, (x, y, z) in views])
     poses[:, :3, :3] *= scale
     for keyframe, (view, _) in zip(keyframes, views, strict=True):
         ground.put(keyframe, view)
@@ -104,7 +128,11 @@ def test_two_places_must_agree_on_the_ground() -> None:
     assert np.isnan(heights((seen(), here), (seen(), (0.05, 0.0, 0.0)))).all()
     assert np.isnan(heights((seen(), here), (lower, beside))).all()
     assert heights((seen(), here), (seen(1.06), beside)) == pytest.approx([1.03, 1.03])
-    assert np.isnan(heights((seen(), here), (seen(1.3), (0.0, 9.0, 0.0)))).all()
+    assert np.isnan(heights((seen(), here), (seen(1.2), beside))).all()
+    assert np.isnan(heights((seen(), here), (seen(), (0.0, 9.0, 0.0)))).all(), "too far apart"
+    assert heights((seen(), here), (seen(1.2), (0.0, 2.0, 0.0))) == pytest.approx([1.1, 1.1]), "it may climb"
+    assert np.isnan(heights((seen(), here), (seen(1.2), (0.0, 0.5, 0.0)))).all()
+    assert np.isnan(heights((seen(), here), (seen(1.27), (0.0, 6.0, 0.0)))).all(), "not by more than 0.15 m"
 
 
 def test_ground_is_wider_than_a_table() -> None:
@@ -114,6 +142,9 @@ def test_ground_is_wider_than_a_table() -> None:
     assert heights((seen(spread_m2=1.15), here), (seen(spread_m2=1.15), beside)) == pytest.approx([1.0, 1.0])
     apart = heights((seen(spread_m2=0.2), here), (seen(spread_m2=0.2), (0.0, 2.2, 0.0)))
     assert apart == pytest.approx([1.0, 1.0]), "seen at two places that lie apart"
+    apart = heights((seen(spread_m2=0.2), here), (seen(spread_m2=0.2), (2.2, 0.0, 0.0)))
+    assert apart == pytest.approx([1.0, 1.0])
+    assert np.isnan(heights((seen(spread_m2=0.2), here), (seen(spread_m2=0.2), (1.2, 1.2, 0.0)))).all()
 
 
 def test_ground_is_none_where_two_views_show_something_lower() -> None:
@@ -134,9 +165,17 @@ def test_ground_is_known_near_those_that_see_it() -> None:
     blind = seen(np.nan, np.nan)
     assert heights(*floor, (blind, (0.0, 7.0, 0.5)))[2] == pytest.approx(1.5)
     assert np.isnan(heights(*floor, (blind, (0.0, 9.0, 0.5)))[2])
+    assert np.isnan(heights(*floor, (blind, (0.0, 0.0, 8.5)))[2]), "in height, too"
     assert np.isnan(heights(*floor, (blind, (0.0, 1.0, -1.5)))[2]), "below that ground"
     box = (seen(0.6, 0.9), (0.0, 0.1, 0.0))
     assert heights(*floor, box) == pytest.approx([1.0, 1.0, 1.0]), "not by what it takes for the ground itself"
+
+
+def test_the_nearest_twenty_tell_the_height() -> None:
+    near = [(seen(), (0.1 * k, 0.0, 0.0)) for k in range(11)]
+    far = [(seen(1.1), (5.0 + 0.05 * k, 0.0, 0.0)) for k in range(15)]
+    assert heights(*near, *far)[0] == pytest.approx(1.0), "eleven of twenty"
+    assert heights(*near[1:], *far)[0] == pytest.approx(1.05), "ten of twenty"
 
 
 def test_heights_are_in_metres_of_the_views_whatever_has_become_of_their_scale() -> None:
@@ -153,7 +192,7 @@ def test_a_ramp_keeps_its_slope_below_those_that_see_it() -> None:
     poses = np.array([camera(0.0, 0.3 * k, 0.0) for k in range(3)])
     for k in keyframes[:2]:
         ground.put(k, seen()._replace(plane=np.array([-1.0, 0.15, 0.02])))
-    ground.put(keyframes[2], seen(np.nan, np.nan))
+    ground.put(keyframes[2], seen(0.4)._replace(plane=np.array([-0.4, 0.3, 0.0])))
     planes = ground.heights(poses[0, :3, 3], keyframes, poses)
     assert planes[keyframes[0]] == pytest.approx([-1.0, 0.15, 0.02])
     assert planes[keyframes[2]] == pytest.approx([-1.0, 0.0, 0.0])
