@@ -21,6 +21,7 @@ _LYING = 2.0  # landmarks of ground for each one as far above it as these are th
 _FALL = 0.06  # m a m by which ground may fall away from the camera
 _KNOWN_WITHIN_M = 8.0  # m from a keyframe that shows the ground, within which its height is known
 _NEAREST = 20  # such keyframes whose median is the height of the ground
+_MOST_VIEWS, _MOST_TOLD = 128, 64  # nearest keyframes that are compared, and that are told of: 3 ms
 _REFUTED = 2  # views of something lower, until the ground is no ground: one may be an error
 _LOWER_M = 0.25  # m below the ground from which landmarks refute it, in other views
 _CLIMB = 0.1  # m a m that the ground may climb from one keyframe to another: ramps and hills
@@ -102,17 +103,18 @@ class LandmarkGround:
         return keyframe in self._views
 
     def heights(self, position: F64, keyframes: Sequence[KeyframeId], S_w_k: F64) -> dict[KeyframeId, F64 | None]:
-        """The ground (3,) below all keyframes near a position (3,), as in `GroundView.plane`; None: unknown.
+        """The ground (3,) below the keyframes nearest to a position (3,), as in `GroundView.plane`; None: unknown.
 
         keyframes: of one map, with a view. S_w_k: (n,4,4) their poses, z up.
         """
         apart = np.linalg.norm(S_w_k[:, :3, 3] - position, axis=1)
-        chosen = np.flatnonzero(apart <= 2.0 * _KNOWN_WITHIN_M)
+        chosen = np.argsort(apart, kind="stable")[:_MOST_VIEWS]
+        chosen = chosen[apart[chosen] <= 2.0 * _KNOWN_WITHIN_M]
         if not len(chosen):
             return {}
         near = [keyframes[i] for i in chosen.tolist()]
         around = _Around.of(near, [self._views[k] for k in near], S_w_k[chosen])
-        return around.heights(np.flatnonzero(apart[chosen] <= _KNOWN_WITHIN_M))
+        return around.heights(min(_MOST_TOLD, np.count_nonzero(apart[chosen] <= _KNOWN_WITHIN_M)))
 
 
 class _Around(NamedTuple):
@@ -143,13 +145,13 @@ class _Around(NamedTuple):
             scale**2 * np.array([view.spread_m2 for view in views]),
         )  # fmt: skip
 
-    def heights(self, rows: I64) -> dict[KeyframeId, F64 | None]:
-        """The ground below some of the keyframes."""
+    def heights(self, first: int) -> dict[KeyframeId, F64 | None]:
+        """The ground below the first keyframes."""
         across = np.linalg.norm(self.camera[:, None, :2] - self.camera[None, :, :2], axis=2)
         apart = np.hypot(across, self.camera[:, None, 2] - self.camera[None, :, 2])
         believed = self._believed(across, apart)
         out: dict[KeyframeId, F64 | None] = {}
-        for i in rows.tolist():
+        for i in range(first):
             near = believed[apart[i, believed] <= _KNOWN_WITHIN_M]
             near = near[np.argsort(apart[i, near], kind="stable")[:_NEAREST]]
             drop = self.camera[i, 2] - float(np.median(self.foot[near])) if len(near) else 0.0

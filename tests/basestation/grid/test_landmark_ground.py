@@ -200,3 +200,16 @@ def test_a_ramp_keeps_its_slope_below_those_that_see_it() -> None:
     assert keyframes[1] not in ground and keyframes[0] in ground
     assert ground.heights(poses[0, :3, 3], [keyframes[0]], poses[:1]) == {keyframes[0]: None}
     assert ground.heights(np.array([99.0, 0.0, 0.0]), [keyframes[0]], poses[:1]) == {}
+
+
+def test_only_the_nearest_are_compared_and_told_of() -> None:
+    """A long flight in one room has thousands of keyframes."""
+    ground, keyframes = LandmarkGround(), [KeyframeId(k) for k in range(300)]
+    poses = np.array([camera(0.0, 0.02 * k, 0.0) for k in range(300)])
+    for k in keyframes:
+        ground.put(k, seen() if k < 256 else seen(np.nan, 2.0))
+    told = ground.heights(poses[0, :3, 3], keyframes, poses)
+    assert list(told) == keyframes[:64] and told[keyframes[0]] == pytest.approx([-1.0, 0.0, 0.0])
+    told = ground.heights(poses[200, :3, 3], keyframes, poses)
+    assert len(told) == 64 and set(keyframes[169:231]) < set(told)
+    assert told[keyframes[200]] is None, "others show more"
