@@ -98,7 +98,7 @@ class GroundHeight(Generic[Tag]):
             if self._foot is not None:
                 self._refuted = self._refuted + 1 if self._is_above(self._foot, low, up) else 0
                 if self._refuted >= _REFUTED:
-                    self._foot, self._refuted = None, 0
+                    self._foot = None
                     return Verdict([], self._withdraw(up))
         if np.isnan(scan.camera_height_m):
             return Verdict([], [])
@@ -109,7 +109,7 @@ class GroundHeight(Generic[Tag]):
                 lower = seen.ground and float((self._foot - foot) @ up) > 0.0
                 self._lower = self._lower + 1 if lower else 0
                 if self._lower >= _REFUTED:  # a step down, or the height was a little too large from the start
-                    self._foot, self._lower = None, 0
+                    self._foot = None
                 return Verdict([], [])
             self._lower = 0
             if seen.ground:
@@ -124,9 +124,9 @@ class GroundHeight(Generic[Tag]):
         ]
         ends = np.concatenate([other.ends for other in same])
         moved_m = max(float(np.linalg.norm(other.camera - camera)) for other in same)
-        if len(same) < 2 or moved_m < _AGREEING_M or _width(ends, up) < _GROUND_WIDTH_M:
+        if moved_m < _AGREEING_M or _width(ends, up) < _GROUND_WIDTH_M:
             return Verdict([], [])
-        self._foot, self._refuted = foot, 0
+        self._foot, self._refuted, self._lower = foot, 0, 0
         self._held.clear()
         withdrawn = self._withdraw(up)
         self._believed.extend(same)
@@ -135,7 +135,7 @@ class GroundHeight(Generic[Tag]):
     def _begin_anew(self) -> list[Tag]:
         """Forget all that was seen. Returns the tags of scans that were believed."""
         tags = [place.tag for place in self._believed]
-        self._foot, self._refuted, self._lower = None, 0, 0
+        self._foot = None
         for seen in (self._held, self._believed, self._low):
             seen.clear()
         return tags
@@ -144,7 +144,6 @@ class GroundHeight(Generic[Tag]):
         """Forget scans whose ground lies above what was seen. Returns their tags."""
         high = [place for place in self._believed if self._too_high(place.foot, up)]
         self._believed = deque((p for p in self._believed if not any(p is h for h in high)), maxlen=_BELIEVED)
-        self._held = deque((p for p in self._held if not self._too_high(p.foot, up)), maxlen=_HELD)
         return [place.tag for place in high]
 
     def _too_high(self, foot: F64, up: F64) -> bool:
@@ -157,7 +156,7 @@ class GroundHeight(Generic[Tag]):
 
     def _is_level(self, a: F64, b: F64, up: F64) -> bool:
         along, across = _apart(a, b, up)
-        return abs(along) < self._level_m(across) + 1e-9
+        return abs(along) <= self._level_m(across)
 
     def _level_m(self, across_m: float) -> float:
         """By how much heights of ground may differ over a distance."""

@@ -148,3 +148,68 @@ def test_a_box_beside_the_way_does_not_lift_the_ground() -> None:
     boxes = fly(ground, *(seen(0.4 + 0.1 * k, 1.6, 0.2, 0.1) for k in range(6)), first=2)
     assert not any(v.believed for v in boxes)
     assert expected(ground, 1.0, 1.6) == pytest.approx(1.6)
+
+
+def known_floor() -> GroundHeight[int]:
+    ground: GroundHeight[int] = GroundHeight()
+    assert fly(ground, *(seen(x, 1.2, 0.0, 0.1) for x in (0.0, 0.5)))[1].believed == [0, 1]
+    return ground
+
+
+def test_views_of_something_lower_count_only_one_after_the_other() -> None:
+    ground = known_floor()
+    low, floor = seen(0.6, 1.2, None, -0.6), seen(0.6, 1.2, 0.0, 0.1)
+    assert not any(v.withdrawn for v in fly(ground, low, floor, low, floor, low, first=2))
+    assert expected(ground, 0.6, 1.2) == pytest.approx(1.2)
+    ground = known_floor()
+    step, floor = seen(0.6, 1.2, -0.3, -0.2), seen(0.6, 1.2, 0.0, 0.1)
+    fly(ground, step, floor, step, first=2)
+    assert expected(ground, 0.6, 1.2) == pytest.approx(1.2)
+    fly(ground, step, first=5)
+    assert expected(ground, 0.6, 1.2) is None
+    fly(ground, *(seen(x, 1.2, -0.3, -0.2) for x in (0.6, 1.0)), seen(1.0, 1.2, -0.6, -0.5), first=6)
+    assert expected(ground, 1.0, 1.2) == pytest.approx(1.5), "one lower view, again"
+
+
+@pytest.mark.parametrize("count", [2, 3])
+def test_after_something_lower_was_seen_the_count_begins_anew(count: int) -> None:
+    """The floor that takes the place of a table is not given up by one wrong view."""
+    ground: GroundHeight[int] = GroundHeight()
+    fly(ground, *(seen(0.2 * k, 1.6, 0.8, None) for k in range(count)))
+    fly(ground, *(seen(x, 1.6, None, 0.1) for x in (1.2, 1.4)), first=10)
+    fly(ground, *(seen(1.4 + 0.2 * k, 1.6, 0.0, 0.1) for k in range(3)), first=20)
+    fly(ground, seen(2.0, 1.6, None, -0.6), first=30)
+    assert expected(ground, 2.0, 1.6) == pytest.approx(1.6)
+
+
+def test_two_places_agree_the_better_the_nearer_they_are() -> None:
+    for x, z, agree in ((0.5, 0.14, True), (0.5, 0.16, False), (5.0, 0.24, True), (5.0, 0.26, False)):
+        ground: GroundHeight[int] = GroundHeight()
+        verdict = fly(ground, seen(0.0, 1.2, 0.0, None), seen(x, 1.2, z, None))[1]
+        assert bool(verdict.believed) == agree, (x, z)
+    near: GroundHeight[int] = GroundHeight()
+    assert not fly(near, seen(0.0, 1.2, 0.0, 0.1), seen(0.08, 1.2, 0.0, 0.1))[1].believed, "one place"
+
+
+def test_ground_may_fall_on_the_way_to_what_was_seen_lower() -> None:
+    ground = known_floor()
+    assert not any(v.withdrawn for v in fly(ground, *(seen(4.5, 1.2, None, -0.5) for _ in "ab"), first=2))
+    assert fly(known_floor(), *(seen(1.0, 1.2, None, -0.5) for _ in "ab"), first=2)[1].withdrawn == [0, 1]
+
+
+def test_narrow_ground_is_wide_where_it_is_seen_from_places_that_lie_apart() -> None:
+    views = [seen(x, 1.2, 0.0, None, far_m=1.5) for x in (0.0, 0.3, 3.5)]
+    beside, apart = fly(GroundHeight(), *views)[1:]
+    assert not beside.believed and apart.believed == [0, 1, 2]
+    aslant = [seen(x, 1.2, 0.0, None, far_m=2.2) for x in (0.0, 0.2)]
+    assert not fly(GroundHeight(), *aslant)[1].believed, "2.6 m wide"
+
+
+def test_a_climb_does_not_lose_the_ground_below() -> None:
+    assert expected(known_floor(), 0.5, 10.0) == pytest.approx(10.0)
+
+
+def test_a_vertical_that_is_a_little_better_known_changes_nothing() -> None:
+    ground, view = known_floor(), seen(1.0, 1.2, 0.0, 0.1)
+    up_c = np.array([0.0, -np.cos(0.05), np.sin(0.05)])
+    assert not ground.note(2, view._replace(scan=replace(view.scan, up_c=up_c))).withdrawn
