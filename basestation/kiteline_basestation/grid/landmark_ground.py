@@ -114,7 +114,7 @@ class LandmarkGround:
             return {}
         near = [keyframes[i] for i in chosen.tolist()]
         around = _Around.of(near, [self._views[k] for k in near], S_w_k[chosen])
-        return around.heights(min(_MOST_TOLD, np.count_nonzero(apart[chosen] <= _KNOWN_WITHIN_M)))
+        return around.heights(min(_MOST_TOLD, int(np.count_nonzero(apart[chosen] <= _KNOWN_WITHIN_M))))
 
 
 class _Around(NamedTuple):

@@ -11,6 +11,7 @@ from kiteline_basestation.grid.ground_height import ground_heights
 from kiteline_basestation.grid.sparse_scan import GROUND, OBSTACLE, UNLABELLED, label, sparse_ground, sparse_scan
 from kiteline_core.arrays import F64, I64
 from kiteline_core.geometry.cameras import RectifiedCamera
+from kiteline_core.ground.column_scan import ColumnScan
 from tests.basestation.flat_rooms import camera
 
 CAMERA = RectifiedCamera(640, 480, 320.0, 320.0, 319.5, 239.5, 0.1, True, np.eye(4))
@@ -112,3 +113,70 @@ def test_ground_spreads_as_in_the_reference(seed: int) -> None:
     ground = np.zeros(count.shape[:2], np.int32)
     kernels.spread_ground(count, start, start_bin, reach, 0.25, 4.0, ground, np.zeros(ground.size, np.int32))
     assert np.array_equal(ground, ground_reference(count.astype(float), start, start_bin, reach, 0.25, 4.0))
+
+
+def scan_from(height_m: float, points: F64, seen: list[bool] | None = None) -> ColumnScan:
+    """A scan of landmarks (n,3) about a camera above a floor that a grid of unseen landmarks shows."""
+    x, y = np.meshgrid(np.arange(0.5, 9.0, 0.5), np.arange(-4.0, 4.5, 0.5))
+    floor = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, -height_m)])
+    local = np.concatenate([points + [0.0, 0.0, -height_m], floor])
+    mine = np.concatenate([np.ones(len(points), bool) if seen is None else seen, np.zeros(len(floor), bool)])
+    points_k = np.column_stack([-local[:, 1], -local[:, 2], local[:, 0]])
+    made = sparse_scan(GridConfig(), CAMERA, camera(0.0, 0.0, 0.0), points_k, mine, np.array([-height_m, 0.0, 0.0]))
+    assert made is not None
+    return made[0]
+
+
+def ahead(scan: ColumnScan, azimuth_rad: float) -> int:
+    return int(np.argmin(np.abs(scan.azimuths_rad - azimuth_rad)))
+
+
+def test_columns_of_landmarks_span_the_image() -> None:
+    scan = scan_from(1.4, np.array([[6.0, 0.1, 0.0]]))
+    half = np.arctan(1.0)
+    assert len(scan) == 36 and scan.azimuths_rad[0] == pytest.approx(-half * 35 / 36)
+    assert scan.azimuths_rad[-1] == pytest.approx(half * 35 / 36)
+    outside = scan_from(1.4, np.array([[1.0, 1.3, 0.0], [1.0, -1.3, 0.0], [25.0, 0.0, 0.0], [3.0, 0.0, 2.2]]))
+    assert not outside.free_m.any() and not outside.bands.any()
+    assert not scan_from(1.4, np.array([[6.0, 0.1, 0.0]]), [False]).free_m.any(), "another keyframe's"
+
+
+def test_a_ray_to_the_floor_frees_where_it_is_lower_than_boxes_are() -> None:
+    scan = scan_from(1.4, np.array([[6.0, 0.1, 0.0]]))
+    k = ahead(scan, 0.1 / 6.0)
+    assert scan.free_m[k] == pytest.approx(6.0, abs=0.01) and scan.free_from_m[k] == pytest.approx(3.0, abs=0.1)
+    assert np.count_nonzero(scan.free_m) == 1 and not np.isfinite(scan.obstacle_m).any()
+    low = scan_from(0.6, np.array([[6.0, 0.1, 0.0]]))
+    assert low.free_from_m[k] == 0.0, "the camera itself is lower"
+
+
+def test_a_ray_to_an_obstacle_frees_up_to_it_if_that_is_low() -> None:
+    k = ahead(scan_from(1.4, np.array([[6.0, 0.1, 0.0]])), 0.1 / 6.0)
+    low = scan_from(1.4, np.array([[6.0, 0.1, 0.35]]))
+    assert low.obstacle_m[k] == pytest.approx(6.0, abs=0.01) and low.bands[k] == 1
+    assert low.free_m[k] == pytest.approx(6.0, abs=0.01)
+    assert low.free_from_m[k] == pytest.approx(4.0, abs=0.1), "0.7 m high after two thirds of its way"
+    for height in (0.8, 1.6):
+        high = scan_from(1.4, np.array([[6.0, 0.1, height]]))
+        assert np.isfinite(high.obstacle_m[k]) and high.free_m[k] == 0.0
+    above = scan_from(0.2, np.array([[6.0, 0.1, 0.5]]))
+    assert above.free_m[k] == pytest.approx(6.0, abs=0.01) and above.free_from_m[k] == 0.0
+
+
+def test_landmarks_close_behind_an_obstacle_belong_to_it() -> None:
+    k = ahead(scan_from(1.4, np.array([[6.0, 0.1, 0.0]])), 0.1 / 6.0)
+    scan = scan_from(1.4, np.array([[3.0, 0.05, 0.35], [3.25, 0.05, 0.9], [3.4, 0.05, 1.5]]))
+    assert scan.obstacle_m[k] == pytest.approx(3.0, abs=0.01) and scan.bands[k] == 0b011
+
+
+def test_the_camera_is_as_high_as_the_ground_next_to_it_lies_low() -> None:
+    """Twenty landmarks of the ground next to the camera tell, on a ramp too."""
+    rng = np.random.default_rng(5)
+    points = rng.uniform([1.0, -1.0, 0.0], [9.0, 1.0, 0.0], (400, 3))
+    points[:, 2] = 0.1 * points[:, 0] - 1.5
+    points_k = np.column_stack([-points[:, 1], -points[:, 2], points[:, 0]])
+    made = sparse_scan(
+        GridConfig(), CAMERA, camera(0.0, 0.0, 0.0), points_k, np.ones(400, bool), np.array([-1.5, 0.1, 0.0])
+    )
+    nearest = np.sort(np.hypot(points[:, 0], points[:, 1]))[:20]
+    assert made is not None and made[0].camera_height_m == pytest.approx(1.5 - 0.1 * np.median(nearest), abs=0.02)
