@@ -19,6 +19,7 @@ from kiteline_agent.keyframes.new_landmarks import NewPoints
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_agent.tracking.frame_images import NO_GRID, FrameImages
+from kiteline_agent.tracking.pose_state import scaled
 from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
@@ -35,16 +36,24 @@ _MAX_S = 1.98  # s after which a new first frame is taken: the view has changed 
 class TwoViewMap:
     """The first keyframe of a map, triangulated from a second view.
 
-    images, t_ns: of the first frame. frames: from there to the second one. T_a_b: (4,4) second camera in the first.
-    points: new landmarks in the first frame. median_depth_m: theirs.
+    images, t_ns: of the first frame. T_m_a: (4,4) where it was predicted. frames: from there to the second one. T_a_b:
+    (4,4) second camera in the first. points: new landmarks in the first frame. median_depth_m: theirs.
     """
 
     images: FrameImages
     t_ns: int
+    T_m_a: F64
     frames: int
     T_a_b: F64
     points: NewPoints
     median_depth_m: float
+
+    def scaled(self, factor: float) -> "TwoViewMap":
+        """The same with all lengths `factor` times as long."""
+        return replace(
+            self, T_a_b=scaled(self.T_a_b, factor), median_depth_m=factor * self.median_depth_m,
+            points=replace(self.points, disparity=self.points.disparity / factor),
+        )  # fmt: skip
 
     def set_sigma(self, local_map: LocalMap, keyframe: KeyframeId, sigma_px: float) -> None:
         """Write the deviations of the triangulated depths into the local map. sigma_px: of a pixel at octave 0."""
@@ -68,7 +77,7 @@ class TwoViewStart:
         self._intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
         self._median_depth_m = config.two_view_start.median_depth_m
         self._first: FrameImages | None = None
-        self._first_t_ns = 0
+        self._first_t_ns, self._T_m_first = 0, np.eye(4)
         self._frames = 0
         self._corners = FrameFlow(_FLOW)  # that are still followed
         self._uv0 = np.zeros((0, 2))
@@ -117,6 +126,7 @@ class TwoViewStart:
         images = ctx.images
         corners = features.detect(images.left, np.zeros((0, 2)), self._detector)
         self._first, self._first_t_ns, self._frames = replace(images, right=None), ctx.t_ns, 0
+        self._T_m_first = ctx.T_m_c
         self._corners.begin(images.left[0], corners.uv)
         self._uv0, self._octave = corners.uv, corners.octave
         self._templates = np.empty((len(corners.uv), *self._templates.shape[1:]), np.uint8)
@@ -152,7 +162,7 @@ class TwoViewStart:
         angle, descriptor = features.describe(first.left, place, octave)
         disparity = self._camera.bf / (seen.points[rows, 2] * factor)
         points = NewPoints(place, disparity, octave, angle, descriptor)
-        return TwoViewMap(first, self._first_t_ns, self._frames, T_a_b, points, self._median_depth_m)
+        return TwoViewMap(first, self._first_t_ns, self._T_m_first, self._frames, T_a_b, points, self._median_depth_m)
 
     def _mean_warp(self) -> F64:
         """Linear part (2,2) of the affine map that fits the corners of the first frame to those of the last."""

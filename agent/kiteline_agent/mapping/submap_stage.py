@@ -11,7 +11,7 @@ from kiteline_agent.inertial.inertial_tracker import InertialTracker
 from kiteline_agent.initialisation.inertial_map import InertialMap
 from kiteline_agent.initialisation.inertial_start import InertialStart
 from kiteline_agent.initialisation.metric_restart import MetricPoints, metric_points
-from kiteline_agent.initialisation.two_view_start import TwoViewStart
+from kiteline_agent.initialisation.two_view_start import TwoViewMap, TwoViewStart
 from kiteline_agent.initialisation.unscaled_path import UnscaledPath
 from kiteline_agent.initialisation.window import lens_correction
 from kiteline_agent.keyframes.depth_from_motion import DepthFromMotion
@@ -24,6 +24,7 @@ from kiteline_agent.mapping.keyframe_stage import KeyframeStage
 from kiteline_agent.mapping.start_watch import VIEWS_S, StartWatch
 from kiteline_agent.mapping.submaps import TRACKED_M, TRACKED_RAD
 from kiteline_agent.motion.loss_motion import LossMotion
+from kiteline_agent.motion.odometer_scale import LEAST_MOVED_M
 from kiteline_agent.relocalisation.relocaliser import Relocaliser
 from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_agent.tracking.track import Track
@@ -227,9 +228,12 @@ class SubmapStage:
             if not camera.submaps.any:
                 self._warnings += self._views_watch.note(ctx.t_ns, Fault.PARALLAX)
             return None
+        unit, told_by = self._unit_by_motion(ctx, two_views), "convention"
+        if unit is not None:
+            two_views, told_by = two_views.scaled(unit), "the motion that a sensor tells"
         if camera.submaps.any:
             camera.leave_submap()
-        events = ["submap: opened", f"mono: scale by convention, median depth {two_views.median_depth_m:.3g} m"]
+        events = ["submap: opened", f"mono: scale by {told_by}, median depth {two_views.median_depth_m:.3g} m"]
         camera.motion.begin_unscaled_map()
         camera.open_submap()
         camera.pose.reset_motion()
@@ -250,6 +254,16 @@ class SubmapStage:
         camera.pose.set_motion(se3.exp(se3.log(two_views.T_a_b) / two_views.frames), velocity)
         self._keyframes.add(ctx, track)
         return OpenedSubmap(True, events)
+
+    def _unit_by_motion(self, ctx: FrameContext, views: TwoViewMap) -> float | None:
+        """Metres in one unit of two views, by the way between them that a sensor told; None if none did.
+
+        Roughly: it keeps the odometry frame from jumping until the scale is known.
+        """
+        told_m = float(np.linalg.norm(ctx.T_m_c[:3, 3] - views.T_m_a[:3, 3]))
+        seen = float(np.linalg.norm(views.T_a_b[:3, 3]))
+        measured = self._camera.submaps.any and self._camera.had_metres and self._camera.motion.measures_motion
+        return told_m / seen if measured and told_m > LEAST_MOVED_M and seen > 0.0 else None
 
     def join_older(self, ctx: FrameContext, track: Track) -> list[str]:
         """Search the older submaps beside a new one; if one is found, make a keyframe in both and continue in the old.

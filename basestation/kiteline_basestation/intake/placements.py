@@ -131,7 +131,9 @@ class SubmapPlacements:
 
     def _is_apart_in_metres(self, submap: SubmapId, keyframe: KeyframeId) -> bool:
         """True if nothing tells how a submap in metres lies to the placed ones, which are its agent's and not."""
-        if submap not in self._map.metric_submaps or submap in self._intake.loss_ties or self._in_metres:
+        tie = self._intake.loss_ties.get(submap)
+        tied = tie is not None and submap_of_keyframe(tie.since) in self.S_w_m
+        if submap not in self._map.metric_submaps or tied or self._in_metres:
             return False
         stamps = self._map.keyframes.t_ns[[self._map.rows[k] for k in (self._map.submaps[submap][0], keyframe)]]
         if stamps[1] - stamps[0] < _LATE_TIE_S * 1e9:

@@ -3,18 +3,19 @@
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import pytest
 
 from kiteline_basestation.mapper import Mapper, MapperInput
-from kiteline_codec.schema import CameraIntrinsics, SubmapScale
-from kiteline_core.ids import submap_of_keyframe
+from kiteline_codec.schema import CameraIntrinsics, Record, SubmapScale, SubmapTie
+from kiteline_core.ids import keyframe_id, submap_id, submap_of_keyframe
 from tests.basestation.feeding import STEP_NS, WITHOUT_GRID
 from tests.basestation.test_monocular import in_own_unit
 
 MakeFlight = Callable[..., Any]
 
 
-@pytest.mark.parametrize("by", ["the same agent", "another agent"])
+@pytest.mark.parametrize("by", ["the same agent", "another agent", "the same agent, tied to a map without a place"])
 def test_a_map_in_metres_begins_a_new_world_where_nothing_ties_it_to_one_in_another_unit(
     make_flight: MakeFlight, by: str
 ) -> None:
@@ -25,7 +26,12 @@ def test_a_map_in_metres_begins_a_new_world_where_nothing_ties_it_to_one_in_anot
     own_submap, submap = (submap_of_keyframe(f.keyframes[0]) for f in (own, later))
     mapper = Mapper(WITHOUT_GRID)
     withdrawn: list[int] = []
-    for flight, said in ((own, []), (later, [SubmapScale(submap, 1.0)])):
+    metres: list[Record] = [SubmapScale(submap, 1.0)]
+    if "tied" in by:
+        between = keyframe_id(submap_id(later.agent, 1, 9), 3)
+        metres.append(SubmapTie(submap, between, np.eye(4), 0.005, 0.002))
+    said_of: list[tuple[Any, list[Record]]] = [(own, []), (later, metres)]
+    for flight, said in said_of:
         for n, batch in enumerate([[CameraIntrinsics(flight.agent, flight.camera), *said], *flight.records, []]):
             output = mapper.step(MapperInput(((flight.agent, tuple(batch)),)), n * STEP_NS)
             withdrawn += [key.id for _, key in output.withdrawn]
