@@ -11,7 +11,10 @@ _START = 0.1  # relative deviation at the start
 _MOST = 0.25  # relative; a larger difference is a fault, not a scale
 _FLOOR = 0.01  # least relative deviation
 _SIGMA_M_S = 0.05  # m/s; expected noise of a window
+_LEAST_M_S = 0.015  # m/s; least noise of one, where windows show less than expected
 _WALK = 0.003  # relative change per sqrt(s): load and temperature
+_YOUNG_WALK, _YOUNG_S = 0.05, 4.0  # relative per sqrt(s), and s in which it calms down, of one camera's map
+_CLEAR_S, _CLEAR, _CLEAR_DEVIATIONS = 1.5, 0.06, 4.0  # s, relative: by more than that a map is corrected sooner
 _GATE = 3.0  # deviations beyond which a window is left out: slip
 
 
@@ -22,19 +25,23 @@ class OdometerScale:
         """of_map: the map of one camera, whose lengths the odometer tells: the map is off by it, not the odometer."""
         self._of_map = of_map
         self.value, self.var = 1.0, _START**2
-        self._age_s = 0.0  # of compared windows since the map began
+        self._age_s = 0.0  # of compared windows since the map began, or was corrected
+        self._grown_s = 0.0  # of those since it was in a unit of its own
 
-    def add(self, by_odometer: F64, by_images: F64, dt_s: float) -> None:
-        """Add a window of so many s: displacements (3,) in m."""
+    def add(self, by_odometer: F64, by_images: F64, dt_s: float, noise_m_s: float) -> None:
+        """Add a window of so many s: displacements (3,) in m. noise_m_s: of the windows before, an axis."""
         distance, square = float(np.sqrt(by_images @ by_images)), float(by_odometer @ by_odometer)
-        self.var += (MAP_WALK if self._of_map else _WALK) ** 2 * dt_s
+        self.var += self._walk_square() * dt_s
         self._age_s += dt_s
+        self._grown_s += dt_s
         if square <= LEAST_MOVED_M**2:
             return
         along = float(by_odometer @ by_images)
         # Over the part along the images' motion: the odometer's own noise in its square would shorten it.
         measured = distance**2 / along if along > 0.0 else 0.0
-        var = (_SIGMA_M_S * dt_s / distance) ** 2 if distance > 0.0 else np.inf
+        # A map of one camera drifts within seconds: its windows count as what they are.
+        noise_m_s = min(max(noise_m_s, _LEAST_M_S), _SIGMA_M_S) if self._of_map else _SIGMA_M_S
+        var = (noise_m_s * dt_s / distance) ** 2 if distance > 0.0 else np.inf
         off = measured - self.value
         aligned = along > _ALIGNED * distance * float(np.sqrt(square))
         if aligned and off * off < _GATE**2 * (self.var + var):
@@ -42,10 +49,22 @@ class OdometerScale:
             self.value = float(np.clip(self.value + gain * off, 1.0 - _MOST, 1.0 + _MOST))
             self.var = max((1.0 - gain) * self.var, _FLOOR**2)
 
+    def _walk_square(self) -> float:
+        """Relative change per sqrt(s), squared. A young map of one camera drifts by percents: few views made it."""
+        if not self._of_map:
+            return _WALK**2
+        return MAP_WALK**2 + float(_YOUNG_WALK * np.exp(-self._grown_s / _YOUNG_S)) ** 2
+
+    def begin_unscaled(self) -> None:
+        """A map in a unit of its own begins: once that is told it may still drift."""
+        self.value, self.var, self._age_s, self._grown_s = 1.0, _START**2, 0.0, 0.0
+
     def begin(self, factor: float) -> None:
         """A map in metres begins, whose lengths are `factor` times those before: the next correction waits."""
         self.scale_map(factor)
         self._age_s = 0.0
+        if abs(self.value - 1.0) > _MOST:  # the map was off by more than is followed
+            self.value, self.var = 1.0, _START**2
 
     def scale_map(self, factor: float) -> None:
         """Lengths in the map were multiplied by `factor`."""
@@ -57,4 +76,6 @@ class OdometerScale:
         """Factor by which the map is to be scaled, and its deviation; None if it is right as far as is known."""
         if not self._of_map:
             return None
-        return correction_due(1.0 / self.value, float(np.sqrt(self.var)) / self.value**2, self._age_s)
+        scale, sigma = 1.0 / self.value, float(np.sqrt(self.var)) / self.value**2
+        clear = self._age_s >= _CLEAR_S and abs(np.log(scale)) > max(_CLEAR_DEVIATIONS * sigma / scale, _CLEAR)
+        return (scale, sigma) if clear else correction_due(scale, sigma, self._age_s)

@@ -5,9 +5,10 @@ import numpy as np
 from kiteline_core.arrays import F64
 
 WINDOW_S = 0.4  # s; window of a comparison
-_WINDOWS = 40  # newest windows that are kept
+WINDOWS = 20  # newest windows that are kept: the unit of a young map drifts
 _LEAST_WINDOWS = 5  # least number of agreeing windows for a scale
 _LEAST_SHARE = 0.7  # least share of the windows that must agree
+_NEWEST = 2  # windows of which one must lie near the median: else the unit changes, or the odometer slips now
 _LEAST_MOVED_M = 0.05  # m; least motion by the odometer in a window that counts
 _OUTLYING = 3.0  # deviations of a window from the median scale: slip, a moment of bad images
 
@@ -15,9 +16,9 @@ _OUTLYING = 3.0  # deviations of a window from the median scale: slip, a moment 
 class UnitScale:
     """Windows in which odometer and images moved, and the metres per unit of the map that they give."""
 
-    def __init__(self, aligned: float) -> None:
-        """aligned: least cosine between both displacements of a window that agrees."""
-        self._aligned = aligned
+    def __init__(self, aligned: float, windows: int = WINDOWS) -> None:
+        """aligned: least cosine between both displacements of a window that agrees. windows: newest ones, kept."""
+        self._aligned, self._most = aligned, windows
         # Displacement by the odometer times that by the images, m times units; the latter's square; agrees.
         self._windows: list[tuple[float, float, bool]] = []
 
@@ -32,7 +33,12 @@ class UnitScale:
             return
         along = float(by_odometer @ by_images)
         self._windows.append((along, b * b, along > self._aligned * a * b))
-        del self._windows[:-_WINDOWS]
+        del self._windows[: -self._most]
+
+    @property
+    def full(self) -> bool:
+        """True if there are as many windows as are kept."""
+        return len(self._windows) == self._most
 
     def metres_per_unit(self) -> tuple[float, float] | None:
         """Metres per unit of the map and its standard deviation; None while unknown."""
@@ -44,6 +50,8 @@ class UnitScale:
         middle = float(np.median(each))
         spread = 1.4826 * float(np.median(np.abs(each - middle)))
         near = np.abs(each - middle) <= _OUTLYING * spread
+        if not near[-_NEWEST:].any():
+            return None
         metres = float(along[near].sum() / square[near].sum())
         left = along[near] - metres * square[near]
         count = np.count_nonzero(near)

@@ -6,6 +6,7 @@ import pytest
 from kiteline_agent.motion.odometer_scale import OdometerScale
 
 DT_S = 0.2
+NOISE_M_S = 0.05
 
 
 def driven(scale: OdometerScale, seconds: float, growth: float = 1.0, noise: float = 0.0, seed: int = 0) -> None:
@@ -13,7 +14,7 @@ def driven(scale: OdometerScale, seconds: float, growth: float = 1.0, noise: flo
     rng = np.random.default_rng(seed)
     for k in range(round(seconds / DT_S)):
         moved = 0.8 * DT_S * np.array([np.cos(0.3 * k), np.sin(0.3 * k), 0.1])
-        scale.add(moved + noise * rng.normal(size=3), growth * moved, DT_S)
+        scale.add(moved + noise * rng.normal(size=3), growth * moved, DT_S, NOISE_M_S)
 
 
 def test_a_map_that_grew_is_to_be_scaled_back() -> None:
