@@ -49,8 +49,10 @@ def warm(config: BaseConfig | None = None) -> None:
     sparse_map.set_camera(AgentId(0), replace(stereo, stereo=False))
     station.mapper.grid_updates.update()  # of a camera that sends no scans, landmarks are drawn
     sparse_map.set_camera(AgentId(0), stereo)
-    agent.put(_scan(_KEYFRAMES - 1))
+    for before, far_m in ((2, 8.0), (1, 2.0)):  # the second one takes a part of the cells of the first
+        agent.put(_scan(_KEYFRAMES - before, far_m))
     station.step({}, done, _KEYFRAMES * 1_000_000_000)
+    station.mapper.grid_updates.update()
     station.mapper.views.take()
     warm_ground(stereo)  # scans of images that agents send
     submap = submap_id(0, 0, 0)
@@ -71,9 +73,9 @@ def warm_graphs() -> None:
     optimise(GraphInputs(np.arange(3), poses, held, edges, poses, sigma, np.arange(3) == 2, GraphConfig()))
 
 
-def _scan(k: int) -> KeyframeScan:
+def _scan(k: int, far_m: float) -> KeyframeScan:
     """A floor and a wall behind it."""
-    near, far = np.full(8, 0.5), np.full(8, 2.0)
+    near, far = np.full(8, 0.5), np.full(8, far_m)
     up = np.array([0.0, -1.0, 0.0])
     scan = ColumnScan(up, -0.4, 0.1, near, far, far, np.full(8, 7, np.uint8), far, 1.0)
     return KeyframeScan(keyframe_id(submap_id(0, 0, 0), k), scan, np.zeros(0, np.uint8))
