@@ -238,7 +238,7 @@ class FixedLagSmoother:
 
     def hold(self, intervals: int) -> None:
         """Keep so many intervals in the window, whose samples are awaited, if there is room."""
-        self._states = int(np.clip(intervals + 1, self._config.states, max(self._config.states, _MOST_STATES)))
+        self._states = max(self._config.states, min(intervals + 1, _MOST_STATES))
 
     def replace(self, back: int, samples: Samples) -> None:
         """Replace the samples of an interval. back: 0 for that before the newest state. Older ones are final."""

@@ -25,6 +25,7 @@ _PATIENCE_S = 2.0  # s; longest time that a flight controller waits for more tha
 _SETTLED_S = 1.0  # s of fusion after which the vertical is known to a degree or two: after the first frames to five
 _SURE_RAD = 0.0175  # rad; deviation of a vertical that is better than that of the first frames: a degree
 _FOLLOW_S = 3.0  # s; time constant with which the vertical of a flight controller follows the smoother's
+_EVERY_S = 0.19  # s between two small turns of it
 _FOLLOW_RAD_S = 0.005  # rad/s, at most: 3 degrees in 10 s. At 10 m/s it bends the path by 0.05 m/s^2
 _LEAST_M_S2 = 0.1  # of a specific force that points anywhere
 _ATTITUDE_TILT = np.array([0, 1, 2, 15, 16])  # in the covariance of a state
@@ -164,7 +165,10 @@ class GravityAligner:
     def _follow(self, t_ns: int, T_o_m: F64, here_o: F64) -> None:
         """Turn the gravity-aligned frame slowly to the smoother's vertical, once images and IMU are fused for long."""
         settled = self._fused_ns is not None and t_ns - self._fused_ns >= _SETTLED_S * 1e9
-        dt_s, self._followed_ns = (t_ns - self._followed_ns) * 1e-9, t_ns
+        dt_s = (t_ns - self._followed_ns) * 1e-9
+        if dt_s < _EVERY_S:  # each costs as much as a hundred landmarks
+            return
+        self._followed_ns = t_ns
         if not settled or self._doubted or self._rough or dt_s > _FOLLOW_S:
             return
         assert self._inertial is not None
