@@ -20,7 +20,7 @@ from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 from kiteline_core.order_statistics import median
 
-_MOST_STATES = 6  # in the window, while samples come frames late
+MOST_STATES = 6  # in the window, while samples come frames late
 _BY_DEFINITION = 1e-4  # m and rad: deviation of a pose that defines its map
 _VELOCITY_CHI2 = 7.81  # 95 % with 3 degrees of freedom: an odometer's velocity beyond it is down-weighted
 
@@ -101,7 +101,7 @@ class FixedLagSmoother:
     def __init__(
         self, camera: RectifiedCamera, calibration: ImuCalibration, config: FixedLagConfig, gravity_m_s2: float = 9.81
     ) -> None:
-        n, p = max(config.states, _MOST_STATES) + 1, config.points
+        n, p = max(config.states, MOST_STATES) + 1, config.points
         self._config = config
         self._states = config.states  # in the window
         self._calibration = calibration
@@ -238,7 +238,7 @@ class FixedLagSmoother:
 
     def hold(self, intervals: int) -> None:
         """Keep so many intervals in the window, whose samples are awaited, if there is room."""
-        self._states = max(self._config.states, min(intervals + 1, _MOST_STATES))
+        self._states = max(self._config.states, min(intervals + 1, MOST_STATES))
 
     def replace(self, back: int, samples: Samples) -> None:
         """Replace the samples of an interval. back: 0 for that before the newest state. Older ones are final."""

@@ -79,7 +79,10 @@ class GravityAligner:
 
     @property
     def R_l_o(self) -> F64 | None:
-        """(3,3) that gravity-aligns the odometry frame; None before. At once after `renew`, `doubt`, a guess."""
+        """(3,3) that gravity-aligns the odometry frame; None before.
+
+        It follows the smoother's vertical slowly, and turns at once after `renew`, `doubt` and a guess.
+        """
         return None if self._renewed and not self._known else self._R_l_o
 
     @property
@@ -127,8 +130,7 @@ class GravityAligner:
         if self._inertial is None:
             return None
         self._began_ns = t_ns if self._began_ns is None else self._began_ns
-        asked = self._is_settled(t_ns) if self._known else True
-        if not asked:
+        if self._known and not self._is_settled(t_ns):
             self._follow(t_ns, T_o_m, (T_o_m @ T_m_b)[:3, 3])
             return None
         R_l_m = self._inertial.gravity_rotation()

@@ -7,6 +7,7 @@ from kiteline_agent.inertial.calibration.known_imu import KnownImuConfig
 from kiteline_agent.inertial.calibration.self_calibration import SelfCalibration
 from kiteline_agent.inertial.clocks.frame_clock import FrameClock
 from kiteline_agent.inertial.fixed_lag import (
+    MOST_STATES,
     BodyVelocity,
     FixedLagSmoother,
     InertialMotion,
@@ -26,7 +27,6 @@ from kiteline_core.frame import ImuBatch, ImuCalibration
 from kiteline_core.geometry import disparity_offset, se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 
-_WAITING = 6  # intervals whose samples are awaited: more than the smoother holds
 _PRIOR_SIGMA = np.repeat([0.005, 0.1], 3)  # rad/s, m/s^2: of biases of earlier tracking, after a loss
 
 
@@ -383,7 +383,7 @@ class InertialTracker:
             if samples is not None:
                 lacks = self._buffer.lacks(end_ns)
                 self._smoother.replace(back, without_held(samples) if lacks else samples)
-        self._incomplete = [i for i in intervals[-_WAITING:] if newest is not None and newest < i[1]]
+        self._incomplete = [i for i in intervals[-MOST_STATES:] if newest is not None and newest < i[1]]
 
     def _calibrate(self, t_ns: int, T_m_b_visual: F64, depth_m: float, dt_s: float) -> None:
         gravity = self._smoother.gravity if self._smoother.running and self._images_have_scale else None

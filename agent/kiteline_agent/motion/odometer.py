@@ -35,9 +35,6 @@ _SURPRISE = 4.0  # deviations from the prediction above which a sample is reject
 _SEEN_M_S = 0.05  # m/s; error of the velocity between two frames placed by images
 _SEEN_RAD_S = 0.02  # rad/s; the same of the rotation rate
 _RISE = 0.5  # weight of such an unusual error: a slip is detected within 0.2 s
-_LASTING = 30  # windows, 6 s of motion, that must agree on another length than a map in metres has
-_WRONG = 0.1  # relative; by which a map of one camera is wrong, and no longer drifts
-_WRONG_SIGMA = 0.04  # relative deviation of that
 _DOUBTED = 0.25  # relative deviation of lengths that odometer and images disagree on
 _SETTLED = 0.4  # share of a rejected jump below which the velocity must fall before it is used again
 _ALIGNED = 0.9  # least cosine between both displacements of a window for the unit
@@ -69,7 +66,6 @@ class Odometer:
         self._path, self._path_cov, self._path_cross = np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3))  # in m
         self._rotation_cov, self._rotation_cross = np.zeros((3, 3)), np.zeros((3, 3))  # about the body's axes
         self._unit_scale = UnitScale(_ALIGNED)
-        self._lasting = UnitScale(_ALIGNED, _LASTING)  # of a map in metres with one camera
         self.unit_sigma = 0.0  # relative deviation of metres per unit, once they were found
         self._unscaled_ns: int | None = None  # stamp of the first frame in a map of unknown scale
         self._trusted = self._reported_trust = False
@@ -290,19 +286,7 @@ class Odometer:
 
     def scale_correction(self) -> tuple[float, float] | None:
         """Factor by which a monocular map in metres is to be scaled, and its deviation; None if none is due."""
-        if self._usable:
-            return self._scale.correction()
-        return self._lasting_correction() if self.metric else None
-
-    def _lasting_correction(self) -> tuple[float, float] | None:
-        """The same where images and odometer agree on directions and, for seconds, on another length: the map is wrong.
-
-        A map of two views may collapse while its first landmarks are measured.
-        """
-        found = self._lasting.metres_per_unit() if self._lasting.full else None
-        if found is None or abs(np.log(found[0])) < _WRONG or found[1] > _WRONG_SIGMA * found[0]:
-            return None
-        return found
+        return self._scale.correction(believed=self._trusted) if self.metric else None
 
     def move_map(self, T_new_old: F64, growth: float = 1.0) -> None:
         """Transform the state after the submap frame moved by T_new_old (4,4), and lengths in it grew by a factor."""
@@ -318,14 +302,13 @@ class Odometer:
         if metric:
             self._scale.begin(factor)
         else:
-            self._scale.begin_unscaled()
+            self._scale = OdometerScale(of_map=True)
         found = self.metres_per_unit()
         if metric and found is not None:
             self.unit_sigma = float(np.hypot(found[1] / found[0], _UNIT_FLOOR))
         self.metric = metric
         self._anchor = self._last = None
         self._unit_scale.clear()
-        self._lasting.clear()
         self._unscaled_ns, self._doubted = None, False
         self._reset_image_loss()
 
@@ -381,7 +364,6 @@ class Odometer:
     def _compare_displacements(self, by_odometer: F64, by_images: F64, axes: float, dt: float) -> None:
         """Update scale, noise and trust from displacements (3,) in m, in the `axes` that are measured."""
         distance = float(np.sqrt(by_images @ by_images))
-        self._lasting.add(by_odometer, by_images)
         self._scale.add(by_odometer, by_images, dt, float(np.sqrt(self._noise)))
         error = (by_images - self.scale * by_odometer) / dt
         tolerance = self._config.tolerance_m_s + _TOLERANCE_SHARE * distance / dt

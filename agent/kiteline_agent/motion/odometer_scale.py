@@ -3,6 +3,7 @@
 import numpy as np
 
 from kiteline_agent.inertial.scale_filter import MAP_WALK, correction_due
+from kiteline_agent.motion.unit_scale import UnitScale
 from kiteline_core.arrays import F64
 
 LEAST_MOVED_M = 0.02  # m; motion in a window below which axes and scale are not observable
@@ -15,6 +16,9 @@ _LEAST_M_S = 0.015  # m/s; least noise of one, where windows show less than expe
 _WALK = 0.003  # relative change per sqrt(s): load and temperature
 _YOUNG_WALK, _YOUNG_S = 0.05, 4.0  # relative per sqrt(s), and s in which it calms down, of one camera's map
 _CLEAR_S, _CLEAR, _CLEAR_DEVIATIONS = 1.5, 0.06, 4.0  # s, relative: by more than that a map is corrected sooner
+_LASTING = 30  # windows, 6 s of motion, that must agree on another length than a map in metres has
+_WRONG = 0.1  # relative; by which a map of one camera is wrong, and no longer drifts
+_WRONG_SIGMA = 0.04  # relative deviation of that
 _GATE = 3.0  # deviations beyond which a window is left out: slip
 
 
@@ -24,6 +28,7 @@ class OdometerScale:
     def __init__(self, *, of_map: bool) -> None:
         """of_map: the map of one camera, whose lengths the odometer tells: the map is off by it, not the odometer."""
         self._of_map = of_map
+        self._lasting = UnitScale(_ALIGNED, _LASTING)
         self.value, self.var = 1.0, _START**2
         self._age_s = 0.0  # of compared windows since the map began, or was corrected
         self._grown_s = 0.0  # of those since it was in a unit of its own
@@ -34,6 +39,8 @@ class OdometerScale:
         self.var += self._walk_square() * dt_s
         self._age_s += dt_s
         self._grown_s += dt_s
+        if self._of_map:
+            self._lasting.add(by_odometer, by_images)
         if square <= LEAST_MOVED_M**2:
             return
         along = float(by_odometer @ by_images)
@@ -55,14 +62,11 @@ class OdometerScale:
             return _WALK**2
         return MAP_WALK**2 + float(_YOUNG_WALK * np.exp(-self._grown_s / _YOUNG_S)) ** 2
 
-    def begin_unscaled(self) -> None:
-        """A map in a unit of its own begins: once that is told it may still drift."""
-        self.value, self.var, self._age_s, self._grown_s = 1.0, _START**2, 0.0, 0.0
-
     def begin(self, factor: float) -> None:
         """A map in metres begins, whose lengths are `factor` times those before: the next correction waits."""
         self.scale_map(factor)
         self._age_s = 0.0
+        self._lasting.clear()
         if abs(self.value - 1.0) > _MOST:  # the map was off by more than is followed
             self.value, self.var = 1.0, _START**2
 
@@ -72,10 +76,25 @@ class OdometerScale:
             self.value *= factor
             self.var *= factor**2
 
-    def correction(self) -> tuple[float, float] | None:
-        """Factor by which the map is to be scaled, and its deviation; None if it is right as far as is known."""
+    def correction(self, *, believed: bool) -> tuple[float, float] | None:
+        """Factor by which the map is to be scaled, and its deviation; None if it is right as far as is known.
+
+        believed: odometer and images agree.
+        """
         if not self._of_map:
             return None
+        if not believed:
+            return self._lasting_correction()
         scale, sigma = 1.0 / self.value, float(np.sqrt(self.var)) / self.value**2
         clear = self._age_s >= _CLEAR_S and abs(np.log(scale)) > max(_CLEAR_DEVIATIONS * sigma / scale, _CLEAR)
         return (scale, sigma) if clear else correction_due(scale, sigma, self._age_s)
+
+    def _lasting_correction(self) -> tuple[float, float] | None:
+        """The same where images and odometer agree on directions and, for seconds, on another length: the map is wrong.
+
+        A map of two views may collapse while its first landmarks are measured.
+        """
+        found = self._lasting.metres_per_unit() if self._lasting.full else None
+        if found is None or abs(np.log(found[0])) < _WRONG or found[1] > _WRONG_SIGMA * found[0]:
+            return None
+        return found

@@ -5,7 +5,7 @@ import numpy as np
 from kiteline_core.arrays import F64
 
 WINDOW_S = 0.4  # s; window of a comparison
-WINDOWS = 20  # newest windows that are kept: the unit of a young map drifts
+_WINDOWS = 20  # newest windows that are kept: the unit of a young map drifts
 _LEAST_WINDOWS = 5  # least number of agreeing windows for a scale
 _LEAST_SHARE = 0.7  # least share of the windows that must agree
 _NEWEST = 2  # windows of which one must lie near the median: else the unit changes, or the odometer slips now
@@ -16,7 +16,7 @@ _OUTLYING = 3.0  # deviations of a window from the median scale: slip, a moment 
 class UnitScale:
     """Windows in which odometer and images moved, and the metres per unit of the map that they give."""
 
-    def __init__(self, aligned: float, windows: int = WINDOWS) -> None:
+    def __init__(self, aligned: float, windows: int = _WINDOWS) -> None:
         """aligned: least cosine between both displacements of a window that agrees. windows: newest ones, kept."""
         self._aligned, self._most = aligned, windows
         # Displacement by the odometer times that by the images, m times units; the latter's square; agrees.

@@ -8,36 +8,19 @@ from kiteline_agent.agent import Agent
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_agent.step import Identity, StepInput
+from kiteline_bench.harness.odometer import SCALE, measured_along
 from kiteline_core.arrays import F64
-from kiteline_core.frame import Frame, OdometryBatch, Trajectory
-from kiteline_core.geometry import se3
+from kiteline_core.frame import Frame, OdometryBatch
 from kiteline_core.ids import AgentId
 from kiteline_hw.sources.open import open_source
 from tests.agent.mono_room import similar
-
-SCALE, NOISE_M_S, NOISE_RAD_S = 1.01, 0.02, 0.01  # of the odometer
-
-
-def odometer(truth: Trajectory) -> OdometryBatch:
-    """Velocities at the truth's stamps, in the body."""
-    rng, T, t_s = np.random.default_rng(3), truth.T_w_b, truth.t_ns * 1e-9
-    dt_s = t_s[2:] - t_s[:-2]
-    v_w = (T[2:, :3, 3] - T[:-2, :3, 3]) / dt_s[:, None]
-    v_b = np.einsum("nji,nj->ni", T[1:-1, :3, :3], v_w)
-    rate = np.array([se3.so3_log(a[:3, :3].T @ b[:3, :3]) for a, b in zip(T[:-2], T[2:], strict=True)]) / dt_s[:, None]
-    n = len(v_b)
-    return OdometryBatch(
-        truth.t_ns[1:-1],
-        SCALE * v_b + NOISE_M_S * rng.normal(size=(n, 3)), rate + NOISE_RAD_S * rng.normal(size=(n, 3)),
-        np.tile(NOISE_M_S**2 * np.eye(3), (n, 1, 1)), np.tile(NOISE_RAD_S**2 * np.eye(3), (n, 1, 1)),
-    )  # fmt: skip
 
 
 def test_a_map_whose_unit_the_odometer_told_is_scaled_when_it_drifts(data_dir: Path) -> None:
     source = open_source(str(data_dir / "euroc_mh01_air"), mono=True, imu=False)
     truth = source.ground_truth
     assert truth is not None
-    driven, done = odometer(truth), 0
+    driven, done = measured_along(truth), 0
     agent = Agent(source.rig, None, AgentConfig(), Identity(AgentId(0), 0), NoBaseChannel())
     found: list[tuple[int, F64]] = []
     words: list[str] = []

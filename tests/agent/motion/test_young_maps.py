@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from kiteline_agent.config import OdometerConfig
 from kiteline_agent.motion.odometer import Odometer
 from kiteline_agent.motion.odometer_scale import OdometerScale
 from kiteline_agent.motion.unit_scale import UnitScale
@@ -33,14 +34,14 @@ def test_a_young_map_that_shrinks_at_once_is_corrected_within_seconds() -> None:
     scale = OdometerScale(of_map=True)
     scale.begin(1.0)
     driven(scale, 1.4, 0.8)
-    assert scale.correction() is None
+    assert scale.correction(believed=True) is None
     driven(scale, 0.8, 0.8)
-    found = scale.correction()
+    found = scale.correction(believed=True)
     assert found is not None and found[0] == pytest.approx(1.25, rel=0.1)
     old = OdometerScale(of_map=True)
     driven(old, 20.0)
     driven(old, 1.0, 0.94)  # a map that has been right for long does not move as fast
-    assert old.correction() is None
+    assert old.correction(believed=True) is None
 
 
 def compared(odometer: Odometer, seconds: float, length: float) -> None:
@@ -50,7 +51,7 @@ def compared(odometer: Odometer, seconds: float, length: float) -> None:
 
 
 def test_a_map_that_collapsed_is_scaled_although_the_odometer_is_no_longer_believed() -> None:
-    odometer = Odometer(np.eye(4), odometer_config(), metric=False)
+    odometer = Odometer(np.eye(4), OdometerConfig(), metric=False)
     odometer.set_metric(metric=True)
     compared(odometer, 1.0, 1.0)
     assert odometer.trusted and odometer.deviation < 0.05
@@ -64,12 +65,6 @@ def test_a_map_that_collapsed_is_scaled_although_the_odometer_is_no_longer_belie
     assert odometer.scale == 1.0 and odometer.scale_correction() is None
     compared(odometer, 6.0, 1.0)
     assert odometer.trusted and odometer.deviation < 0.05
-
-
-def odometer_config():  # type: ignore[no-untyped-def]
-    from kiteline_agent.config import OdometerConfig
-
-    return OdometerConfig()
 
 
 def test_windows_count_as_what_they_are() -> None:
