@@ -26,9 +26,9 @@ class SourceReport:
     notes: list[str] = field(default_factory=list)
 
     def skip(self, reason: str, note: str) -> None:
-        """Count one skipped item; keep the first ten notes."""
+        """Count one skipped item; keep the first note of each reason, and ten notes in all."""
         self.skipped[reason] = self.skipped.get(reason, 0) + 1
-        if len(self.notes) < 10:
+        if self.skipped[reason] == 1 or len(self.notes) < 10:
             self.notes.append(f"{reason}: {note}")
 
     def clear(self) -> None:

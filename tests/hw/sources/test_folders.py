@@ -151,6 +151,16 @@ def test_euroc_bad_imu_samples_are_dropped_and_counted(tmp_path: Path) -> None:
     assert source.report.skipped["imu sample not finite"] == 1  # counts belong to one reading
 
 
+def test_images_of_another_size_are_told_also_behind_many_bad_samples(tmp_path: Path) -> None:
+    """The samples' notes had filled the list, and the error said nothing of the images."""
+    root = euroc(tmp_path)
+    add_imu(root, np.eye(4), [f"{1000 - i * 5_000_000 if i % 2 else 1000 + i},0,0,0,0,0,9.8" for i in range(40)])
+    for path in (root / "mav0/cam0/data").iterdir():
+        put(path, picture(0, (40, 64)))
+    with pytest.raises(SourceError, match=r"64x40 px, calibration says 64x48, and 3 more"):
+        read(open_source(str(root)))
+
+
 def test_euroc_broken_images_are_skipped_and_counted(tmp_path: Path) -> None:
     root = euroc(tmp_path, n=8)
     stamps = [1000 + i * 50_000_000 for i in range(8)]
