@@ -162,9 +162,7 @@ class Corrections:
         self._S_w_m.pop(submap, None)
         self._recognised.discard(submap)
         if submap == self._map.active:
-            self._smoothing.clear()
-            self._filter.clear()
-            self._whole.clear()
+            self._clear_live()
 
     def _take_calibration(self, record: DisparityCalibration) -> bool:
         if self._calibrate is not None:
@@ -193,9 +191,13 @@ class Corrections:
 
     def leave_world(self) -> None:
         """Odometry does not lead on in w: live poses are in it again once the active submap is placed."""
+        self._clear_live()
+        self._own_world = None
+
+    def _clear_live(self) -> None:
+        """Live poses begin anew where the active submap lies then."""
         for state in (self._smoothing, self._filter, self._whole):
             state.clear()
-        self._own_world = None
 
     def is_recognised(self, submap: SubmapId) -> bool:
         """True if the base merged a submap with another one: its pose there rests on more than odometry."""
