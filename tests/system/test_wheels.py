@@ -23,10 +23,15 @@ BYTE_CODE = 1.25  # size of byte code over that of its source: 1.22 with blocks 
 
 def ask_pip(requirements: list[str], python: str, *command: str) -> None:
     """Run a command of pip as on such a board. Skips without a network, fails if there is no wheel."""
-    words = [sys.executable, "-m", "pip", *command, "--quiet", "--retries", "1", "--only-binary=:all:",
-             "--implementation", "cp", "--python-version", python, *requirements]  # fmt: skip
+    words = [*command, "--only-binary=:all:", "--implementation", "cp", "--python-version", python, *requirements]
     for platform in PLATFORMS:
         words += ["--platform", platform]
+    run_pip(words)
+
+
+def run_pip(words: list[str]) -> None:
+    """Run pip. Skips without a network, fails if it does."""
+    words = [sys.executable, "-m", "pip", *words, "--quiet", "--retries", "1"]
     done = subprocess.run(words, capture_output=True, text=True, timeout=300, check=False)
     if done.returncode != 0:
         if any(text in done.stderr for text in UNREACHABLE):
@@ -39,6 +44,11 @@ def resolve(requirements: list[str], python: str, folder: Path) -> list[str]:
     report = folder / "report.json"
     ask_pip(requirements, python, "install", "--dry-run", "--ignore-installed", "--target", str(folder),
             "--report", str(report))  # fmt: skip
+    return names_in(report)
+
+
+def names_in(report: Path) -> list[str]:
+    """File names in a report of pip."""
     installed: list[dict[str, Any]] = json.loads(report.read_text())["install"]
     return [one["download_info"]["url"].rsplit("/", 1)[1] for one in installed]
 
@@ -48,6 +58,14 @@ def test_the_drone_installs_from_wheels_alone_on_the_newest_python(tmp_path: Pat
     names = resolve(PROJECT["dependencies"], "3.13", tmp_path)
     assert len(names) >= len(PROJECT["dependencies"])
     assert all(name.endswith(("aarch64.whl", "-any.whl")) for name in names), names
+
+
+@pytest.mark.timeout(320)
+def test_no_source_is_newer_than_its_wheel(tmp_path: Path) -> None:
+    """pip takes the newest version, also if that one comes as source alone: here it may choose, as on a board."""
+    report = tmp_path / "report.json"
+    run_pip(["install", "--dry-run", "--ignore-installed", "--report", str(report), *PROJECT["dependencies"]])
+    assert [name for name in names_in(report) if not name.endswith(".whl")] == []
 
 
 @pytest.mark.timeout(320)
