@@ -190,7 +190,7 @@ def _add_tracking(p: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     p.add_argument(
         "--calibration", metavar="FILE[,FILE]", default="",
-        help="cameras, extrinsics and IMU noise in place of the source's: kiteline, Kalibr, EuRoC, ROS or OpenCV YAML",
+        help="calibration in place of the source's: YAML of kiteline, Kalibr, EuRoC, ROS, OpenCV or ORB-SLAM",
     )  # fmt: skip
     p.add_argument("--mono", action="store_true", help="the left camera alone")
     p.add_argument("--no-imu", action="store_true", help="without inertial samples")

@@ -20,7 +20,8 @@ class FileCalibration:
     cameras: none, the left one, or left and right. T_c_r: (4,4) right camera in the left one. T_b_c: (4,4) left camera
     in the body, which is the IMU; None: not given. topics: of the cameras in a bag, "" where not given. known: False
     for a stand-in where nothing is calibrated yet, whose size is that of the images. without_imu: T_b_c is in the frame
-    that EuRoC's sensor.yaml share, and no file says where the IMU is in it.
+    that EuRoC's sensor.yaml share, and no file says where the IMU is in it. depth_scale: stored units a metre of depth
+    images; None: not given.
     """
 
     where: str
@@ -31,6 +32,7 @@ class FileCalibration:
     topics: tuple[str, ...] = ()
     known: bool = True
     without_imu: bool = False
+    depth_scale: float | None = None
 
     def rig_of_images(self, name: str, count: int, size: tuple[int, int]) -> CameraRig:
         """The rig of a source's images: one camera or two, (height, width). Raises SourceError if they are too many."""
@@ -52,7 +54,8 @@ class FileCalibration:
         if self.T_c_r is None:
             raise SourceError(
                 f"{self.where}: nothing says where the right camera sits against the left one: expected extrinsics "
-                "(T_cn_cnm1, T_BS, R and T, or the P of a rectified pair); with mono (--mono) the left camera is used"
+                "(T_cn_cnm1, T_BS, Stereo.T_c1_c2, R and T, or the P of a rectified pair); with mono (--mono) the left "
+                "camera is used"
             )
         T_c_r = checked_baseline(self.T_c_r, self.where)
         return CameraRig(self.cameras[0], self.cameras[1], T_b_c, T_c_r, has_body=has_body)
@@ -111,7 +114,12 @@ def _between(left: FilePart, right: FilePart) -> F64 | None:
         return se3.inverse(left.T_s_c) @ right.T_s_c
     if left.rectified is None or right.rectified is None:
         return None
-    (r_l, p_l), (r_r, p_r) = left.rectified, right.rectified
+    return between_rectified(left.rectified, right.rectified)
+
+
+def between_rectified(left: tuple[F64, F64], right: tuple[F64, F64]) -> F64 | None:
+    """T_c_r (4,4) by R (3,3) and P (3,4) of both cameras of a pair; None if a P is that of no camera."""
+    (r_l, p_l), (r_r, p_r) = left, right
     if not (p_l[0, 0] > 0 and p_r[0, 0] > 0):
         return None
     # P relates the rectified frames; R rotates each camera into its rectified one.

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from pathlib import Path
 
-from kiteline_hw.calibration import euroc, kalibr, opencv, own
+from kiteline_hw.calibration import euroc, kalibr, opencv, orb_slam, own
 from kiteline_hw.calibration.file_calibration import FileCalibration, FilePart, joined
 from kiteline_hw.calibration.nodes import Node, read_nodes
 from kiteline_hw.ports import SourceError
@@ -16,6 +16,7 @@ _READERS: tuple[tuple[Callable[[Node], bool], Callable[[Node], FilePart]], ...] 
     (euroc.is_sensor, euroc.read_sensor),
     (opencv.is_pair, opencv.read_pair),
     (opencv.is_camera, opencv.read_camera),
+    (orb_slam.is_settings, orb_slam.read_settings),
     (kalibr.is_imu, kalibr.read_imu),
 )
 
@@ -44,5 +45,5 @@ def _read(path: Path) -> FilePart:
     some = ", ".join(sorted(node.keys)[:6])
     raise SourceError(
         f"{path}: no calibration that is known: expected kiteline's calibration.yaml, Kalibr's camchain or imu, "
-        f"EuRoC's sensor.yaml, ROS' camera_info or OpenCV's FileStorage; found the keys {some}"
+        f"EuRoC's sensor.yaml, ROS' camera_info, OpenCV's FileStorage or ORB-SLAM3's settings; found the keys {some}"
     )

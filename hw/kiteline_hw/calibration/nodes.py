@@ -18,6 +18,8 @@ _MOST_BYTES = 1 << 16  # calibration files are a few kB
 _MOST_NESTED = 16  # brackets in brackets: calibrations have two; a YAML reader takes time by the square of them
 _MOST_ROWS = 1000  # of a matrix
 _MOST_PX = 100_000  # of an image's side
+_FILE_STORAGE = "%YAML:"  # begins a file of OpenCV's, which takes `key:value` without a space, as YAML does not
+_TIGHT_KEY = re.compile(r"^(\s*[A-Za-z_][\w.]*:)(?=\S)")
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,8 +129,10 @@ def read_nodes(path: Path) -> Node:
         raise SourceError(f"{path}: {error.strerror}; expected a calibration file") from error
     if len(data) > _MOST_BYTES:
         raise SourceError(f"{path}: more than {_MOST_BYTES} bytes: expected a calibration file, which is far smaller")
+    lines = data.decode("utf-8-sig", "replace").splitlines()
+    if lines and lines[0].startswith(_FILE_STORAGE):
+        lines = [_TIGHT_KEY.sub(r"\1 ", line) for line in lines]
     # OpenCV's head "%YAML:1.0" is no YAML.
-    lines = data.decode("utf-8", "replace").splitlines()
     text = "\n".join("" if line.startswith("%") else line for line in lines)
     if _nested(text) > _MOST_NESTED:
         raise SourceError(f"{path}: lists nested more than {_MOST_NESTED} deep: expected a calibration file")

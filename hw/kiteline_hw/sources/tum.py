@@ -89,7 +89,9 @@ def _read_calibration(folder: Path, colour: Stamped, given: FileCalibration | No
     """The camera and the stored depth units a metre."""
     path = folder / "camera.yaml"
     if given is not None:
-        scale = yaml_number(read_yaml(path, ""), "depth_scale", path, DEPTH_SCALE) if path.is_file() else DEPTH_SCALE
+        scale = given.depth_scale or DEPTH_SCALE
+        if path.is_file():
+            scale = yaml_number(read_yaml(path, ""), "depth_scale", path, scale)
         return given.rig_of_images(str(folder), 1, image_size([image for _, image in colour])).left, _checked(
             scale, path
         )
