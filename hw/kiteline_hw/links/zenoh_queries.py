@@ -112,13 +112,15 @@ def ask(
 
     logins: user and password, for a base that asks for them.
     """
-    deadline_s = time.monotonic() + _TIMEOUT_S
+    begin_s = time.monotonic()
+    deadline_s = begin_s + _TIMEOUT_S
     try:
         session = open_session(endpoint, "client", connect_timeout_s=0.0 if logins else _TIMEOUT_S)
     except LinkError:
         if not logins:
             raise
-        session = open_session(endpoint, "client", connect_timeout_s=_TIMEOUT_S, logins=logins)
+        waited_s = time.monotonic() - begin_s
+        session = open_session(endpoint, "client", connect_timeout_s=_TIMEOUT_S, waited_s=waited_s, logins=logins)
     try:
         while (left_s := deadline_s - time.monotonic()) > 0.0:
             replies: queue.SimpleQueue[tuple[bool, str] | None] = queue.SimpleQueue()

@@ -24,6 +24,7 @@ _MAX_PAIRED_SESSIONS = 288  # where only the paired may: 256 agents, and those p
 _MOST_MESSAGE_BYTES = 1 << 18  # that a base takes in: four of the longest packets
 CLOSE_TIMEOUT_S = 1.5  # s; a frozen peer can stall a close for much longer: then the session is abandoned
 _EXIT_TIMEOUT_S = 6.0  # s for sessions that are closed at the end of the process; a busy machine needs seconds
+_LEAST_ATTEMPT_MS = 100  # ms of one attempt to connect where hardly any time is left
 CONNECT_TIMEOUT_MS = 4000  # ms of one attempt to connect: two round trips with 900 ms of delay each way
 _RETRY_S = 0.1  # s between two attempts to connect
 _ROUTER = "router/"  # before a locator: a Zenoh router listens there, and both sides connect
@@ -108,10 +109,13 @@ def open_session(
     lease_ms: int = 2000,
     access: dict[str, Any] | None = None,
     connect_timeout_s: float = 10.0,
+    waited_s: float = 0.0,
     give_up: threading.Event | None = None,
     logins: Mapping[str, str] | None = None,
 ) -> zenoh.Session:
     """Listen (base) or connect (client, with retries until the timeout or until `give_up` is set). Raises LinkError.
+
+    connect_timeout_s: 0 for a single attempt; waited_s: how much of it is over already.
 
     logins: user and password of a client, or those without which a base takes no connection. A client that names one is
     refused by a base that asks for none.
@@ -126,14 +130,18 @@ def open_session(
             file.flush()
             listed = file.name
         config = session_config(endpoint, role, lease_ms, access, logins, listed)
-        return _opened(config, endpoint, role, connect_timeout_s, give_up)
+        return _opened(config, endpoint, role, connect_timeout_s, waited_s, give_up)
 
 
 def _opened(
-    config: zenoh.Config, endpoint: str, role: Role, connect_timeout_s: float, give_up: threading.Event | None
-) -> zenoh.Session:
-    deadline_s = time.monotonic() + connect_timeout_s
+    config: zenoh.Config, endpoint: str, role: Role, connect_timeout_s: float, waited_s: float,
+    give_up: threading.Event | None,
+) -> zenoh.Session:  # fmt: skip
+    deadline_s = time.monotonic() + connect_timeout_s - waited_s
     while True:
+        if connect_timeout_s > 0.0:
+            left_ms = max(_LEAST_ATTEMPT_MS, round(1e3 * (deadline_s - time.monotonic())))
+            config.insert_json5("connect/timeout_ms", json.dumps(min(CONNECT_TIMEOUT_MS, left_ms)))
         try:
             session = zenoh.open(config)
             break

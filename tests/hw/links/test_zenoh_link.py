@@ -1,5 +1,6 @@
 """Zenoh links: reconnect with either side, never block the caller, never keep a process from ending."""
 
+import json
 import re
 import signal
 import time
@@ -12,6 +13,7 @@ from kiteline_hw.links import zenoh_session
 from kiteline_hw.links.open import open_link
 from kiteline_hw.links.queued_link import INBOX_PACKETS, OUTBOX_PACKETS, QueuedLink
 from kiteline_hw.links.zenoh_link import ZenohHub, ZenohLink
+from kiteline_hw.links.zenoh_queries import ask
 from kiteline_hw.links.zenoh_session import check_endpoint, open_session
 from kiteline_hw.ports import LinkError
 from tests.hw.processes import free_endpoint, start, wait_for
@@ -108,6 +110,29 @@ def test_through_a_router(monkeypatch: pytest.MonkeyPatch) -> None:
         assert link.send(b"up") and hub.links()[4].send(b"down")
         wait_for(lambda: hub.links()[4].receive() == [b"up"])
         wait_for(lambda: link.receive() == [b"down"])
+
+
+@pytest.mark.parametrize("logins", [None, {"maps": "secret"}])
+def test_a_question_waits_as_long_for_a_base_as_it_says(
+    monkeypatch: pytest.MonkeyPatch, logins: dict[str, str] | None
+) -> None:
+    clock_s = 100.0
+
+    def refused(config: zenoh.Config) -> zenoh.Session:
+        nonlocal clock_s
+        clock_s += json.loads(config.get_json("connect/timeout_ms")) / 1000.0
+        raise zenoh.ZError("nobody listens")
+
+    def sleep(seconds: float) -> None:
+        nonlocal clock_s
+        clock_s += seconds
+
+    monkeypatch.setattr(zenoh, "open", refused)
+    monkeypatch.setattr(time, "monotonic", lambda: clock_s)
+    monkeypatch.setattr(time, "sleep", sleep)
+    with pytest.raises(LinkError, match="no base station answers .* within 10 s"):
+        ask(free_endpoint(), "maps", "list", "{}", logins)
+    assert 110.0 <= clock_s < 110.5
 
 
 @pytest.mark.alone
