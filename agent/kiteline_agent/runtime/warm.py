@@ -39,10 +39,12 @@ WARMING = ("kiteline_codec.warm", "kiteline_agent.runtime.warm")  # modules whos
 def warm(config: AgentConfig | None = None) -> None:
     """Run every kernel once, on the types that flights use; once in a process for each configuration.
 
-    A filled cache makes this take a fraction of a second.
+    config: of a flight, whose tracker's kernels do; None: those of both trackers. A filled cache makes this take a
+    fraction of a second.
     """
+    if config is None or config.tracker == "ekf":
+        warm_filter((config or AgentConfig()).detector)
     if config is not None and config.tracker == "ekf":
-        warm_filter()
         return
     # Deterministic noise, corners everywhere: s <- 1103515245 s + 12345 from s = 1 on, modulo 2^31, in closed form.
     powers = np.cumprod(np.full(240 * 320, 1103515245, np.uint64), dtype=np.uint64)

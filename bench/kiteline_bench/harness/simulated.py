@@ -59,7 +59,7 @@ def render(bench: Bench, name: str, command: Sequence[str], agents: int = 1) -> 
     if not all(path.exists() for path in out):
         bench.say(f"rendering {name}")
         bench.folder.mkdir(parents=True, exist_ok=True)
-        simulate.main([*command, "--out", str(out[0])])
+        simulate.main([*command, "--force", "--out", str(out[0])])
     return out
 
 

@@ -62,7 +62,7 @@ def record(out: Path, seed: int, turns: Moves, shakes: Moves, scene: str = _SCEN
         path, seconds = out.with_suffix(".txt"), max(end for _, end, *_ in turns) + _REST_S
         np.savetxt(path, trajectory(T_b_c, turns, shakes), fmt="%.7f")
         simulate.main([scene, "--trajectory", str(path), "--seconds", f"{seconds:g}", "--seed", f"{seed}",
-                       "--rig", "worn", "--wear", *_WEAR, "--out", str(out)])  # fmt: skip
+                       "--rig", "worn", "--wear", *_WEAR, "--force", "--out", str(out)])  # fmt: skip
     return out
 
 

@@ -10,7 +10,7 @@ import socket
 import sys
 import threading
 import weakref
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from types import FrameType
 from typing import Any, NoReturn
@@ -18,6 +18,7 @@ from typing import Any, NoReturn
 from kiteline_core.errors import KitelineError
 
 _LLVM = f"{os.sep}llvmlite{os.sep}"  # in the paths of frames that hold native objects
+_PATIENCE_S = 1.5  # s until a user is told what is waited for
 _AGAIN_S = 0.01  # s until a handler that could not raise is called again
 
 
@@ -201,6 +202,18 @@ def print_lines(lines: Iterable[str]) -> None:
     with contextlib.suppress(OSError):
         for line in lines:
             print(line, file=sys.stderr, flush=True)
+
+
+@contextlib.contextmanager
+def told_if_slow(text: str) -> Iterator[None]:
+    """Print a line on stderr if the block takes long."""
+    timer = threading.Timer(_PATIENCE_S, print_lines, [[text]])
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
 
 
 def kept_folder(name: str) -> Path:

@@ -6,15 +6,17 @@ from pathlib import Path
 
 from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_agent.runtime.agent_runtime import AgentRuntime
+from kiteline_agent.runtime.warm import WARMING as AGENT_WARMING
 from kiteline_basestation.runtime.base_runtime import BaseRuntime
 from kiteline_basestation.runtime.options import coded_channels
+from kiteline_basestation.runtime.warm import WARMING as BASE_WARMING
 from kiteline_codec.channel import RecordChannel, coded_channel, plain_pair
 from kiteline_codec.sync.resumption import agent_session
 from kiteline_hw.links.kinds import link_traits
 from kiteline_hw.lockstep.messages import Down, Phase
 from kiteline_hw.lockstep.shared_core import SharedCore
 from kiteline_hw.logs.spill_file import SpillFile
-from kiteline_hw.system import kernel_cache, process
+from kiteline_hw.system import kernel_cache
 from kiteline_lab.flights.outcome import FlightOutcome, poses_from_json
 from kiteline_lab.flights.plan import FlightPlan
 from kiteline_lab.flights.progress import Progress
@@ -42,8 +44,8 @@ def fly_in_process(plan: FlightPlan, mode: str) -> FlightOutcome:
             ours[spec.agent] = NoBaseChannel()
     percent = plan.agents[0].cpu_percent
     core = SharedCore(percent) if percent > 0.0 and plan.base is not None else None
-    if not plan.quiet and not kernel_cache.filled():
-        process.print_lines([kernel_cache.COMPILING])
+    if not plan.quiet:
+        kernel_cache.fill(AGENT_WARMING if plan.base is None else (*AGENT_WARMING, *BASE_WARMING))
     with contextlib.ExitStack() as stack:
         agents = {}
         for spec, source in zip(plan.agents, plan.sources, strict=True):

@@ -1,5 +1,6 @@
 """The plan of a flight: opened sources, flight time 0, and the options of each process."""
 
+import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,6 +14,7 @@ from kiteline_hw.durable_files import next_number
 from kiteline_hw.ports import FrameSource, SourceError, is_live
 from kiteline_hw.sim.links.link_model import link_seed
 from kiteline_hw.sources.open import open_source
+from kiteline_hw.system.process import told_if_slow
 
 _BASE_PERCENT = 200.0  # of a core: the computer of a base beside agents with a limit, one core for steps, one for jobs
 
@@ -76,7 +78,8 @@ def plan(o: Options, quiet: bool = False) -> FlightPlan:
     mono = o.mono or is_filter(o.config, o.tracker)
     try:
         for text in o.sources:
-            made.sources.append(open_source(text, mono=mono, imu=o.imu, calibration=o.calibration))
+            with contextlib.nullcontext() if quiet else told_if_slow(f"opening {text}"):
+                made.sources.append(open_source(text, mono=mono, imu=o.imu, calibration=o.calibration))
             if is_live(made.sources[-1]):
                 raise SourceError(f"{text}: a camera is flown with `kiteline agent`: expected a recording or sim:SCENE")
         starts = flight_starts(made.sources)

@@ -3,6 +3,7 @@
 import argparse
 import json
 import os
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,11 +18,13 @@ from kiteline_hw.sim.sensors.wear import KINDS
 from kiteline_hw.sim.source import SimSource
 from kiteline_hw.sim.truth.sight import CELL_M, look
 from kiteline_hw.sim.world.world import World
+from kiteline_hw.system.process import told_if_slow
 from kiteline_lab.flights.progress import Progress
 from kiteline_lab.grids.truth import write_truth
-from kiteline_lab.outputs.out_file import expect_nothing_lost, whole_file
+from kiteline_lab.outputs.out_file import expect_new, expect_nothing_lost, whole_file
 
 JPEG_QUALITY = 92
+FIRST_USE = "at the first use of this version kernels are compiled, for some ten seconds"
 COURSE = "course"  # in place of a trajectory: the scene's own course
 
 
@@ -55,6 +58,7 @@ def main(argv: list[str]) -> int:
                    "wheels: odometry_wheels=1")  # fmt: skip
     p.add_argument("--png", action="store_true", help=f"images without loss (default JPEG {JPEG_QUALITY})")
     p.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="threads that render (default: all cores)")
+    p.add_argument("--force", action="store_true", help="overwrite F.mcap and what lies beside it")
     o = p.parse_args(argv)
     names = ("trajectory", "seed", "seconds", "start", "lens", "mono", "depth", "imu", "odometry", "rig", "rig_seed")
     options: dict[str, object] = {name: getattr(o, name) for name in names if getattr(o, name) is not None}
@@ -63,12 +67,15 @@ def main(argv: list[str]) -> int:
     if o.also:
         options["also"] = tuple("" if name == COURSE else name for name in o.also)
     config = read_config(o.scene, **options)
+    outs = [o.out, *(o.out.with_name(f"{o.out.stem}-{k}{o.out.suffix}") for k in range(1, 1 + len(config.also)))]
+    beside = [out.with_suffix(suffix) for out in outs for suffix in (".yaml", ".rig_truth.json")]
+    expect_new([*outs, *beside], force=o.force)  # before minutes of rendering
     world: World | None = None
     poses = []
-    for agent in range(1 + len(config.also)):
-        source = SimSource(replace(config, agent=agent), o.workers, world)
+    for agent, out in enumerate(outs):
+        with told_if_slow(f"making the scene; {FIRST_USE}"):
+            source = SimSource(replace(config, agent=agent), o.workers, world)
         world = source.world
-        out = o.out if agent == 0 else o.out.with_name(f"{o.out.stem}-{agent}{o.out.suffix}")
         with whole_file(out, force=True) as part:
             samples = record(source, part, o.png)
         truth = out.with_suffix(".rig_truth.json")
@@ -95,9 +102,11 @@ def record(source: SimSource, path: Path, png: bool = False) -> int:
     assert truth is not None
     frames = samples = 0
     with (
+        ExitStack() as until_first_frame,
         LogWriter(path, {"role": "recording", "source": source.name}) as log,
         Progress(f"rendering {path.stem.strip('.').removesuffix('.mcap')}", source.frame_count, "frames") as progress,
     ):
+        until_first_frame.enter_context(told_if_slow(f"rendering the first frame; {FIRST_USE}"))
         log.rig(int(truth.t_ns[0]), source.rig, source.imu)
         for item in source:
             if isinstance(item, ImuBatch):
@@ -110,6 +119,7 @@ def record(source: SimSource, path: Path, png: bool = False) -> int:
             log.pose(GROUND_TRUTH, item.t_ns, "world", truth.T_w_b[frames])
             log.frame(replace(item, encoded=encode(item, png)))
             frames += 1
+            until_first_frame.close()
             progress.update(frames)
             expect_nothing_lost(log, path)
     expect_nothing_lost(log, path)

@@ -12,6 +12,7 @@ from kiteline_hw.sim.truth.box_files import read_boxes
 from kiteline_hw.sim.truth.occupancy import write_grid
 from kiteline_hw.sim.truth.sight import CELL_M, RANGE_M, SeenWorld, look
 from kiteline_hw.sources.open import open_source
+from kiteline_hw.system.process import told_if_slow
 
 _LEAST_CELL_M = 0.005  # a room of 10 m has 4 million such cells
 
@@ -75,6 +76,8 @@ def main(argv: list[str]) -> int:
         parser.error("expected a positive side of a cell and a positive range")
     if not _LEAST_CELL_M <= args.cell < np.inf:
         parser.error(f"expected a side of a cell of {_LEAST_CELL_M:g} m or more")
-    for file in write_truth(seen_world(args.source, args.boxes, args.cell, args.range), args.out.with_suffix("")):
+    with told_if_slow(f"looking over the world of {args.source}"):
+        seen = seen_world(args.source, args.boxes, args.cell, args.range)
+    for file in write_truth(seen, args.out.with_suffix("")):
         print(f"{file}: true occupancy")
     return 0

@@ -2,7 +2,7 @@
 
 import fcntl
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
@@ -40,16 +40,21 @@ def _written_as_it_comes(path: Path, content: bytes) -> bool:
     return True
 
 
+def expect_new(paths: Iterable[Path], *, force: bool) -> None:
+    """Raise SourceError when one of these files is there already (unless force)."""
+    there = [str(path) for path in paths if path.is_file()]
+    if there and not force:
+        exist = "exists" if len(there) == 1 else "exist"
+        raise SourceError(f"{', '.join(there)} {exist} already: name another place, or overwrite with --force")
+
+
 def write_files(folder: Path, contents: Mapping[str, bytes], *, force: bool) -> list[Path]:
     """Write files by their names in a folder, all of them or none; returns where they are.
 
     Raises SourceError when one is there already (unless force) or its folder may not be written, OSError.
     """
     paths = {folder / name: content for name, content in contents.items()}
-    there = [str(path) for path in paths if path.is_file()]
-    if there and not force:
-        exist = "exists" if len(there) == 1 else "exist"
-        raise SourceError(f"{', '.join(there)} {exist} already: name another place, or overwrite with --force")
+    expect_new(paths, force=force)
     with ExitStack() as stack:
         for path, content in paths.items():
             if not _written_as_it_comes(path, content):

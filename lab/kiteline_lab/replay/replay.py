@@ -12,10 +12,12 @@ import cv2
 from kiteline_agent.onboard import OnboardAgent
 from kiteline_agent.runtime import flight_log as agent_log
 from kiteline_agent.runtime.frame_counts import FrameCounts, live_line, odometry_line
+from kiteline_agent.runtime.warm import WARMING as AGENT_WARMING
 from kiteline_agent.runtime.warm import warm as agent_warm
 from kiteline_basestation.jobs import Job
 from kiteline_basestation.runtime import flight_log as base_log
 from kiteline_basestation.runtime.base_runtime import load_vocabulary, missing_extras
+from kiteline_basestation.runtime.warm import WARMING as BASE_WARMING
 from kiteline_basestation.runtime.warm import warm as base_warm
 from kiteline_basestation.station import Station
 from kiteline_basestation.store.restore import restore
@@ -26,7 +28,7 @@ from kiteline_hw.links.kinds import link_traits
 from kiteline_hw.logs.log_parts import WholeLog
 from kiteline_hw.logs.mcap_log import LogReader
 from kiteline_hw.ports import SourceError
-from kiteline_hw.system import process
+from kiteline_hw.system import kernel_cache, process
 from kiteline_lab.flights.progress import Progress
 from kiteline_lab.outputs.out_file import write_whole
 from kiteline_lab.replay.logged_steps import Step, agent_input, agent_of_log, check_replayable, steps
@@ -174,15 +176,17 @@ def main(argv: list[str]) -> int:
 
         return refly(a.log, a.cpu, a.out, a.virtual)
     cv2.setNumThreads(1)
-    agent_warm()
-    base_warm()
-    with WholeLog(a.log) as log, Progress("replaying", log.topics.get(agent_log.STEP), "steps") as progress:
+    with WholeLog(a.log) as log:
         is_agent = log.metadata.get("role") == "agent"
         if a.out is not None and not is_agent:
             raise SourceError(f"{a.log}: --out leaves an agent's trajectories, and this is a base's log")
         if not is_agent:
             process.print_lines(missing_extras())
-        done = (replay_agent if is_agent else replay_base)(log, progress, stop_at_first=a.verify)
+        kernel_cache.fill((*AGENT_WARMING, *BASE_WARMING))
+        agent_warm()
+        base_warm()
+        with Progress("replaying", log.topics.get(agent_log.STEP), "steps") as progress:
+            done = (replay_agent if is_agent else replay_base)(log, progress, stop_at_first=a.verify)
         cut = log.cut
     if a.out is not None and is_agent:
         write_whole(a.out / "live.tum", "".join(done.live).encode())

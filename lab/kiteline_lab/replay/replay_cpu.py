@@ -10,7 +10,7 @@ from kiteline_agent.runtime.options import AgentOptions
 from kiteline_hw.logs.mcap_log import LogReader
 from kiteline_hw.ports import SourceError
 from kiteline_hw.sources.open import open_source
-from kiteline_hw.system import process
+from kiteline_hw.system import kernel_cache, process
 from kiteline_hw.system.cpu import CpuQuota
 from kiteline_lab.flights.children import ChildProcesses, ended_by
 from kiteline_lab.flights.flight_report import statistic
@@ -55,7 +55,10 @@ def _limited(log: Path, percent: float, folder: Path) -> dict[str, Any]:
         report: dict[str, Any] | None = None
         error = ""
         while (event := children.next_event(300.0)) is not None and event.kind != "exit":
-            if event.kind == "progress":
+            if event.kind == "compiling":
+                seconds = event.values.get("seconds", 0)
+                process.print_lines([kernel_cache.still_compiling(seconds) if seconds else kernel_cache.COMPILING])
+            elif event.kind == "progress":
                 progress.update(event.values["frames"])
             elif event.kind == "result":
                 report = event.values["report"]

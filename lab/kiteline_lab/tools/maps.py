@@ -4,13 +4,11 @@
 """
 
 import argparse
-import contextlib
 import json
 import secrets
 import sys
-import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +19,6 @@ from kiteline_hw.system import process
 from kiteline_hw.system.key_store import MAPS, default_path, login_of, read_file
 
 DEFAULT_BASE = "tcp/127.0.0.1:7447"
-_PATIENCE_S = 1.5  # s until a user is told what is waited for
 
 
 def parser() -> argparse.ArgumentParser:
@@ -144,7 +141,7 @@ def ask_base(base: str, key_file: Path | None, verb: str, question: str) -> tupl
         signed = sign(key, verb, question, int(time.time()), secrets.token_hex(16), start)
         return ask(endpoint, "maps", verb, signed, logins=login_of(MAPS, key))
 
-    with _told_if_slow(f"waiting for a base at {endpoint}"):
+    with process.told_if_slow(f"waiting for a base at {endpoint}"):
         ok, text = ask_once("")  # where it is signed nothing comes of it: its refusal names the base's start
         answer = _read(endpoint, text)
         start = None if ok or key is None else answer.get("start")
@@ -152,18 +149,6 @@ def ask_base(base: str, key_file: Path | None, verb: str, question: str) -> tupl
             ok, text = ask_once(start)
             answer = _read(endpoint, text)
     return ok, text, answer
-
-
-@contextlib.contextmanager
-def _told_if_slow(text: str) -> Iterator[None]:
-    """Print a line on stderr if the block takes long."""
-    timer = threading.Timer(_PATIENCE_S, process.print_lines, [[text]])
-    timer.daemon = True
-    timer.start()
-    try:
-        yield
-    finally:
-        timer.cancel()
 
 
 def _read(endpoint: str, text: str) -> dict[str, Any]:

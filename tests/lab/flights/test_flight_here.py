@@ -32,6 +32,17 @@ def test_each_mode_keeps_the_contract(recording: Path, tmp_path: Path, mode: str
     assert (agent["bytes_up"] > 0) == (mode == "local")
 
 
+@pytest.mark.parametrize(("mode", "base"), [("tracker", False), ("monolith", True)])
+def test_kernels_are_compiled_by_a_process_that_says_so(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: str, base: bool
+) -> None:
+    filled: list[tuple[str, ...]] = []
+    monkeypatch.setattr("kiteline_lab.flights.in_process.kernel_cache.fill", filled.append)
+    fly(Options((str(recording),), tmp_path, mode, seconds=0.2))
+    assert len(filled) == 1
+    assert ("kiteline_basestation.runtime.warm" in filled[0]) == base
+
+
 def test_two_flights_are_alike_to_the_last_byte(recording: Path, tmp_path: Path) -> None:
     for run in "ab":
         fly(Options((str(recording),), tmp_path / run, "local", loss=0.2, seed=3), quiet=True)

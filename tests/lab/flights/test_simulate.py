@@ -91,3 +91,19 @@ def test_errors_leave_nothing_behind(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match="folder that exists"):
         main([SCENE, "--out", str(tmp_path / "no" / "f.mcap")])
     assert list(tmp_path.iterdir()) == []
+
+
+def test_an_existing_recording_is_overwritten_only_with_force(tmp_path: Path) -> None:
+    command = [SCENE, "--also", "course", "--out", str(tmp_path / "f.mcap")]
+    (tmp_path / "f-1.mcap").write_text("of yesterday")
+    with pytest.raises(SourceError, match=r"f-1\.mcap exists already: .*--force"):
+        main(command)
+    assert not (tmp_path / "f.mcap").exists()  # said before anything is rendered
+    assert main([*command, "--force"]) == 0
+    assert (tmp_path / "f-1.mcap").stat().st_size > 1000
+
+
+def test_a_file_of_another_kind_beside_the_recording_is_not_overwritten(tmp_path: Path) -> None:
+    (tmp_path / "f.yaml").write_text("fx: 400")
+    with pytest.raises(SourceError, match=r"f\.yaml exists already"):
+        main([SCENE, "--out", str(tmp_path / "f.mcap")])

@@ -39,15 +39,15 @@ print(json.dumps([before, after, lines + called(base)]))
 """
 
 
-def test_flights_of_two_eyes_and_of_one_compile_nothing(recording: Path, tmp_path: Path) -> None:
-    options = json.dumps([[], ["--mono", "--no-imu"]])
+def test_flights_of_two_eyes_of_one_and_of_the_filter_compile_nothing(recording: Path, tmp_path: Path) -> None:
+    options = json.dumps([[], ["--mono", "--no-imu"], ["--tracker", "ekf"]])
     done = subprocess.run(
         [sys.executable, "-c", FLIGHT, str(recording), options, str(tmp_path / "flight")],
         capture_output=True, text=True, check=True,
     )  # fmt: skip
     before, after, lines = json.loads(done.stdout.splitlines()[-1])
     assert sum(map(len, before.values())) > 50
-    assert after == [before, before]
+    assert after == [before, before, before]
     lists = {name: set(listed(importlib.import_module(name))) for name in WARMING}
     named = set().union(*lists.values())
     assert named == set(lines), "write the lists anew: make kernels"

@@ -275,3 +275,16 @@ def test_a_flight_under_a_limit_says_what_was_not_written(
 
 def full_disk(*_: object) -> None:
     raise OSError(errno.ENOSPC, "No space left on device")
+
+
+def test_a_log_that_is_not_there_is_told_before_kernels_are_compiled_and_another_is_told_of_them(
+    flown: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    filled: list[tuple[str, ...]] = []
+    monkeypatch.setattr("kiteline_lab.replay.replay.kernel_cache.fill", filled.append)
+    monkeypatch.setattr("kiteline_lab.replay.replay.agent_warm", lambda: filled.append(("warm",)))
+    with pytest.raises((SourceError, FileNotFoundError)):
+        main([str(tmp_path / "nowhere.mcap"), "--verify"])
+    assert filled == []
+    assert main([str(flown / "agent0" / "log.mcap"), "--verify"]) == 0
+    assert "kiteline_basestation.runtime.warm" in filled[0] and filled[1] == ("warm",)

@@ -109,8 +109,8 @@ def test_a_base_that_does_not_answer_is_waited_for_with_a_word(
         print(*lines)
         told.set()
 
-    monkeypatch.setattr(maps, "_PATIENCE_S", 0.01)
-    monkeypatch.setattr("kiteline_lab.tools.maps.process.print_lines", tell)
+    monkeypatch.setattr("kiteline_hw.system.process._PATIENCE_S", 0.01)
+    monkeypatch.setattr("kiteline_hw.system.process.print_lines", tell)
     monkeypatch.setattr(maps, "ask", slow)
     monkeypatch.setattr(maps, "default_path", lambda: Path("no keys"))
     assert maps.main(["list", "--base", "tcp/10.0.0.1:7447"]) == 0
