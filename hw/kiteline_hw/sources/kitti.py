@@ -5,17 +5,20 @@ K [I | t]; the baseline is the difference of the two t along x. The components o
 the colour cameras) are ignored: the images were rectified so that their rows agree. Raw drives: see kitti_raw.
 """
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
 from kiteline_core.arrays import F64
 from kiteline_core.frame import Trajectory
-from kiteline_hw.ports import SourceError
+from kiteline_hw.ports import SourceError, SourceReport
+from kiteline_hw.sensors.frames import EncodedFrame
 from kiteline_hw.sources.kitti_raw import is_raw, open_raw, pairs_by_name, rig_of
 from kiteline_hw.sources.recording import Recording, image_size, list_images, sorted_trajectory
 from kiteline_hw.sources.text_files import read_rows, row_values, seconds_to_ns
 
+_TIMES = "times.txt"
 NOMINAL_HZ = 10  # KITTI's rate, used if there is no times.txt
 PAIRS = (("image_0", "image_1", "P0", "P1"), ("image_2", "image_3", "P2", "P3"), ("image_l", "image_r", "P0", "P1"))
 
@@ -43,10 +46,13 @@ def open_source(folder_name: str, mono: bool, imu: bool) -> Recording:
     if rig.T_c_r is not None and rig.T_c_r[0, 3] < 0:
         raise SourceError(f"{calib}: baseline {rig.T_c_r[0, 3]:g} m: left and right row are swapped")
     times = _read_times(folder, lefts)
-    return Recording(
-        f"kitti:{folder}", rig, len(lefts), lambda report: pairs_by_name(times, lefts, rights, report),
-        ground_truth=_read_ground_truth(folder, lefts, times),
-    )  # fmt: skip
+
+    def frames(report: SourceReport) -> Iterator[EncodedFrame]:
+        if not (folder / _TIMES).is_file():
+            report.notes.append(f"no {folder / _TIMES} (s a line): flown at {NOMINAL_HZ} images a second")
+        yield from pairs_by_name(times, lefts, rights, report)
+
+    return Recording(f"kitti:{folder}", rig, len(lefts), frames, ground_truth=_read_ground_truth(folder, lefts, times))
 
 
 def _read_projections(path: Path, left: str, right: str) -> tuple[F64, F64 | None]:
@@ -82,7 +88,7 @@ def _row_indices(images: list[Path], row_count: int) -> list[int]:
 
 
 def _read_times(folder: Path, lefts: list[Path]) -> list[int]:
-    path = folder / "times.txt"
+    path = folder / _TIMES
     if not path.is_file():
         numbers = [int(p.stem) for p in lefts] if all(p.stem.isdecimal() for p in lefts) else list(range(len(lefts)))
         return [number * (1_000_000_000 // NOMINAL_HZ) for number in numbers]

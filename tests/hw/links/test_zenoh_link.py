@@ -130,7 +130,7 @@ def test_a_question_waits_as_long_for_a_base_as_it_says(
     monkeypatch.setattr(zenoh, "open", refused)
     monkeypatch.setattr(time, "monotonic", lambda: clock_s)
     monkeypatch.setattr(time, "sleep", sleep)
-    with pytest.raises(LinkError, match="no base station answers .* within 10 s"):
+    with pytest.raises(LinkError, match=r"no base station answers .* within 10 s"):
         ask(free_endpoint(), "maps", "list", "{}", logins)
     assert 110.0 <= clock_s < 110.5
 

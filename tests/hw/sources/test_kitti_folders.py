@@ -134,3 +134,15 @@ def test_kitti_errors(tmp_path: Path) -> None:
     (kitti(tmp_path / "e", "image_0", None, NAMED) / "times.txt").write_text("0\n0.1\n")
     with pytest.raises(SourceError, match="2 times for 3 images"):
         open_source(str(tmp_path / "e"))
+
+
+def test_a_sequence_without_times_tells_its_rate(tmp_path: Path) -> None:
+    for i in range(3):
+        put(tmp_path / "image_0" / f"{i:06d}.png", picture(i))
+    (tmp_path / "calib.txt").write_text("P0: 60 0 32 0 0 60 24 0 0 0 1 0\n")
+    source = open_source(f"kitti:{tmp_path}")
+    assert len(list(source)) == 3
+    assert len(source.report.notes) == 1 and "times.txt" in source.report.notes[0]
+    (tmp_path / "times.txt").write_text("0\n0.1\n0.2\n")
+    source = open_source(f"kitti:{tmp_path}")
+    assert len(list(source)) == 3 and source.report.notes == []
