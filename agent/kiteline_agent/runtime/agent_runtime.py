@@ -30,6 +30,7 @@ from kiteline_codec import warm as codec_warm
 from kiteline_codec.channel import CodedChannel, RecordChannel, settled
 from kiteline_core.config import ConfigError
 from kiteline_core.ids import AgentId
+from kiteline_core.wording import counted
 from kiteline_hw.durable_files import link_newest
 from kiteline_hw.links.kinds import link_traits
 from kiteline_hw.lockstep.messages import Down, Phase, Up
@@ -277,7 +278,7 @@ class AgentRuntime:
         total = self.counts.as_report()
         skipped, notes = self.source.report.skipped, list(self.source.report.notes)
         if self._encoder.stored:
-            notes.append(f"log: {self._encoder.stored} images stored uncompressed, as encoding fell behind")
+            notes.append(f"log: {counted(self._encoder.stored, 'image')} stored uncompressed, as encoding fell behind")
         notes += [*self._warnings, *self.log_notes()]
         return {
             "source": self.source.name,

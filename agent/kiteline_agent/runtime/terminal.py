@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 from kiteline_agent.runtime.frame_counts import FrameCounts, live_pose
 from kiteline_agent.step import StepOutput
+from kiteline_core.wording import counted
 
 _SUMMARY_NS = 10_000_000_000  # between two summaries
 _SHOWN = (
@@ -56,6 +57,6 @@ class StatusMessages:
 def summary(counts: FrameCounts) -> str:
     """The flight so far in one line."""
     return (
-        f"{counts.frames} frames: {counts.tracked} tracked, {counts.lost} lost, {counts.dropped} dropped; "
-        f"{counts.keyframes} keyframes in {len(counts.submaps)} submap{'s' * (len(counts.submaps) != 1)}"
+        f"{counted(counts.frames, 'frame')}: {counts.tracked} tracked, {counts.lost} lost, {counts.dropped} dropped; "
+        f"{counted(counts.keyframes, 'keyframe')} in {counted(len(counts.submaps), 'submap')}"
     )

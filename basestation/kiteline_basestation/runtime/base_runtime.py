@@ -28,6 +28,7 @@ from kiteline_codec import warm as codec_warm
 from kiteline_codec.channel import RecordChannel, settled
 from kiteline_core.ids import AgentId
 from kiteline_core.places.place_index import Vocabulary
+from kiteline_core.wording import counted
 from kiteline_hw.durable_files import write_atomically
 from kiteline_hw.links.kinds import link_traits
 from kiteline_hw.lockstep.messages import Down, Phase, Up
@@ -313,10 +314,9 @@ def report_restored(restored: Restored | None, parent: process.Parent | None) ->
     """Print what was restored and repaired, and send it to the parent process."""
     if restored is None:
         return
-    keyframes = f"{restored.keyframes} keyframe{'s' * (restored.keyframes != 1)}"
     process.print_lines(
         [
-            f"store: {keyframes}, {restored.awaited} value{'s' * (restored.awaited != 1)} awaited",
+            f"store: {counted(restored.keyframes, 'keyframe')}, {counted(restored.awaited, 'value')} awaited",
             *(f"store: repaired: {fault}" for fault in restored.faults),
         ]
     )

@@ -17,6 +17,7 @@ from kiteline_codec.schema import Key, WireError, messages, owners, record_log
 from kiteline_core.config import ConfigError
 from kiteline_core.errors import INPUT_FAULTS
 from kiteline_core.ids import AgentId
+from kiteline_core.wording import counted
 from kiteline_hw.logs.log_parts import WholeLog
 from kiteline_hw.logs.mcap_log import LogMessage, LogReader
 
@@ -79,7 +80,7 @@ def _of_agent(log: LogReader, path: Path) -> FromLog:
         values.setdefault(agent, {})[key] = code
     for agent, keys in sorted(strange.items()):
         faults.append(
-            f"{path}: left out {len(keys)} value{'s' * (len(keys) != 1)} not of agent {agent}, whose log this is, the "
+            f"{path}: left out {counted(len(keys), 'value')} not of agent {agent}, whose log this is, the "
             f"first {value_name(keys[0])}: ids of an earlier version?"
         )
     if strange and not values:

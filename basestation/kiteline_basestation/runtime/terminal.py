@@ -11,6 +11,7 @@ from kiteline_basestation.station import Station
 from kiteline_codec.channel import CodedChannel
 from kiteline_core.geometry import se3
 from kiteline_core.ids import AgentId, KeyframeId, SubmapId, agent_of_submap, submap_of_keyframe
+from kiteline_core.wording import counted
 
 _EVERY_NS = 10_000_000_000  # between two summaries
 
@@ -119,15 +120,15 @@ class TerminalReporter:
         mapper = self._station.mapper
         keyframes = sum(len(mapper.map.submaps.get(submap, ())) for submap in merge.moved)
         newer, older = _name(merge.map_id, mapper.names), _name(merge.into, mapper.names)
-        return f"map {newer} ({_count(keyframes, 'keyframe')}) merged into map {older}"
+        return f"map {newer} ({counted(keyframes, 'keyframe')}) merged into map {older}"
 
     def summary(self) -> str:
         """Sizes of the map in one line."""
         s = self._station.mapper.summary()
         return (
-            f"{_count(_int(s['keyframes']), 'keyframe')} and {s['points']} landmarks "
-            f"in {_count(_int(s['maps']), 'map')}; "
-            f"{_count(_int(s['loops']), 'loop')}, {_count(_int(s['merges']), 'merge')}"
+            f"{counted(_int(s['keyframes']), 'keyframe')} and {counted(_int(s['points']), 'landmark')} "
+            f"in {counted(_int(s['maps']), 'map')}; "
+            f"{counted(_int(s['loops']), 'loop')}, {counted(_int(s['merges']), 'merge')}"
         )
 
     def _status(self, flight_ns: int, rss_mib: float, stored: bool | None) -> str:
@@ -139,9 +140,9 @@ class TerminalReporter:
         self._bytes_up, self._bytes_down = up, down
         waits = sum(e.dirty for e in ends)
         parts = [
-            f"{_count(len(self._here), 'agent')} connected",
+            f"{counted(len(self._here), 'agent')} connected",
             self.summary(),
-            f"{rates[0]:.1f} kB/s up, {rates[1]:.1f} down" + (f", {_count(waits, 'value')} to send" if waits else ""),
+            f"{rates[0]:.1f} kB/s up, {rates[1]:.1f} down" + (f", {counted(waits, 'value')} to send" if waits else ""),
             f"peak memory {rss_mib:.0f} MiB",
         ]
         if stored is not None:
@@ -151,10 +152,6 @@ class TerminalReporter:
 
 def _name(submap: SubmapId, names: dict[SubmapId, str]) -> str:
     return f'{submap_name(submap)} "{names[submap]}"' if submap in names else submap_name(submap)
-
-
-def _count(number: int, noun: str) -> str:
-    return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
 def _int(value: object) -> int:

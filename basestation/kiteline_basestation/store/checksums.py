@@ -16,6 +16,7 @@ from kiteline_basestation.store.saved_map import SavedMap, SavedValues, value_na
 from kiteline_codec.schema import Key
 from kiteline_core.errors import KitelineError
 from kiteline_core.ids import MAX_AGENTS, AgentId
+from kiteline_core.wording import counted
 
 _APPLICATION = 0x6B6C6D70  # "klmp"
 VERSION = 5  # of the tables; a store of another version is refused
@@ -213,10 +214,10 @@ def _missed(db: sqlite3.Connection, table: str, count: int, total: int, faults: 
         found = None
     rows, expected = found or (None, None)
     if rows is not None and isinstance(rows, int) and rows > count:
-        return [f"{rows - count} rows of table {table} are missing"]
+        return [f"{counted(rows - count, 'row')} of table {table} missing"]
     if rows == count and (faults or expected == _wrapped(total)):
         return []
-    return [f"table {table} has {count} rows, and its totals say {rows}: altered on disk"]
+    return [f"table {table} has {counted(count, 'row')}, and its totals say {rows}: altered on disk"]
 
 
 def _row_name(row: Sequence[Any]) -> str:

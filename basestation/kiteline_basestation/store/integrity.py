@@ -45,6 +45,7 @@ from kiteline_core.ids import (
     agent_of_submap,
     submap_of_keyframe,
 )
+from kiteline_core.wording import counted
 
 _RIGID = 1e-6  # tolerance of a rotation matrix
 _OF_BASE = KeyframePose | RefinedLandmarks | FusedLandmarks | RemovedObservations | CulledLandmarks
@@ -204,7 +205,7 @@ def relinked(mapper: Mapper) -> list[str]:
     to = np.where(table.kind[left] == LANDMARK, left, -1).astype(np.int32)
     kernels.link(left, to, table.root, table.first, table.next)
     mapper.tell_fused(fused)
-    return [f"{len(wrong)} keypoints were linked to landmarks of another map, or to none: maps are apart there"]
+    return [f"{counted(len(wrong), 'keypoint')} linked to landmarks of another map, or to none: maps are apart there"]
 
 
 def _linked_wrongly(sparse_map: SparseMap) -> I32:
@@ -236,16 +237,18 @@ def contradictions(mapper: Mapper) -> list[str]:
     linked = np.flatnonzero(root >= 0)
     kinds = table.kind[:n]
     if np.any(kinds[linked] == EMPTY):
-        out.append(f"{np.count_nonzero(kinds[linked] == EMPTY)} empty keypoints are linked to landmarks")
+        out.append(f"{counted(int(np.count_nonzero(kinds[linked] == EMPTY)), 'empty keypoint')} linked to landmarks")
     on = root[linked]
     fused = (root[on] != on) & (kinds[on] != EMPTY)  # a landmark whose section is still to come counts as a root
     if np.any(fused):
-        out.append(f"{np.count_nonzero(fused)} keypoints are linked to fused landmarks")
+        out.append(f"{counted(int(np.count_nonzero(fused)), 'keypoint')} linked to fused landmarks")
     if np.any(kinds[on] == OBSERVATION):
-        out.append(f"{np.count_nonzero(kinds[on] == OBSERVATION)} keypoints are linked to what is no landmark")
+        out.append(
+            f"{counted(int(np.count_nonzero(kinds[on] == OBSERVATION)), 'keypoint')} linked to what is no landmark"
+        )
     unlinked = np.flatnonzero((kinds == LANDMARK) & (root < 0))
     if len(unlinked):
-        out.append(f"{len(unlinked)} landmarks have no root")
+        out.append(f"{counted(len(unlinked), 'landmark')} without a root")
     roots = np.unique(on).astype(np.int32)
     listed = np.zeros(n, np.int64)
     for slot in roots.tolist():

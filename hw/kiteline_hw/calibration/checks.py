@@ -5,6 +5,7 @@ import numpy as np
 from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraModel, Lens
+from kiteline_core.wording import counted
 from kiteline_hw.ports import SourceError
 
 LONGEST_READOUT_S = 0.2  # no video camera is slower
@@ -37,18 +38,19 @@ def parse_lens(model: str, coefficients: list[float], where: str) -> tuple[Lens,
     name = _plain(model)
     if not name and any(coefficients):
         raise SourceError(
-            f"{where}: {len(coefficients)} coefficients of a lens whose distortion model is not named: expected "
-            "radial-tangential or equidistant, or none with coefficients of 0; --calibration FILE takes another one"
+            f"{where}: {counted(len(coefficients), 'coefficient')} of a lens whose distortion model is not named: "
+            "expected radial-tangential or equidistant, or none with coefficients of 0; "
+            "--calibration FILE takes another one"
         )
     if name in _UNDISTORTED or not any(coefficients):
         return (Lens.EQUIDISTANT, (0.0, 0.0, 0.0, 0.0)) if name in _EQUIDISTANT else (Lens.NONE, ())
     if name in _RADTAN:
         if len(coefficients) not in (4, 5, 8):
-            raise SourceError(f"{where}: {model} has {len(coefficients)} coefficients: expected 4, 5 or 8")
+            raise SourceError(f"{where}: {model} has {counted(len(coefficients), 'coefficient')}: expected 4, 5 or 8")
         return Lens.RADTAN, tuple(coefficients)
     if name in _EQUIDISTANT:
         if len(coefficients) != 4:
-            raise SourceError(f"{where}: {model} has {len(coefficients)} coefficients: expected 4")
+            raise SourceError(f"{where}: {model} has {counted(len(coefficients), 'coefficient')}: expected 4")
         return Lens.EQUIDISTANT, tuple(coefficients)
     raise SourceError(f"{where}: lens model {model!r} is not known: expected radial-tangential or equidistant")
 

@@ -9,6 +9,7 @@ from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraModel, CameraRig
+from kiteline_core.wording import counted
 from kiteline_hw.calibration.checks import checked_baseline
 from kiteline_hw.ports import SourceError
 
@@ -90,7 +91,8 @@ def joined(parts: Sequence[FilePart]) -> FileCalibration:
     imus = [p for p in parts if p.calibration.imu is not None]
     count = sum(len(p.calibration.cameras) for p in eyes)
     if count > 2 or len(imus) > 1:
-        raise SourceError(f"{where}: {count} cameras and {len(imus)} IMUs: expected a left and a right camera, one IMU")
+        found = f"{counted(count, 'camera')} and {counted(len(imus), 'IMU')}"
+        raise SourceError(f"{where}: {found}: expected a left and a right camera, one IMU")
     imu = imus[0].calibration.imu if imus else None
     if not eyes:
         return FileCalibration(where, imu=imu)

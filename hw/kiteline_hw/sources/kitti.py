@@ -12,6 +12,7 @@ import numpy as np
 
 from kiteline_core.arrays import F64
 from kiteline_core.frame import Trajectory
+from kiteline_core.wording import counted
 from kiteline_hw.ports import SourceError, SourceReport
 from kiteline_hw.sensors.frames import EncodedFrame
 from kiteline_hw.sources.kitti_raw import is_raw, open_raw, pairs_by_name, rig_of
@@ -97,7 +98,8 @@ def _read_times(folder: Path, lefts: list[Path]) -> list[int]:
     except ValueError as error:
         raise SourceError(f"{path}: {error}") from error
     if len(times) < len(lefts):
-        raise SourceError(f"{path}: {len(times)} times for {len(lefts)} images: expected one a line for each image")
+        found = f"{counted(len(times), 'time')} for {counted(len(lefts), 'image')}"
+        raise SourceError(f"{path}: {found}: expected one a line for each image")
     return [times[row] for row in _row_indices(lefts, len(times))]
 
 

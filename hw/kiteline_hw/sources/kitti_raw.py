@@ -12,6 +12,7 @@ import numpy as np
 
 from kiteline_core.arrays import F64
 from kiteline_core.geometry.cameras import CameraModel, CameraRig
+from kiteline_core.wording import counted
 from kiteline_hw.calibration.checks import checked_baseline, checked_camera
 from kiteline_hw.ports import SourceError, SourceReport
 from kiteline_hw.sensors.frames import EncodedFrame
@@ -112,7 +113,8 @@ def _read_times(path: Path, lefts: list[Path]) -> list[int]:
     """Stamps in ns of the images, whose names are the numbers of rows such as `2011-09-26 13:02:25.594360375`."""
     lines = [line.strip() for line in read_text(path, "a date and time a line").splitlines() if line.strip()]
     if len(lines) < len(lefts):
-        raise SourceError(f"{path}: {len(lines)} times for {len(lefts)} images: expected one a line for each image")
+        found = f"{counted(len(lines), 'time')} for {counted(len(lefts), 'image')}"
+        raise SourceError(f"{path}: {found}: expected one a line for each image")
     numbered = all(p.stem.isdecimal() and int(p.stem) < len(lines) for p in lefts)
     return [_nanoseconds(lines[int(p.stem) if numbered else k], path) for k, p in enumerate(lefts)]
 

@@ -14,6 +14,7 @@ from kiteline_core.arguments import period
 from kiteline_core.arrays import U8
 from kiteline_core.errors import KitelineError
 from kiteline_core.frame import Frame, ImuBatch, OdometryBatch
+from kiteline_core.wording import counted
 from kiteline_hw.calibration.file_calibration import UNCALIBRATED, FileCalibration
 from kiteline_hw.calibration.files import FORMS, read_calibration
 from kiteline_hw.calibration.own import texts as own_texts
@@ -129,7 +130,7 @@ def _camera(args: argparse.Namespace) -> int:
             )
         result, findings = calibrated(collector, board, args.lens, args.coefficients)
         rms = ", ".join(f"{r.rms_px:.3f}" for r in result.residuals)
-        head = f"kiteline calibrate: {len(result.poses)} views of {_described(board)}, {rms} px rms"
+        head = f"kiteline calibrate: {counted(len(result.poses), 'view')} of {_described(board)}, {rms} px rms"
         comments = (f"{head}; {overall(findings)}",)
         given = FileCalibration(str(args.out), result.cameras, result.T_c_r, kept.T_b_c, kept.imu, kept.topics)
         part.write_text(own_texts(given, comments)["calibration.yaml"])
@@ -150,7 +151,8 @@ def _camera(args: argparse.Namespace) -> int:
 def _note(collector: ViewCollector) -> str:
     covered = ", ".join(f"{100 * c.share:.0f} %" for c in collector.coverage)
     wanted = collector.wanted()
-    return f"{len(collector.views)} views, {covered} covered" + (f"; show {wanted}" if wanted else "; complete")
+    seen = f"{counted(len(collector.views), 'view')}, {covered} covered"
+    return seen + (f"; show {wanted}" if wanted else "; complete")
 
 
 def _described(board: Board) -> str:

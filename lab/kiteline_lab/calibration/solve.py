@@ -15,6 +15,7 @@ from kiteline_core.arrays import F64, I64, Bool
 from kiteline_core.errors import KitelineError
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraModel, Lens
+from kiteline_core.wording import counted
 from kiteline_lab.calibration.lenses import derivatives, project, rays
 from kiteline_lab.calibration.views import View
 
@@ -99,8 +100,8 @@ def calibrate(
         if seen < FEWEST_VIEWS:
             who = f"the {('left', 'right')[k]} camera" if n == 2 else "the camera"
             raise CalibrationFailed(
-                f"{seen} views of the board by {who}: expected {FEWEST_VIEWS} at least, better 15 to 40; check the "
-                "board's squares, kind and dictionary against --board, the light and the focus"
+                f"{counted(seen, 'view')} of the board by {who}: expected {FEWEST_VIEWS} at least, better 15 to 40; "
+                "check the board's squares, kind and dictionary against --board, the light and the focus"
             )
     d = 4 if lens is Lens.EQUIDISTANT else coefficients
     state, used = _start(points_m, views, sizes, lens, d)
@@ -153,8 +154,8 @@ def _start(
         both = [right @ se3.inverse(left) for left, right in zip(*poses) if left is not None and right is not None]
         if len(both) < FEWEST_VIEWS:
             raise CalibrationFailed(
-                f"{len(both)} views of the board by both cameras: expected {FEWEST_VIEWS} at least, better 15: hold it "
-                "where both see it; images of a pair must be of the same instant"
+                f"{counted(len(both), 'view')} of the board by both cameras: expected {FEWEST_VIEWS} at least, better "
+                "15: hold it where both see it; images of a pair must be of the same instant"
             )
         shifts = np.array([T[:3, 3] for T in both])
         apart = np.linalg.norm(shifts[:, None] - shifts[None], axis=2).sum(1)

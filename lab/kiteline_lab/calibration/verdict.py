@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from kiteline_core.wording import counted
 from kiteline_lab.calibration.solve import Calibrated
 from kiteline_lab.calibration.views import ENOUGH_VIEWS, Coverage
 
@@ -42,7 +43,8 @@ def judge(result: Calibrated, coverage: Sequence[Coverage], views: int) -> list[
     for axis, how in ((0, "turned about its upright axis"), (1, "tipped forward and back")):
         tilted = int((np.abs(normals[:, axis]) > _TILT).sum())
         if tilted < _NEEDED_TILTED:
-            out.append(CalibrationFinding("poor", f"{tilted} views of the board {how}", "show a few by 20 to 45°"))
+            text = f"{counted(tilted, 'view')} of the board {how}"
+            out.append(CalibrationFinding("poor", text, "show a few by 20 to 45°"))
     if result.T_c_r is not None:
         baseline_m, sigma = float(np.linalg.norm(result.T_c_r[:3, 3])), result.baseline_sigma()
         turn = np.degrees(np.arccos(np.clip(0.5 * (np.trace(result.T_c_r[:3, :3]) - 1.0), -1.0, 1.0)))

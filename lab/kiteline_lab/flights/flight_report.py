@@ -9,6 +9,7 @@ import numpy as np
 
 from kiteline_core.arrays import F64
 from kiteline_core.geometry import tum
+from kiteline_core.wording import counted
 
 Report = dict[str, Any]
 
@@ -62,9 +63,9 @@ def table(report: Report) -> str:
     if base:
         digests = {True: "equal", False: "NOT equal"}.get(base["digest_equal"], "not compared")
         lines.append(
-            f"base: {base.get('keyframes', 0)} keyframes, {base['map_points']} points, {base['loops']} loops, "
-            f"{base['merges']} merges, digests {digests}, bundle {base['timing']['bundle_ms']['p50']:.1f} ms, "
-            f"{base['timing']['rss_mib']:.0f} MiB"
+            f"base: {counted(base.get('keyframes', 0), 'keyframe')}, {counted(base['map_points'], 'point')}, "
+            f"{counted(base['loops'], 'loop')}, {counted(base['merges'], 'merge')}, digests {digests}, "
+            f"bundle {base['timing']['bundle_ms']['p50']:.1f} ms, {base['timing']['rss_mib']:.0f} MiB"
         )
     lines.extend(f"note: {note}" for note in (*report.get("notes", ()), *_agent_notes(report["agents"])))
     return "\n".join(lines)

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 
 from kiteline_core.frame import EncodedImage, Frame, ImuBatch, OdometryBatch
+from kiteline_core.wording import counted
 from kiteline_hw.logs.mcap_log import GROUND_TRUTH, IMU, ODOMETER, LogWriter
 from kiteline_hw.sensors.images import encode_depth, encode_image
 from kiteline_hw.sim.config import RIGS, SimConfig, read_config
@@ -83,7 +84,8 @@ def main(argv: list[str]) -> int:
             json.dumps({"rig": config.rig, "readout_s": config.readout_s, **source.worn.to_json()}, indent=1) + "\n"
         )
         poses.append(source.ground_truth.T_w_b @ source.worn.true.T_b_c)
-        print(f"{out}: {source.frame_count} frames, {samples} imu samples, {out.stat().st_size / 1e6:.1f} MB")
+        frames = counted(source.frame_count, "frame")
+        print(f"{out}: {frames}, {counted(samples, 'imu sample')}, {out.stat().st_size / 1e6:.1f} MB")
     assert world is not None
     seen = look(world, source.worn.true.left, np.concatenate(poses), cell_m=cell_m(config))
     for file in write_truth(seen, o.out.with_suffix("")):

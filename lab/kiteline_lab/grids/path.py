@@ -12,6 +12,7 @@ import numpy as np
 
 from kiteline_core.arrays import F64, Bool
 from kiteline_core.errors import KitelineError
+from kiteline_core.wording import counted
 from kiteline_lab.grids.files import FREE, OCCUPIED, UNKNOWN, GridFile, read_grid
 from kiteline_lab.grids.path_kernels import search
 from kiteline_lab.grids.picture import draw_path
@@ -167,5 +168,6 @@ def main(argv: list[str]) -> int:
             )
         )
     else:
-        print(f"{found.length_m:.2f} m, {len(found.places) - 1} straight parts, {found.clearance_m:.2f} m of room")
+        parts = counted(len(found.places) - 1, "straight part")
+        print(f"{found.length_m:.2f} m, {parts}, {found.clearance_m:.2f} m of room")
     return 0

@@ -24,6 +24,7 @@ from kiteline_basestation.store.restore import restore
 from kiteline_basestation.store.saved_map import unpack
 from kiteline_core.arguments import limit
 from kiteline_core.ids import AgentId
+from kiteline_core.wording import counted
 from kiteline_hw.links.kinds import link_traits
 from kiteline_hw.logs.log_parts import WholeLog
 from kiteline_hw.logs.mcap_log import LogReader
@@ -196,7 +197,6 @@ def main(argv: list[str]) -> int:
     if done.difference is not None:
         print(f"differs: {done.difference}")
         return 1 if a.verify else 0
-    print(
-        f"{done.steps} steps" + (f", {done.counts.frames} frames" if is_agent else "") + ": every output as in the log"
-    )
+    frames = f", {counted(done.counts.frames, 'frame')}" if is_agent else ""
+    print(f"{counted(done.steps, 'step')}{frames}: every output as in the log")
     return 0

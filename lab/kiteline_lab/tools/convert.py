@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 
 from kiteline_core.frame import Frame, ImuBatch, Trajectory
+from kiteline_core.wording import counted
 from kiteline_hw.logs.mcap_log import GROUND_TRUTH, IMU, ODOMETER, LogWriter
 from kiteline_hw.ports import FrameSource
 from kiteline_hw.sources.kinds import source_forms
@@ -30,7 +31,7 @@ def main(argv: list[str]) -> int:
             frames, samples = record(source, part)
         finally:
             source.close()
-    print(f"{o.out}: {frames} frames, {samples} imu samples, {o.out.stat().st_size / 1e6:.1f} MB")
+    print(f"{o.out}: {counted(frames, 'frame')}, {counted(samples, 'imu sample')}, {o.out.stat().st_size / 1e6:.1f} MB")
     for reason, count in sorted(source.report.skipped.items()):
         print(f"  skipped: {count} x {reason}")
     for note in source.report.notes:

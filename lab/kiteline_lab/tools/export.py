@@ -34,6 +34,7 @@ from kiteline_core.ids import (
     boot_of_submap,
     submap_of_keyframe,
 )
+from kiteline_core.wording import counted
 from kiteline_lab.outputs.out_file import write_files
 
 FORMATS = ("tum", "ply", "pgm", "g2o")
@@ -130,7 +131,7 @@ def _left_out(mapper: Mapper) -> list[str]:
         map_id = sparse_map.map_id(submap)
         lost[map_id] = lost.get(map_id, 0) + len(sparse_map.submaps[submap])
     return [
-        f"left out: map {submap_name(map_id)} ({n} keyframe{'s' * (n != 1)}) has no place in w"
+        f"left out: map {submap_name(map_id)} ({counted(n, 'keyframe')}) has no place in w"
         for map_id, n in lost.items()
     ]
 

@@ -13,6 +13,7 @@ from pathlib import Path
 from mcap.records import Schema
 from mcap.writer import CompressionType, Writer
 
+from kiteline_core.wording import counted
 from kiteline_hw.logs.mcap_file import McapFile, RawMessage
 from kiteline_hw.logs.mcap_repair import BEGINS, REPAIRED
 from kiteline_hw.ports import SourceError
@@ -112,7 +113,7 @@ def _recover(path: Path, out: Path, force: bool) -> int:
     file = McapFile(path)
     with whole_file(out, force=force) as part:
         written = _write(part, [file], ((0, m) for m in file.messages(ordered=False)), [""])
-    print(f"{out}: {written} messages; {path} was {file.cut or 'whole'}")
+    print(f"{out}: {counted(written, 'message')}; {path} was {file.cut or 'whole'}")
     for note in file.notes:
         print(f"  {note}")
     return 0
@@ -133,7 +134,7 @@ def _cut(path: Path, out: Path, begin_s: float, end_s: float, force: bool) -> in
         stretch = ((0, m) for m in _interval(file, begin_ns, end_ns))
         begins = f"{begin_s:g} s after the start" if begin_ns > file.first_ns else ""
         written = _write(part, [file], stretch, [""], begins)
-    print(f"{out}: {written} messages")
+    print(f"{out}: {counted(written, 'message')}")
     return 0
 
 
@@ -165,7 +166,7 @@ def _merge(out: Path, paths: list[Path], force: bool) -> int:
     merged = heapq.merge(*map(_numbered, count(), files), key=lambda item: (item[1].log_ns, item[0]))
     with whole_file(out, force=force) as part:
         written = _write(part, files, merged, _prefixes(files))
-    print(f"{out}: {written} messages of {len(paths)} files")
+    print(f"{out}: {counted(written, 'message')} of {counted(len(paths), 'file')}")
     return 0
 
 

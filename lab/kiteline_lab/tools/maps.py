@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from kiteline_codec.transport.signed_question import sign
+from kiteline_core.wording import counted
 from kiteline_hw.links.zenoh_queries import ask
 from kiteline_hw.ports import LinkError
 from kiteline_hw.system import process
@@ -81,7 +82,8 @@ def query(a: argparse.Namespace) -> dict[str, Any]:
 def table(answer: Mapping[str, Any]) -> str:
     """A reply as text: maps in a table."""
     if "looking" in answer:
-        searched = f"{answer['looking']} keyframes are searched for in the other map"
+        n = int(answer["looking"])
+        searched = f"{counted(n, 'keyframe')} {'is' if n == 1 else 'are'} searched for in the other map"
         return f"{searched}; `kiteline maps list` shows one map once a place is found"
     if "deleted" in answer:
         return f"deleted: {' '.join(answer['deleted'])}"
@@ -122,8 +124,8 @@ def _of_store(a: argparse.Namespace) -> int:
     for fault in checked.faults:
         print(f"{a.store}: {fault}", file=sys.stderr)
     agents, faults = len(checked.saved.agents), len(checked.faults)
-    of = f"{agents} agent{'s' * (agents != 1)}"
-    print(f"{a.store}: {values} values of {of} are sound, {faults} fault{'s' * (faults != 1)}")
+    sound = f"{counted(values, 'value')} of {counted(agents, 'agent')} {'is' if values == 1 else 'are'} sound"
+    print(f"{a.store}: {sound}, {counted(faults, 'fault')}")
     return 1 if checked.faults else 0
 
 

@@ -95,7 +95,7 @@ def test_changes_are_told_once_and_a_summary_now_and_then() -> None:
         told += narrator.lines(step, tally, k * 50_000_000)
     words = [line.split("s  ", 1)[1] for line in told]
     assert words[:2] == ["submap: opened", "first pose"]
-    assert words[2].startswith("201 frames: 191 tracked, 10 lost, 0 dropped; 1 keyframes in 1 submap; 0.0 kB/s up")
+    assert words[2].startswith("201 frames: 191 tracked, 10 lost, 0 dropped; 1 keyframe in 1 submap; 0.0 kB/s up")
     assert words[3:] == ["lost: no pose from the images", "tracking again after 0.2 s"]
     assert told[4].startswith("    15.7 s")
     assert summary(tally).startswith("400 frames: 386 tracked, 14 lost")

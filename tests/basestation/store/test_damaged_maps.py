@@ -84,7 +84,7 @@ def test_maps_whose_merge_was_lost_are_apart_and_their_agents_told(joined: tuple
     texts = {name: text for name, text in kept.texts.items() if name != "mapper.map"}
     station = new_station(words, session=3)
     restored = restore(station, replace(kept, texts=texts, faults=("state 'mapper.map' was altered",)), 0)
-    assert any("were linked to landmarks of another map, or to none" in fault for fault in restored.faults)
+    assert any("linked to landmarks of another map, or to none" in fault for fault in restored.faults)
     end = station.channels[AgentId(1)]
     assert isinstance(end, CodedChannel)
     for n in range(5):

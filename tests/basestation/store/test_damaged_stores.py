@@ -134,7 +134,7 @@ def test_rows_that_are_gone_are_missed(tmp_path: Path) -> None:
     filled(tmp_path)
     change(tmp_path, "DELETE FROM code WHERE id = 7; DELETE FROM state WHERE name = 'state3'")
     faults = read(tmp_path).faults
-    assert faults == ("2 rows of table code are missing", "1 rows of table state are missing")
+    assert faults == ("2 rows of table code missing", "1 row of table state missing")
 
 
 def test_what_is_left_of_a_damaged_file_is_taken(tmp_path: Path) -> None:

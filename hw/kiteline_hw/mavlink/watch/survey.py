@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from kiteline_core.wording import counted
 from kiteline_hw.mavlink.messages import (
     HIGHRES_IMU,
     Attitude,
@@ -256,14 +257,14 @@ class ControllerSurvey:
         return out
 
     def _sync(self, controller: Heartbeat) -> Finding:
-        asked = f"it asked {self._sync_requests} times itself"
+        asked = f"it asked {counted(self._sync_requests, 'time')} itself"
         if not self._round_trips_ms:
             level = FindingLevel.ERROR if controller.autopilot == wire.PX4 else FindingLevel.WARNING
             remedy = "PX4 needs it to convert stamps: is the wire to it good?" if level is FindingLevel.ERROR else ""
             return Finding("timesync", level, f"no answer; {asked}", "", remedy)
         trips = sorted(self._round_trips_ms)
         middle, high = trips[len(trips) // 2], trips[round(0.95 * (len(trips) - 1))]
-        text = f"{len(trips)} answers, round trip {middle:.1f} ms, 95 % within {high:.1f} ms; {asked}"
+        text = f"{counted(len(trips), 'answer')}, round trip {middle:.1f} ms, 95 % within {high:.1f} ms; {asked}"
         if controller.autopilot == wire.PX4 and self._sync_requests == 0:
             return Finding(
                 "timesync", FindingLevel.ERROR, text, "", "PX4 must ask, to convert stamps: set MAV_x_MODE to onboard"
