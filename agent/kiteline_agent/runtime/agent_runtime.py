@@ -142,7 +142,8 @@ class AgentRuntime:
         except (OSError, SourceError) as error:
             if not options.log_optional:
                 raise
-            self._notices.say("log", f"no log of this flight: {error}")
+            why = f"{error.filename}: {error.strerror}" if isinstance(error, OSError) and error.strerror else error
+            self._notices.say("log", f"no log of this flight: {why}; --log names its folder")
             return None
         self._log, self._budget = log, budget
         log.rig(self._log_shift_ns, source.rig, source.imu)

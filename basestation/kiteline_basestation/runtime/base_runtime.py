@@ -129,7 +129,8 @@ class BaseRuntime:
         except (OSError, SourceError) as error:
             if not options.log_optional:
                 raise
-            self._notices.say("log", f"no log of this start: {error}")
+            why = f"{error.filename}: {error.strerror}" if isinstance(error, OSError) and error.strerror else error
+            self._notices.say("log", f"no log of this start: {why}; --log names its folder")
             return None
         log.text("/log", options.start_ns, "info", f"base, session {options.session}")
         log.flush()  # a base that dies at once leaves a log that can be read

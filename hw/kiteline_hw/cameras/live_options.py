@@ -73,9 +73,9 @@ def read_rig(scheme: str, options: LiveOptions, *, stereo: bool, given: FileCali
     name = options.calibration or next((path for path in CALIBRATIONS if Path(path).is_file()), "")
     if not name:
         raise SourceError(
-            f"{scheme}: the camera's calibration is missing: expected {scheme}:…?calibration=FILE (a camera.yaml with "
-            f"fx, fy, cx, cy, width, height, for a pair baseline_m; or a recording of this camera), or "
-            f"{' or '.join(CALIBRATIONS)}"
+            f"{scheme}: the camera's calibration is missing: expected --calibration FILE, which `kiteline calibrate` "
+            f"makes, or {scheme}:…?calibration=FILE (a camera.yaml with fx, fy, cx, cy, width, height, for a pair "
+            f"baseline_m; or a recording of this camera), or {' or '.join(CALIBRATIONS)}"
         )
     path = home_path(name)
     if path.suffix not in (".yaml", ".yml"):

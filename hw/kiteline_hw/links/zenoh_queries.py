@@ -16,7 +16,7 @@ from typing import Any
 import zenoh
 
 from kiteline_hw.links.zenoh_access import PREFIX, access_of_base
-from kiteline_hw.links.zenoh_session import close_session, direct, open_session, reason_of
+from kiteline_hw.links.zenoh_session import check_endpoint, close_session, direct, open_session, reason_of
 from kiteline_hw.ports import LinkError
 
 _TIMEOUT_S = 10.0  # s in which a request must be answered
@@ -112,6 +112,7 @@ def ask(
 
     logins: user and password, for a base that asks for them.
     """
+    check_endpoint(endpoint)
     begin_s = time.monotonic()
     deadline_s = begin_s + _TIMEOUT_S
     try:

@@ -76,7 +76,9 @@ class McapFile:
         self._spans: list[_Span] = []
         if path.is_dir():
             first = min((file.name for file in path.glob("*.mcap")), key=len, default=None)
-            hint = f"such as {path / first}; later parts of a log are read with its first" if first else "it has none"
+            below = [str(file) for file in sorted(path.glob("*/*.mcap"))[:2]]
+            none = f"it has none; below it are {' and '.join(below)}" if below else "it has none"
+            hint = f"such as {path / first}; later parts of a log are read with its first" if first else none
             raise SourceError(f"{path}: a folder: expected one of its *.mcap files, {hint}")
         try:
             with path.open("rb") as file:

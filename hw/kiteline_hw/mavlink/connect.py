@@ -67,13 +67,15 @@ def connect(
         raise LinkError("--offset: with T_f_c in [agent.controller_imu] the body is the controller's: leave it out")
     default = "frd" if body_is_controller else "flu" if rig.has_body else "rdf"
     velocities = imu = None
+    option = "--axes"
     try:
         T_b_f = mounting(axes or default, _offset(options.offset))
         if options.odometry:
+            option = "--odometry"
             source, track_m = parse_odometry_option(options.odometry)
             velocities = ControllerOdometry(source, T_b_f, ControllerOdometryConfig(track_m=track_m))
     except ValueError as error:
-        raise LinkError(f"--axes or --odometry: {error}") from error
+        raise LinkError(f"{option}: {error}") from error
     if imu_rate_hz > 0.0:
         imu = ControllerImu(np.ascontiguousarray(T_b_f[:3, :3]), imu_rate_hz, report)
     config = SessionConfig(

@@ -24,6 +24,11 @@ class SourceKind:
     shown: str = ""
     given: bool = False
 
+    @property
+    def live(self) -> bool:
+        """True for a camera."""
+        return self.module.startswith("kiteline_hw.cameras")
+
 
 SOURCES: tuple[SourceKind, ...] = (
     SourceKind("euroc", "DIR", "EuRoC or TUM-VI folder (ASL layout), stereo and IMU",
@@ -72,6 +77,12 @@ def source_forms() -> str:
 def source_table() -> str:
     """The forms of SOURCE with their meanings, one a line."""
     return "\n".join(f"  {f'{kind.scheme}:{kind.argument}':21}  {kind.about}" for kind in SOURCES)
+
+
+def is_camera(spec: str) -> bool:
+    """True if `spec` begins with the scheme of a live camera."""
+    scheme, colon, _ = spec.partition(":")
+    return bool(colon) and any(kind.live for kind in SOURCES if kind.scheme == scheme)
 
 
 def is_source(spec: str) -> bool:

@@ -11,8 +11,9 @@ from kiteline_codec.channel import coded_channel
 from kiteline_core.frame import Frame
 from kiteline_core.ids import MAX_BOOTS
 from kiteline_hw.durable_files import next_number
-from kiteline_hw.ports import FrameSource, SourceError, is_live
+from kiteline_hw.ports import FrameSource, SourceError
 from kiteline_hw.sim.links.link_model import link_seed
+from kiteline_hw.sources.kinds import is_camera
 from kiteline_hw.sources.open import open_source
 from kiteline_hw.system.process import told_if_slow
 
@@ -78,10 +79,10 @@ def plan(o: Options, quiet: bool = False) -> FlightPlan:
     mono = o.mono or is_filter(o.config, o.tracker)
     try:
         for text in o.sources:
+            if is_camera(text):
+                raise SourceError(f"{text}: a camera is flown with `kiteline agent`: expected a recording or sim:SCENE")
             with contextlib.nullcontext() if quiet else told_if_slow(f"opening {text}"):
                 made.sources.append(open_source(text, mono=mono, imu=o.imu, calibration=o.calibration))
-            if is_live(made.sources[-1]):
-                raise SourceError(f"{text}: a camera is flown with `kiteline agent`: expected a recording or sim:SCENE")
         starts = flight_starts(made.sources)
     except BaseException:
         made.close()

@@ -49,7 +49,7 @@ def read_grid(path: Path) -> GridFile:
     try:
         lines = path.read_text(encoding="utf-8", errors="surrogateescape").split("\n")
     except OSError as e:
-        raise GridFileError(f"{path}: cannot be read as a grid's YAML file ({e})") from None
+        raise GridFileError(f"{path}: {e.strerror}; expected the YAML file of a grid") from None
     fields = {k.strip(): _value(v) for k, colon, v in (line.partition(":") for line in lines) if colon and "#" not in k}
     missing = [k for k in ("image", "resolution", "origin") if not fields.get(k)]
     if missing:

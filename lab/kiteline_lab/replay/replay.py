@@ -181,6 +181,8 @@ def main(argv: list[str]) -> int:
         is_agent = log.metadata.get("role") == "agent"
         if a.out is not None and not is_agent:
             raise SourceError(f"{a.log}: --out leaves an agent's trajectories, and this is a base's log")
+        if a.out is not None:
+            a.out.mkdir(parents=True, exist_ok=True)  # what cannot be made is told before minutes of replay
         if not is_agent:
             process.print_lines(missing_extras())
         kernel_cache.fill((*AGENT_WARMING, *BASE_WARMING))

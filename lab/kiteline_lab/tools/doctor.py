@@ -156,6 +156,11 @@ def check_zenoh() -> Iterable[DoctorCheck]:
         )
 
 
+_NOT_ASKED = DoctorCheck(
+    Severity.NOTE, "flight controller", "not asked here", "kiteline doctor --mavlink serial:DEVICE:BAUD"
+)
+
+
 def check_serial() -> Iterable[DoctorCheck]:
     """List serial ports, and whether this user may open them."""
     ports = sorted({p for pattern in SERIAL_PORTS for p in glob.glob(pattern)})
@@ -172,9 +177,7 @@ def check_serial() -> Iterable[DoctorCheck]:
         )
     if usable := [p for p in ports if p not in closed]:
         yield DoctorCheck(Severity.OK, "serial", ", ".join(usable))
-    yield DoctorCheck(
-        Severity.NOTE, "flight controller", "not asked here", "kiteline doctor --mavlink serial:DEVICE:BAUD"
-    )
+    yield _NOT_ASKED
 
 
 def check_cgroup() -> Iterable[DoctorCheck]:
@@ -282,7 +285,7 @@ def main(argv: list[str]) -> int:
     p.add_argument("--json", action="store_true", help="print the results as JSON")
     a = p.parse_args(argv)
     warmed = warm() if a.warm else []  # first, so that the checks find the kernels compiled
-    results = run_checks()
+    results = [found for found in run_checks() if not (a.mavlink and found == _NOT_ASKED)]
     if a.mavlink:
         process.print_lines(["asking the flight controller, for some ten seconds"])
         results += check_controller(a.mavlink, a.mavlink_key)

@@ -37,7 +37,7 @@ def parser() -> argparse.ArgumentParser:
     one = {
         "get": "one map; with --json the poses of its keyframes too",
         "split": "take a submap out of the map into which it was merged, until `merge` asks for it",
-        "delete": "delete a map",
+        "delete": "delete a map, for good: `backup` keeps a copy of a store before",
     }
     for verb, what in one.items():
         verbs.add_parser(verb, help=what, parents=[anywhere]).add_argument("map", metavar="MAP")
@@ -87,6 +87,8 @@ def table(answer: Mapping[str, Any]) -> str:
         return f"{searched}; `kiteline maps list` shows one map once a place is found"
     if "deleted" in answer:
         return f"deleted: {' '.join(answer['deleted'])}"
+    if not answer.get("maps", [answer]):
+        return "no map yet"
     rows = [("map", "name", "agents", "keyframes", "points", "placed", "unit", "submaps")]
     for m in answer.get("maps", [answer]):
         agents, submaps = ",".join(map(str, m["agents"])), " ".join(map(_submap, m["submaps"]))

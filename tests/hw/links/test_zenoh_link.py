@@ -112,6 +112,11 @@ def test_through_a_router(monkeypatch: pytest.MonkeyPatch) -> None:
         wait_for(lambda: link.receive() == [b"down"])
 
 
+def test_a_question_to_an_endpoint_without_protocol_says_what_to_write() -> None:
+    with pytest.raises(LinkError, match=r"write tcp/10\.0\.0\.1:7447$"):
+        ask("10.0.0.1:7447", "maps", "list", "{}")
+
+
 @pytest.mark.parametrize("logins", [None, {"maps": "secret"}])
 def test_a_question_waits_as_long_for_a_base_as_it_says(
     monkeypatch: pytest.MonkeyPatch, logins: dict[str, str] | None

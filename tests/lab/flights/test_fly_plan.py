@@ -151,3 +151,8 @@ def test_a_cut_log_that_cannot_be_mended_stays(tmp_path: Path, monkeypatch: pyte
 
 def full_disk(*_: object) -> None:
     raise OSError(errno.ENOSPC, "No space left on device")
+
+
+def test_a_camera_is_flown_by_the_agent_which_is_told_before_its_calibration_is_missed(tmp_path: Path) -> None:
+    with pytest.raises(SourceError, match="a camera is flown with `kiteline agent`"):
+        fly(Options(("v4l2:/dev/video0",), tmp_path), quiet=True)

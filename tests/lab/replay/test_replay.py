@@ -288,3 +288,14 @@ def test_a_log_that_is_not_there_is_told_before_kernels_are_compiled_and_another
     assert filled == []
     assert main([str(flown / "agent0" / "log.mcap"), "--verify"]) == 0
     assert "kiteline_basestation.runtime.warm" in filled[0] and filled[1] == ("warm",)
+
+
+def test_a_folder_that_cannot_be_made_is_told_before_the_replay_and_a_flight_is_no_log(
+    flown: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("kiteline_lab.replay.replay.replay_agent", lambda *_, **__: pytest.fail("replayed"))
+    (tmp_path / "file").touch()
+    with pytest.raises(OSError, match="file"):
+        main([str(flown / "agent0" / "log.mcap"), "--out", str(tmp_path / "file" / "again")])
+    with pytest.raises(SourceError, match=r"it has none; below it are .*agent0/log\.mcap and .*base/log\.mcap"):
+        main([str(flown)])

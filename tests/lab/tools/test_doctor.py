@@ -166,16 +166,19 @@ def ask(model: ModelledAutopilot, *options: str) -> int:
 
 
 def test_the_flight_controller_is_checked_and_printed_as_json(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(doctor, "CHECKS", ())
+    (tmp_path / "ttyUSB0").touch()
+    monkeypatch.setattr(doctor, "SERIAL_PORTS", (str(tmp_path / "ttyUSB*"),))
+    monkeypatch.setattr(doctor, "CHECKS", (doctor.check_serial,))
     assert ask(ModelledAutopilot("ardupilot", parameters={"VISO_TYPE": 0}), "--json") == 1
     told = json.loads(capsys.readouterr().out)
     assert told["failed"] is True
     by_name = {check["name"]: check for check in told["checks"]}
     assert by_name["VISO_TYPE"]["severity"] == "fail" and by_name["VISO_TYPE"]["remedy"] == "set VISO_TYPE to 3"
     assert "ArduPilot 4.6.3" in by_name["heartbeat"]["text"]
-    assert {"streams", "timesync", "forwarding", "radio"} <= set(by_name)
+    assert {"serial", "streams", "timesync", "forwarding", "radio"} <= set(by_name)
+    assert "flight controller" not in by_name  # "not asked here"
 
 
 def test_a_controller_that_signs_needs_the_key(

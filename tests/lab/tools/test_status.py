@@ -128,6 +128,7 @@ def test_maps_are_listed_in_columns() -> None:
 
 
 def test_replies_about_maps_are_sentences() -> None:
+    assert maps.table({"maps": []}) == "no map yet"
     assert maps.table({"deleted": ["0.1.0", "0.2.1"]}) == "deleted: 0.1.0 0.2.1"
     assert maps.table({"merged": False, "looking": 60}).startswith("60 keyframes are searched for in the other map")
     with pytest.raises(KeyError):

@@ -17,6 +17,7 @@ _TICKS = 100_000  # stamps count 10 us
 _AHEAD = 60 * _TICKS  # by which the stored stamp is ahead of those in use
 _AGAIN = 5 * _TICKS  # from one attempt to store it to the next
 _RADIO_STATUS = 109  # telemetry radios cannot sign
+_EXPECTED = "expected a file with 64 hexadecimal digits, or the pass phrase set in the ground station"
 
 
 def read_key(path: Path) -> bytes:
@@ -24,9 +25,10 @@ def read_key(path: Path) -> bytes:
     try:
         text = path.read_text(encoding="utf-8").strip()
     except (OSError, UnicodeDecodeError) as error:
-        raise LinkError(f"{path}: cannot read the key of MAVLink's signatures ({error})") from error
+        why = error.strerror if isinstance(error, OSError) else "no text"
+        raise LinkError(f"{path}: cannot read the key of MAVLink's signatures ({why}); {_EXPECTED}") from error
     if not text:
-        raise LinkError(f"{path}: no key: expected 64 hexadecimal digits, or the pass phrase set in the ground station")
+        raise LinkError(f"{path}: no key; {_EXPECTED}")
     with contextlib.suppress(ValueError):
         if len(text) == 64:
             return bytes.fromhex(text)
