@@ -8,6 +8,7 @@ from pathlib import Path
 from kiteline_agent.runtime.options import AgentOptions, agent_config, is_filter
 from kiteline_basestation.runtime.options import BaseOptions, base_config
 from kiteline_codec.channel import coded_channel
+from kiteline_core.config import ConfigError
 from kiteline_core.frame import Frame
 from kiteline_core.ids import MAX_BOOTS
 from kiteline_hw.durable_files import next_number
@@ -117,6 +118,8 @@ def plan(o: Options, quiet: bool = False) -> FlightPlan:
 def _check(o: Options) -> None:
     """Raise ConfigError or BudgetError for options with which an agent or the base would not begin."""
     agent_config(o.config, o.cpu_percent, o.rig, o.grid, o.tracker)
+    if o.grid == "base" and is_filter(o.config, o.tracker):
+        raise ConfigError("--tracker ekf uses no --grid base: leave it out, or fly --tracker map")
     if o.mode != "tracker":
         base_config(o.config)
     for budget_bytes in (o.up_bytes_s, o.down_bytes_s):

@@ -153,6 +153,11 @@ def full_disk(*_: object) -> None:
     raise OSError(errno.ENOSPC, "No space left on device")
 
 
+def test_the_filter_makes_no_images_for_a_grid(recording: Path, tmp_path: Path) -> None:
+    with pytest.raises(KitelineError, match="--tracker ekf uses no --grid base"):
+        fly(Options((str(recording),), tmp_path, grid="base", tracker="ekf"), quiet=True)
+
+
 def test_a_camera_is_flown_by_the_agent_which_is_told_before_its_calibration_is_missed(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match="a camera is flown with `kiteline agent`"):
         fly(Options(("v4l2:/dev/video0",), tmp_path), quiet=True)
