@@ -118,6 +118,11 @@ class KnownCameras:
 
 def opened(path: Path) -> KnownCameras:
     """What the store of a base (a folder) or a rig file knows. Raises KitelineError."""
+    if not path.exists():
+        raise RigError(
+            f"{path}: no such file or folder; expected a rig file, which `kiteline agent --rig FILE` writes, or the "
+            "folder given to `kiteline base --store`"
+        )
     return KnownCameras.of_file(rig_file.load(str(path))) if path.is_file() else KnownCameras.of_base(load(path))
 
 

@@ -189,3 +189,8 @@ def test_a_store_s_rig_file_says_how_well_an_offset_is_known() -> None:
             mapper.map.disparity_calibrated.add(AgentId(0))
         text = exported(KnownCameras.of_base(mapper), None, "kiteline")["rig.toml"]
         assert f"disparity_sigma_px = {sigma_px}\n" in text
+
+
+def test_a_rig_that_is_not_there_is_told_with_both_of_its_forms(tmp_path: Path) -> None:
+    with pytest.raises(RigError, match=r"rig\.toml: no such file or folder; expected a rig file.*base --store"):
+        main(["show", str(tmp_path / "rig.toml")])
