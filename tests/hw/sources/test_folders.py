@@ -365,26 +365,6 @@ def test_images_by_pattern(tmp_path: Path) -> None:
         open_source(f"images:{tmp_path}/none/*.png")
 
 
-@pytest.mark.parametrize(
-    ("names", "t_ns"),
-    [
-        (["1687709760547307", "1687709760580640"], [1687709760547307000, 1687709760580640000]),  # us since 1970
-        (["1575968123456", "1575968123656"], [1575968123456000000, 1575968123656000000]),  # ms since 1970
-        (["1403636579763555584", "1403636579813555456"], [1403636579763555584, 1403636579813555456]),  # ns
-        (["1403636579.763555", "1403636579.813555"], [1403636579763555000, 1403636579813555000]),  # s
-        (["1500000000000000", "1500000050000000"], [1500000000000000, 1500000050000000]),  # ns, 17 days after a start
-        (["00000000000050000000", "00000000000100000000"], [50_000_000, 100_000_000]),  # ns since a start
-        (["1400000000000", "1400050000000"], [0, 100_000_000]),  # 13 digits, in ms too far apart: numbers
-        (["20230625", "20230626"], [0, 100_000_000]),
-    ],
-)
-def test_stamps_in_names_tell_their_unit(names: list[str], t_ns: list[int], tmp_path: Path) -> None:
-    for i, name in enumerate(names):
-        put(tmp_path / f"{name}.png", picture(i))
-    (tmp_path / "camera.yaml").write_text("fx: 60\nfy: 60\ncx: 32\ncy: 24\nwidth: 64\nheight: 48\n")
-    assert [f.t_ns for f in read(open_source(f"images:{tmp_path}/*.png"))[0]] == t_ns
-
-
 # --- recognising
 
 

@@ -1,4 +1,4 @@
-"""Images whose names are no stamps: at which rate they are flown, and that the user is told."""
+"""Times of images: stamps in their names, else the rate at which they are flown, of which the user is told."""
 
 from pathlib import Path
 
@@ -54,3 +54,23 @@ def test_a_rate_that_is_none_is_refused(folder: Path, rate: str) -> None:
     (folder / "camera.yaml").write_text(CAMERA + f"rate_hz: {rate or '[2]'}\n")
     with pytest.raises(SourceError, match=r"camera\.yaml: rate_hz is .*: expected images a second"):
         open_source(f"images:{folder}/a1/*.png")
+
+
+@pytest.mark.parametrize(
+    ("names", "t_ns"),
+    [
+        (["1687709760547307", "1687709760580640"], [1687709760547307000, 1687709760580640000]),  # us since 1970
+        (["1575968123456", "1575968123656"], [1575968123456000000, 1575968123656000000]),  # ms since 1970
+        (["1403636579763555584", "1403636579813555456"], [1403636579763555584, 1403636579813555456]),  # ns
+        (["1403636579.763555", "1403636579.813555"], [1403636579763555000, 1403636579813555000]),  # s
+        (["1500000000000000", "1500000050000000"], [1500000000000000, 1500000050000000]),  # ns, 17 days after a start
+        (["00000000000050000000", "00000000000100000000"], [50_000_000, 100_000_000]),  # ns since a start
+        (["1400000000000", "1400050000000"], [0, 100_000_000]),  # 13 digits, in ms too far apart: numbers
+        (["20230625", "20230626"], [0, 100_000_000]),
+    ],
+)
+def test_stamps_in_names_tell_their_unit(names: list[str], t_ns: list[int], tmp_path: Path) -> None:
+    for i, name in enumerate(names):
+        put(tmp_path / f"{name}.png", picture(i))
+    (tmp_path / "camera.yaml").write_text(CAMERA)
+    assert stamps(open_source(f"images:{tmp_path}/*.png")) == t_ns
