@@ -5,8 +5,6 @@ gives the odometer's scale (tyre wear), its actual noise, and whether it may be 
 stamps or swapped axes raise that noise; above a tolerance the odometer is not used until it agrees again.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from kiteline_agent.config import OdometerConfig
@@ -16,6 +14,7 @@ from kiteline_agent.motion.extrapolation import Extrapolation, MotionSource, alo
 from kiteline_agent.motion.odometer_samples import MeanVelocity, OdometerSamples, measured_part
 from kiteline_agent.motion.odometer_scale import LEAST_MOVED_M, OdometerScale
 from kiteline_agent.motion.unit_scale import WINDOW_S, UnitScale
+from kiteline_agent.motion.velocity_update import KalmanUpdate, blend
 from kiteline_core.arrays import F64
 from kiteline_core.frame import OdometryBatch
 from kiteline_core.geometry import se3
@@ -88,7 +87,14 @@ class Odometer:
     @property
     def deviation(self) -> float:
         """Relative deviation of lengths in a monocular map, once the odometer has told its unit."""
-        return float(np.hypot(self.unit_sigma, _DOUBTED if self._doubted else self.scale - 1.0))
+        lengths = max(_DOUBTED, self._scale.apart) if self._doubted else self._scale.deviation
+        return float(np.hypot(self.unit_sigma, lengths))
+
+    @property
+    def map_scale(self) -> tuple[float, float] | None:
+        """Metres per unit of a monocular map in metres, and the deviation; None while the odometer tells none."""
+        speaks = self._last is not None and self.has_recent(self._last[0])
+        return self._scale.of_map if speaks and self._trusted and self.metric else None
 
     @property
     def trusted(self) -> bool:
@@ -208,16 +214,16 @@ class Odometer:
         self._rate, self._rate_cov, self._rate_slow = update.value, update.cov, update.slow
         return True
 
-    def _updated_velocity(self, mean: MeanVelocity, prior: F64, expected: F64 | None = None) -> "_KalmanUpdate":
+    def _updated_velocity(self, mean: MeanVelocity, prior: F64, expected: F64 | None = None) -> KalmanUpdate:
         """The velocity (3,) in b by a sample. prior: (3,3) its covariance before. expected: (3,); None: as it was."""
         c, z = self._config, self.scale * mean.velocity
         slow = (self._noise + c.floor_m_s**2) * np.eye(3) + self._scale.var * np.outer(z, z)
-        return _blend(self._velocity if expected is None else expected, prior, z, mean.velocity_cov, slow, _SURPRISE)
+        return blend(self._velocity if expected is None else expected, prior, z, mean.velocity_cov, slow, _SURPRISE)
 
-    def _updated_rate(self, mean: MeanVelocity, prior: F64) -> "_KalmanUpdate":
+    def _updated_rate(self, mean: MeanVelocity, prior: F64) -> KalmanUpdate:
         """The same of the rate (3,), never rejected: a gust turns the vehicle at once."""
         slow = (self._rate_noise + self._config.floor_rad_s**2) * np.eye(3)
-        return _blend(self._rate, prior, mean.rate, mean.rate_cov, slow, np.inf)
+        return blend(self._rate, prior, mean.rate, mean.rate_cov, slow, np.inf)
 
     def update(self, T_m_c: F64, t_ns: int) -> None:
         """Process a frame that images (and an IMU) placed at T_m_c (4,4)."""
@@ -260,6 +266,10 @@ class Odometer:
         cov[:3, :3] += arm @ r @ self._rotation_cov @ r.T @ arm.T / 3.0  # heading error along the path
         cov[3:, 3:] = self._rotation_cov
         return 0.5 * (cov + cov.T)
+
+    def mean_between(self, from_ns: int, to_ns: int) -> MeanVelocity | None:
+        """Means of the samples between two stamps, as they were measured; None with a gap."""
+        return self._samples.between(from_ns, to_ns)
 
     def velocity(self, t_ns: int) -> BodyVelocity | None:
         """Velocity for the inertial smoother at the frame t_ns; None if the odometer is not trusted."""
@@ -379,28 +389,3 @@ class Odometer:
         usual = max(1.0 - float(np.exp(-dt / _MEMORY_S)), 1.0 / (self._compared + 1.0))
         share = max(usual, _RISE) if square > _UNUSUAL * before else usual
         return before + share * (square - before)
-
-
-@dataclass(slots=True)
-class _KalmanUpdate:
-    """Result of `_blend`: a vector (3,), its covariance and the correlated part of it (3,3), and the gain (3,3)."""
-
-    value: F64
-    cov: F64
-    slow: F64
-    gain: F64
-    accepted: bool
-
-
-def _blend(value: F64, cov: F64, measured: F64, fast: F64, slow: F64, gate: float) -> _KalmanUpdate:
-    """Kalman update of a vector (3,) with a direct measurement, rejected beyond `gate` standard deviations.
-
-    fast, slow: (3,3) covariance of its white and of its correlated noise.
-    """
-    off = measured - value
-    if float(off @ np.linalg.solve(cov + fast + slow, off)) > gate * gate:
-        return _KalmanUpdate(value, cov, cov, np.zeros((3, 3)), False)
-    gain = cov @ np.linalg.inv(cov + fast + slow)
-    left = np.eye(3) - gain
-    lasting = left @ cov @ left.T + gain @ slow @ gain.T
-    return _KalmanUpdate(value + gain @ off, lasting + gain @ fast @ gain.T, lasting, gain, True)

@@ -16,7 +16,9 @@ _LEAST_M_S = 0.015  # m/s; least noise of one, where windows show less than expe
 _WALK = 0.003  # relative change per sqrt(s): load and temperature
 _YOUNG_WALK, _YOUNG_S = 0.05, 4.0  # relative per sqrt(s), and s in which it calms down, of one camera's map
 _CLEAR_S, _CLEAR, _CLEAR_DEVIATIONS = 1.5, 0.06, 4.0  # s, relative: by more than that a map is corrected sooner
-_LASTING = 30  # windows, 6 s of motion, that must agree on another length than a map in metres has
+_LASTING = 30  # windows, 6 s of motion, most of which must agree on another length than a map in metres has
+_YOUNG_LASTING = 15  # the same of a young map of one camera: rather that one is wrong than the odometer
+_NOW = 5  # windows, the last second, that tell by how much lengths are off now
 _WRONG = 0.1  # relative; by which a map of one camera is wrong, and no longer drifts
 _WRONG_SIGMA = 0.04  # relative deviation of that
 _GATE = 3.0  # deviations beyond which a window is left out: slip
@@ -85,16 +87,37 @@ class OdometerScale:
             return None
         if not believed:
             return self._lasting_correction()
-        scale, sigma = 1.0 / self.value, float(np.sqrt(self.var)) / self.value**2
+        scale, sigma = self._metres_per_unit
         clear = self._age_s >= _CLEAR_S and abs(np.log(scale)) > max(_CLEAR_DEVIATIONS * sigma / scale, _CLEAR)
         return (scale, sigma) if clear else correction_due(scale, sigma, self._age_s)
+
+    @property
+    def of_map(self) -> tuple[float, float] | None:
+        """Metres per unit of a map of one camera, and the deviation; None of a map whose lengths images measure."""
+        return self._metres_per_unit if self._of_map else None
+
+    @property
+    def _metres_per_unit(self) -> tuple[float, float]:
+        return 1.0 / self.value, float(np.sqrt(self.var)) / self.value**2
+
+    @property
+    def deviation(self) -> float:
+        """Relative deviation of lengths in a map of one camera: how well they are known, and how far off they seem."""
+        return float(np.hypot(np.sqrt(self.var), self.value - 1.0))
+
+    @property
+    def apart(self) -> float:
+        """Share by which the newest windows see lengths too long or too short; 0 if they do not agree on one."""
+        found = self._lasting.metres_per_unit(_NOW)
+        return 0.0 if found is None else abs(1.0 / found[0] - 1.0)
 
     def _lasting_correction(self) -> tuple[float, float] | None:
         """The same where images and odometer agree on directions and, for seconds, on another length: the map is wrong.
 
         A map of two views may collapse while its first landmarks are measured.
         """
-        found = self._lasting.metres_per_unit() if self._lasting.full else None
+        young = self._grown_s < 2.0 * _YOUNG_S
+        found = self._lasting.metres_per_unit(_YOUNG_LASTING if young else _LASTING)
         if found is None or abs(np.log(found[0])) < _WRONG or found[1] > _WRONG_SIGMA * found[0]:
             return None
-        return found
+        return self._lasting.metres_per_unit(_NOW) or found  # it may not have come to rest yet

@@ -35,15 +35,14 @@ class UnitScale:
         self._windows.append((along, b * b, along > self._aligned * a * b))
         del self._windows[: -self._most]
 
-    @property
-    def full(self) -> bool:
-        """True if there are as many windows as are kept."""
-        return len(self._windows) == self._most
+    def metres_per_unit(self, newest: int | None = None) -> tuple[float, float] | None:
+        """Metres per unit of the map and its standard deviation; None while unknown.
 
-    def metres_per_unit(self) -> tuple[float, float] | None:
-        """Metres per unit of the map and its standard deviation; None while unknown."""
-        agreed = np.array([window[:2] for window in self._windows if window[2]])
-        if len(agreed) < max(_LEAST_WINDOWS, _LEAST_SHARE * len(self._windows)):
+        newest: of so many windows alone; None: of all that are kept.
+        """
+        windows = self._windows if newest is None else self._windows[-newest:]
+        agreed = np.array([window[:2] for window in windows if window[2]])
+        if len(windows) < (newest or 0) or len(agreed) < max(_LEAST_WINDOWS, _LEAST_SHARE * len(windows)):
             return None
         along, square = agreed.T
         each = along / square

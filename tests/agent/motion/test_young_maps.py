@@ -53,10 +53,10 @@ def compared(odometer: Odometer, seconds: float, length: float) -> None:
 def test_a_map_that_collapsed_is_scaled_although_the_odometer_is_no_longer_believed() -> None:
     odometer = Odometer(np.eye(4), OdometerConfig(), metric=False)
     odometer.set_metric(metric=True)
-    compared(odometer, 1.0, 1.0)
+    compared(odometer, 10.0, 1.0)
     assert odometer.trusted and odometer.deviation < 0.05
-    compared(odometer, 4.0, 2.1)
-    assert not odometer.trusted and odometer.deviation > 0.2  # poses say so
+    compared(odometer, 2.4, 2.1)
+    assert not odometer.trusted and odometer.deviation > 0.8  # poses say so
     assert odometer.scale_correction() is None  # wheels that slip do so for some seconds
     compared(odometer, 4.0, 2.1)
     found = odometer.scale_correction()
@@ -65,6 +65,26 @@ def test_a_map_that_collapsed_is_scaled_although_the_odometer_is_no_longer_belie
     assert odometer.scale == 1.0 and odometer.scale_correction() is None
     compared(odometer, 6.0, 1.0)
     assert odometer.trusted and odometer.deviation < 0.05
+
+
+def test_a_map_that_collapses_while_it_is_young_is_scaled_sooner_by_what_it_is_now() -> None:
+    odometer = Odometer(np.eye(4), OdometerConfig(), metric=False)
+    odometer.set_metric(metric=True)
+    compared(odometer, 1.0, 1.0)
+    compared(odometer, 1.4, 1.8)
+    assert odometer.scale_correction() is None
+    compared(odometer, 1.2, 2.0)
+    found = odometer.scale_correction()
+    assert found is not None and found[0] == pytest.approx(0.5, rel=0.01)
+
+
+def test_poses_say_how_well_lengths_are_known() -> None:
+    """The unit was told to two per cent, by windows that lie back, and a young map changes it by five in a second."""
+    odometer = Odometer(np.eye(4), OdometerConfig(), metric=False)
+    odometer.set_metric(metric=True)
+    assert odometer.deviation > 0.05
+    compared(odometer, 30.0, 1.0)
+    assert odometer.deviation < 0.015
 
 
 def test_windows_count_as_what_they_are() -> None:
