@@ -104,7 +104,9 @@ class Agent:
         self._two_view_start = None if self._has_depth else TwoViewStart(camera, config, self.work)
         self._inertial_start = inertial_start = (
             None if self._has_depth or imu is None
-            else InertialStart(camera, imu, config, self.work, self._governor.may_solve)
+            else InertialStart(
+                camera, imu, config, self.work, self._governor.may_solve, self._camera.motion.odometer.mean_between,
+            )
         )  # fmt: skip
         self._submaps = SubmapStage(
             self._camera, self.map, tracker, maker, self._keyframes, self._relocaliser, self._depth,
@@ -319,7 +321,8 @@ class Agent:
         """
         t_ns, start = frame.t_ns, self._inertial_start
         camera, motion = self._camera, self._camera.motion
-        starting = not camera.submaps.any and motion.tracker is not None and not motion.odometer.has_recent(t_ns)
+        windows = motion.tracker is not None and self._submaps.start_choice.awaits_window(t_ns)
+        starting = windows and not camera.submaps.any
         if start is not None and self._governor.on and (starting or len(start.waiting)):
             start.waiting.add(frame, joined(self._skipped_imu))
             self._skipped_imu = []

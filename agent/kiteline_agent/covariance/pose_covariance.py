@@ -222,8 +222,15 @@ class PoseCovariance:
 
     def dead_reckoning_within(self, m: float, rad: float) -> bool:
         """True if dead reckoning has a standard deviation up to m in any direction and rad about any axis."""
-        largest = (float(np.linalg.eigvalsh(block)[-1]) for block in (self._reckoned[:3, :3], self._reckoned[3:, 3:]))
-        return all(value <= limit**2 for value, limit in zip(largest, (m, rad), strict=True))
+        sigma_m, sigma_rad = self.dead_reckoning_sigma
+        return sigma_m <= m and sigma_rad <= rad
+
+    @property
+    def dead_reckoning_sigma(self) -> tuple[float, float]:
+        """Largest standard deviations of dead reckoning since images were lost: m in a direction, rad about an axis."""
+        blocks = self._reckoned[:3, :3], self._reckoned[3:, 3:]
+        of_m, of_rad = (float(np.sqrt(max(np.linalg.eigvalsh(block)[-1], 0.0))) for block in blocks)
+        return of_m, of_rad
 
     def extend_map(self, T_m_b: F64) -> None:
         """Continue the map with a keyframe at T_m_b (4,4), a pose by dead reckoning."""

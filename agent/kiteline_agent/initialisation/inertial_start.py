@@ -18,6 +18,7 @@ from kiteline_agent.initialisation.corner_tracks import CornerObservations, Corn
 from kiteline_agent.initialisation.inertial_map import InertialMap
 from kiteline_agent.initialisation.landmark_realignment import realigned
 from kiteline_agent.initialisation.metric_restart import window_points
+from kiteline_agent.initialisation.window.known_length import KnownLength, joint_sigma
 from kiteline_agent.initialisation.window.window_bundle import InertialBundle, lens_prior
 from kiteline_agent.initialisation.window.window_noise import LEAST, MOST, Vibration, WindowNoise, vibration
 from kiteline_agent.initialisation.window.window_samples import WindowSamples
@@ -28,6 +29,7 @@ from kiteline_agent.initialisation.window.window_state import (
     WindowSolution,
     lengths_apart,
 )
+from kiteline_agent.initialisation.window_odometry import Mean, WindowOdometry
 from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_agent.tracking.waiting_frames import WaitingFrames
 from kiteline_core.arrays import F64, I64
@@ -41,7 +43,6 @@ _MIN_VIEWS = 3  # keyframes in which a landmark is aligned again, to be kept
 _STILL_FLOW = 0.25  # share of `min_flow` below which the vehicle stands
 _LOWER_COST = 1.0  # by which a solution from nothing must be better: a deviation of the scale is worth 0.5
 _SAME_SCALE = 0.5  # deviations of the scale: solutions that differ by less left out other corners
-_MIN_COMMON = 3  # keyframes of two windows whose distances are compared
 _BEHIND_SHARE = 0.25  # of the time by which tracking is behind: then fewer windows are solved
 _MIN_SPAN_S = 2.4  # s before which a window tells no scale
 _MAX_SPAN_S = 24.0  # s; longest window: older keyframes are dropped
@@ -85,9 +86,12 @@ class InertialStart:
 
     def __init__(
         self, camera: RectifiedCamera, calibration: ImuCalibration, config: AgentConfig, work: Work,
-        may_go_on: Callable[[], bool] = lambda: True,
+        may_go_on: Callable[[], bool] = lambda: True, odometry: Mean = lambda from_ns, to_ns: None,
     ) -> None:  # fmt: skip
-        """may_go_on: asked before each part of a solution; False: there is no CPU time left for it in this step."""
+        """may_go_on: asked before each part of a solution; False: no CPU time is left for it in this step.
+
+        odometry: means of an odometer's velocities between two stamps.
+        """
         self._camera = camera
         self._calibration = calibration
         self._config = config
@@ -98,6 +102,7 @@ class InertialStart:
         start = config.inertial_start
         detector = replace(config.detector, cell_px=start.corner_tracks.cell_px, max_corners=corner_tracks.CORNERS)
         self._tracks = CornerTracks(camera, detector, start.corner_tracks)
+        self._odometry = WindowOdometry(odometry)
         self.waiting = WaitingFrames(corner_tracks.KEYFRAME_S)
         self._buffer = SampleBuffer(_MAX_SPAN_S + 1.0, _MAX_GAP_S)
         self._before: SolvedWindow | None = None
@@ -119,9 +124,15 @@ class InertialStart:
             self._last_samples_ns = ctx.t_ns
         return (ctx.t_ns - self._last_samples_ns) * 1e-9 <= SILENT_S
 
+    @property
+    def has_samples(self) -> bool:
+        """True once a sample of the IMU has come."""
+        return self._buffer.newest_t_ns is not None
+
     def clear(self) -> None:
         """A map is tracked: begin anew after it."""
         self._tracks.clear()
+        self._odometry.clear()
         self._attempt = self._before = self._tried_ns = self._noise = self._vibration = None
         self._by_stamps = False
         self._contradiction.begin_again()
@@ -138,7 +149,7 @@ class InertialStart:
 
     def take_warnings(self) -> list[str]:
         """Events since the last call: what the user should check."""
-        warnings, self._warnings = self._warnings, []
+        warnings, self._warnings = self._warnings + self._odometry.take_events(), []
         return warnings
 
     @property
@@ -176,6 +187,7 @@ class InertialStart:
             self._work.followed += 1
             turn = None if every else self._turn(ctx.t_ns, imu)
             if self._tracks.add(ctx.t_ns, ctx.images.left, turn):
+                self._odometry.add(ctx.t_ns)
                 self._bound_window(ctx.t_ns)
                 if self._attempt is None:
                     self._attempt = self._begin(ctx, imu)
@@ -259,14 +271,15 @@ class InertialStart:
             return None
         solution, modelled = found.solution, self._noise
         noise, sigma = self._seen_noise(solution)
-        if sigma < _NEARLY * _SCALE_SIGMA:
+        length = self._odometry.length(stamps, solution.state, sigma)
+        if joint_sigma(sigma, length) < _NEARLY * _SCALE_SIGMA:
             self._work.alignments += int(np.count_nonzero(observations.seen))
             aligned = realigned(keyframes, observations, solution.state, found.xyz, found.first, self._camera)
             all_corners = corner_tracks.with_found(all_corners, columns, aligned)
             yield
             keep = aligned.seen.sum(axis=0) >= _MIN_VIEWS
             self._noise = noise
-            again = self._bundle(aligned.part(keep), imu)
+            again = self._bundle(aligned.part(keep), imu, length)
             warmer = WarmStart(solution.state, found.xyz[keep])
             solution = (yield from self._counted(again.solving(warmer), len(keyframes))) or solution
             noise, sigma = self._seen_noise(solution)
@@ -276,7 +289,7 @@ class InertialStart:
         if not fits:
             self._doubt(imu.clock)
         known = fits and sigma < _SCALE_SIGMA and not wrong
-        agrees = before is not None and self._agrees(before, self._before)
+        agrees = before is not None and before.lengths_apart(self._before) < _AGREEMENT  # later frames confirm it
         self._noise = modelled
         if known and agrees and warm is not None:
             if not (yield from self._is_lowest(found, observations, imu)):
@@ -377,19 +390,11 @@ class InertialStart:
     def _note_contradiction(self, t_ns: int, *, contradicts: bool | None, by_imu: bool = True) -> None:
         self._warnings += self._contradiction.note(t_ns, contradicts=contradicts, by_imu=by_imu)
 
-    def _agrees(self, before: SolvedWindow, now: SolvedWindow) -> bool:
-        """True if later frames confirm the scale: the keyframes of both solutions are as far apart in both."""
-        common = [t for t in now.t_ns if t in set(before.t_ns)]
-        if len(common) < _MIN_COMMON:
-            return False
-        a, b = (w.solution.state.p[[w.t_ns.index(t) for t in common]] for w in (before, now))
-        return lengths_apart(a, b) < _AGREEMENT
-
-    def _bundle(self, corners: CornerObservations, imu: _Imu) -> InertialBundle:
+    def _bundle(self, corners: CornerObservations, imu: _Imu, length: KnownLength | None = None) -> InertialBundle:
         return InertialBundle(
             corners, imu.samples.at, self._calibration, self._camera.T_b_c, self._camera.fx,
             self._config.inertial.gravity_m_s2, imu.prior, self._config.inertial_start.bundle,
-            self._noise, self._lens_info, imu.offset,
+            self._noise, self._lens_info, imu.offset, length,
         )  # fmt: skip
 
     def _default_prior(self) -> BiasPrior:

@@ -21,9 +21,10 @@ from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.mapping.camera_state import CameraState
 from kiteline_agent.mapping.earlier_views import earlier_views
 from kiteline_agent.mapping.keyframe_stage import KeyframeStage
+from kiteline_agent.mapping.loss_tie import LossTie
+from kiteline_agent.mapping.start_choice import StartChoice
 from kiteline_agent.mapping.start_watch import VIEWS_S, StartWatch
 from kiteline_agent.mapping.submaps import TRACKED_M, TRACKED_RAD
-from kiteline_agent.motion.loss_motion import LossMotion
 from kiteline_agent.motion.odometer_scale import LEAST_MOVED_M
 from kiteline_agent.relocalisation.relocaliser import Relocaliser
 from kiteline_agent.tracking.frame_context import FrameContext
@@ -34,9 +35,10 @@ from kiteline_codec.schema import SubmapScale, SubmapTie
 from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import Rectifier
-from kiteline_core.ids import NO_KEYFRAME, KeyframeId, SubmapId
+from kiteline_core.ids import NO_KEYFRAME
 
 _IGNORED = "imu: not used from here on: the images alone are flown, in a unit of length of their own, as with --no-imu"
+_NO_METRES = "mono: lengths are not metres any more: nothing measured the motion while images were lost"
 _FAILURES = 2  # failed searches in frames with texture before a new submap is opened
 _SCALE_SIGMA = 0.02  # relative deviation below which the metric scale of two views is used
 
@@ -47,20 +49,6 @@ class OpenedSubmap:
 
     placed: bool
     events: list[str]
-
-
-@dataclass(frozen=True, slots=True)
-class _Loss:
-    """The loss of images before the newest submap.
-
-    since: the last keyframe before it. T_k_c: (4,4) camera in that keyframe when images were lost, by dead reckoning to
-    the submap's first frame. R_m_c: (3,3) camera in the submap at that frame.
-    """
-
-    since: KeyframeId
-    T_k_c: F64
-    submap: SubmapId
-    R_m_c: F64
 
 
 class SubmapStage:
@@ -83,10 +71,11 @@ class SubmapStage:
         self._depth = depth
         self._two_view_start = two_view_start
         self._inertial_start = inertial_start
+        self.start_choice = StartChoice(camera, inertial_start)
         self._governor = governor
         self._channel = channel
         self._path = UnscaledPath(local_map)
-        self._loss: _Loss | None = None
+        self._loss_tie = LossTie(camera, channel)
         self._warnings: list[str] = []
         self._start_watch, self._views_watch = StartWatch(), StartWatch(VIEWS_S)
 
@@ -102,8 +91,9 @@ class SubmapStage:
         """Begin a submap with this frame; None if it shows too little."""
         inertial, motion = self._inertial_start, self._camera.motion
         if inertial is not None and motion.tracker is not None:
-            if inertial.add_samples(ctx) and not motion.odometer.has_recent(ctx.t_ns):
+            if inertial.add_samples(ctx) and self.start_choice.awaits_window(ctx.t_ns):
                 return self._open_from_inertial_window(ctx, inertial, motion.tracker)
+            inertial.clear()
         if self._two_view_start is not None:
             return self._open_from_two_views(ctx, self._two_view_start)
         points = self._maker.first_points(ctx)
@@ -122,30 +112,14 @@ class SubmapStage:
         submap = camera.open_submap()
         camera.pose.reset_motion()
         self._keyframes.make(ctx, None, points, camera.pose.T_m_c, Extra.SUBMAP)
-        if after_loss and camera.motion.loss_motion is not None:
-            self._loss = _Loss(since, T_k_c, submap, camera.pose.T_m_c[:3, :3].copy())
-            self._share_tie(self._loss, camera.motion.loss_motion.begin(ctx.t_ns, camera.T_m_b, R_o_m))
+        if after_loss:
+            self._loss_tie.begin(ctx.t_ns, since, T_k_c, submap, R_o_m)
         return OpenedSubmap(True, ["submap: opened"])
 
     def take_warnings(self) -> list[str]:
         """Events since the last call: what keeps a map from beginning, or a monocular one from its scale."""
         warnings, self._warnings = self._warnings, []
         return warnings + ([] if self._inertial_start is None else self._inertial_start.take_warnings())
-
-    def _measure_loss(self, ctx: FrameContext) -> None:
-        """Share the motion over the loss again, once images in the new submap have shown the velocity."""
-        estimator, loss = self._camera.motion.loss_motion, self._loss
-        if estimator is not None and loss is not None and self._camera.submaps.active == loss.submap:
-            self._share_tie(loss, estimator.update(ctx.t_ns, self._camera.T_m_b))
-
-    def _share_tie(self, loss: _Loss, motion: LossMotion | None) -> None:
-        """Tell the base how the new submap lies to the one before it; None: unknown."""
-        if motion is None or loss.since == NO_KEYFRAME:
-            return
-        T_k_f = loss.T_k_c.copy()
-        T_k_f[:3, 3] += loss.T_k_c[:3, :3] @ loss.R_m_c.T @ motion.shift
-        tie = SubmapTie(loss.submap, loss.since, se3.orthonormalise(T_k_f), motion.sigma_m, motion.sigma_rad)
-        self._channel.put(tie)
 
     def _open_from_inertial_window(
         self, ctx: FrameContext, start: InertialStart, inertial: InertialTracker
@@ -231,11 +205,18 @@ class SubmapStage:
         unit, told_by = self._unit_by_motion(ctx, two_views), "convention"
         if unit is not None:
             two_views, told_by = two_views.scaled(unit), "the motion that a sensor tells"
+        since, T_k_a = camera.reference.keyframe, camera.reference.T_k_c @ se3.inverse(two_views.T_a_b)
+        is_tied = unit is not None and not camera.pose.is_guess
+        sigma_m, sigma_rad = camera.covariance.dead_reckoning_sigma
         if camera.submaps.any:
             camera.leave_submap()
         events = ["submap: opened", f"mono: scale by {told_by}, median depth {two_views.median_depth_m:.3g} m"]
+        if unit is None and camera.had_metres:
+            events.append(_NO_METRES)
         camera.motion.begin_unscaled_map()
-        camera.open_submap()
+        submap = camera.open_submap()
+        if is_tied:  # else the base does not place it in a map in metres
+            self._loss_tie.share(submap, since, T_k_a, sigma_m, sigma_rad)
         camera.pose.reset_motion()
         # The second view stays where the camera was predicted, which places the first one.
         T_m_a = camera.pose.T_m_c @ se3.inverse(two_views.T_a_b)
@@ -262,7 +243,7 @@ class SubmapStage:
         """
         told_m = float(np.linalg.norm(ctx.T_m_c[:3, 3] - views.T_m_a[:3, 3]))
         seen = float(np.linalg.norm(views.T_a_b[:3, 3]))
-        measured = self._camera.submaps.any and self._camera.had_metres and self._camera.motion.measures_motion
+        measured = self._camera.submaps.any and self._camera.had_metres and self._camera.motion.told
         return told_m / seen if measured and told_m > LEAST_MOVED_M and seen > 0.0 else None
 
     def join_older(self, ctx: FrameContext, track: Track) -> list[str]:
@@ -270,7 +251,7 @@ class SubmapStage:
 
         Returns events.
         """
-        self._measure_loss(ctx)
+        self._loss_tie.update(ctx.t_ns)
         found = self._relocaliser.find_older_submap(ctx, self._camera.pose.T_m_c)
         if found is None:
             return []
@@ -321,15 +302,15 @@ class SubmapStage:
         inertial = camera.motion.tracker
         if start is None or inertial is None:
             return []
-        if camera.motion.metric or camera.motion.odometer.has_recent(ctx.t_ns) or not start.add_samples(ctx):
+        if camera.motion.has_scale_by_imu or not start.add_samples(ctx):
             self._forget_window(start)
             return []
-        if not (camera.submaps.room and self._governor.may_do_part()):
+        if not self._may_solve_beside_map(start):
             return []
         found = start.add_beside_map(ctx, inertial.known)
         if start.keyframe_t_ns == ctx.t_ns:
             self._path.add(ctx.t_ns, camera.reference.keyframe, camera.reference.T_k_c)
-        if start.contradicted:
+        if start.contradicted and not camera.motion.running:
             self._ignore_imu(start)
         if found is None:
             return []
@@ -338,6 +319,9 @@ class SubmapStage:
             self._forget_window(start)
         return events
 
+    def _may_solve_beside_map(self, start: InertialStart) -> bool:
+        return not start.contradicted and self._camera.submaps.room and self._governor.may_do_part()
+
     def _continue_by_window(self, ctx: FrameContext, track: Track, found: InertialMap) -> list[str]:
         """Continue in metres by a window of some frames ago; nothing while that does not tell the map's unit."""
         camera, solution = self._camera, found.solution
@@ -345,7 +329,7 @@ class SubmapStage:
         sigma = np.inf if unit is None else float(np.hypot(unit.sigma, found.scale_sigma))
         if unit is None or sigma > _SCALE_SIGMA or track.inliers < ctx.config.local_map.first_points:
             return []
-        ctx = self._corrected(ctx, found.lens)
+        ctx, own_unit = self._corrected(ctx, found.lens), not camera.motion.metric
         T_new_old = self._restart(ctx, unit.metres, metric_points(ctx, track, self._map, unit.metres, found.lens))
         gravity = T_new_old[:3, :3] @ unit.R_m_w @ solution.gravity
         state = InertialStartState(
@@ -354,7 +338,8 @@ class SubmapStage:
         camera.motion.begin_metric_map(ctx.t_ns, state)
         camera.gravity.settle(ctx.t_ns)
         text = f"mono: metric within {100.0 * sigma:.1f} %, from {found.duration_s:.1f} s of images and IMU"
-        return [f"{text}, one unit was {unit.metres:.3g} m", "submap: opened"]
+        was = f"one unit was {unit.metres:.3g} m" if own_unit else f"scale corrected by {unit.metres:.4f}"
+        return [f"{text}, {was}", "submap: opened"]
 
     def _forget_window(self, start: InertialStart) -> None:
         """Lengths are metres, or nothing tells them."""

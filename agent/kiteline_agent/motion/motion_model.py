@@ -16,8 +16,9 @@ from kiteline_agent.inertial.inertial_config import InertialConfig
 from kiteline_agent.inertial.inertial_tracker import InertialTracker
 from kiteline_agent.inertial.samples.imu_watch import SILENT_S, ImuWatch
 from kiteline_agent.inertial.samples.sample_check import SampleCheck
-from kiteline_agent.inertial.scale_filter import INTERVAL_S, ScaleFilter
+from kiteline_agent.inertial.scale_filter import INTERVAL_S, ScaleFilter, correction_due
 from kiteline_agent.motion.extrapolation import Extrapolation, MotionSource, along_twist
+from kiteline_agent.motion.joint_scale import JointScale
 from kiteline_agent.motion.loss_motion import LossMotionEstimator
 from kiteline_agent.motion.odometer import Odometer
 from kiteline_agent.motion.step_recorder import StepRecorder
@@ -71,6 +72,7 @@ class MotionModel:
         if self.tracker is not None and imu is not None and metric:
             self.loss_motion = LossMotionEstimator(self.tracker, imu, config.gravity_m_s2)
         self.odometer = Odometer(camera.T_b_c, odometer, metric=metric)
+        self._joint_scale = JointScale()
         self._sample_clock, self._sample_check = SampleClock(), SampleCheck()
         self._watch = ImuWatch(SILENT_S, config.gravity_m_s2)
         self._events: list[str] = []
@@ -87,6 +89,11 @@ class MotionModel:
         return self.running or self.odometer.predicts
 
     @property
+    def told(self) -> bool:
+        """True if a sensor has told the motion of the last frame: an odometer that fell silent, or slips, has not."""
+        return self.running or self.odometer.used
+
+    @property
     def metric(self) -> bool:
         """True if the map's lengths are in metres."""
         return self._metric or self.odometer.metric or (self.tracker is not None and self.tracker.metric)
@@ -97,13 +104,20 @@ class MotionModel:
         if self._metric or not self.metric:
             return 0.0
         by_imu = self._scale_by_imu
-        return self.odometer.deviation if by_imu is None else by_imu.deviation
+        if by_imu is None:
+            return self.odometer.deviation
+        return self._joint_scale.deviation(by_imu.scale, self.odometer.map_scale)
 
     @property
     def _scale_by_imu(self) -> ScaleFilter | None:
         """What watches the scale of a monocular map whose metre the IMU told; None where the odometer did."""
         running = self.tracker is not None and self.tracker.scale.running
         return self.tracker.scale if self.tracker is not None and running else None
+
+    @property
+    def has_scale_by_imu(self) -> bool:
+        """True if the IMU tells the scale of a monocular map, or images do."""
+        return self._metric or self._scale_by_imu is not None
 
     @property
     def awaits_scale(self) -> bool:
@@ -191,6 +205,9 @@ class MotionModel:
         if state is not None:
             track = replace(track, T_c_m=se3.inverse(state.T_m_b @ self._T_b_c))
         self.odometer.update(se3.inverse(track.T_c_m), t_ns)
+        by_imu = self._scale_by_imu
+        if by_imu is not None:
+            self._events += self._joint_scale.watch(by_imu.scale, self.odometer.map_scale)
         return track
 
     def _leave_imu(self, tracker: InertialTracker) -> None:
@@ -299,7 +316,9 @@ class MotionModel:
         if self._metric or not self.metric:
             return None
         by_imu = self._scale_by_imu
-        return self.odometer.scale_correction() if by_imu is None else by_imu.correction()
+        if by_imu is None:
+            return self.odometer.scale_correction()
+        return correction_due(*self._joint_scale.fused(by_imu.scale, self.odometer.map_scale), by_imu.age_s)
 
     def reports(self) -> dict[str, Any]:
         """What was found of time offset, IMU and odometer; None for each that is not there."""

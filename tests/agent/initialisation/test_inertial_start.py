@@ -163,14 +163,12 @@ def test_windows_whose_keyframes_coincide_confirm_no_scale() -> None:
         solution: Any = SimpleNamespace(state=SimpleNamespace(p=places))
         return SolvedWindow((0, 1, 2, 3), np.zeros(0, np.int64), np.zeros((0, 3)), solution)
 
-    start = InertialStart(CAMERA, CALIBRATION, AgentConfig(), Work())
     apart, together = np.arange(12.0).reshape(4, 3), np.ones((4, 3))
-    assert start._agrees(at(apart), at(1.01 * apart))
-    assert not start._agrees(at(apart), at(1.1 * apart))
+    assert at(apart).lengths_apart(at(1.1 * apart)) == pytest.approx(np.log(1.1))
     with np.errstate(all="raise"):
-        assert not start._agrees(at(together), at(together))
-        assert not start._agrees(at(together), at(apart))
-        assert not start._agrees(at(apart), at(together))
+        assert at(together).lengths_apart(at(together)) == np.inf
+        assert at(together).lengths_apart(at(apart)) == np.inf
+        assert at(apart).lengths_apart(at(together)) == np.inf
 
 
 def at_once(result: Any) -> Any:

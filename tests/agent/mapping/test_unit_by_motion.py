@@ -21,7 +21,7 @@ def views(images: Any = None) -> TwoViewMap:
 
 
 def stage(*, measures: bool = True, metres: bool = True, any_map: bool = True) -> Any:
-    motion, submaps = SimpleNamespace(measures_motion=measures), SimpleNamespace(any=any_map)
+    motion, submaps = SimpleNamespace(told=measures), SimpleNamespace(any=any_map)
     return SimpleNamespace(_camera=SimpleNamespace(motion=motion, submaps=submaps, had_metres=metres))
 
 

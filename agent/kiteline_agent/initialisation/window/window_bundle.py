@@ -24,6 +24,7 @@ from kiteline_agent.initialisation.window.inertial_terms import (
     CutSamples,
     InertialTerms,
 )
+from kiteline_agent.initialisation.window.known_length import KnownLength
 from kiteline_agent.initialisation.window.lens_correction import TERMS
 from kiteline_agent.initialisation.window.window_noise import WindowNoise
 from kiteline_agent.initialisation.window.window_state import (
@@ -75,17 +76,19 @@ class InertialBundle:
         noise: WindowNoise | None = None,
         lens_info: F64 | None = None,
         offset: TimeOffset = NO_OFFSET,
+        length: KnownLength | None = None,
     ) -> None:
         """cut: gives the samples between the keyframes. noise: factors on the inertial error model.
 
         lens_info: (8,8) inverse covariance of the lens before this window; None: by the options. offset: known before.
+        length: of the path, if a sensor other than the IMU tells it.
         """
         self._offset_s = offset.offset_s
         self._terms = InertialTerms(cut, offset, calibration, gravity_m_s2, prior, config, noise or WindowNoise())
         lens_info = lens_prior(config, focal_px) if lens_info is None else lens_info
         self._corners = CornerTerms(observations, T_b_c, focal_px, config, lens_info)
         self._t_bc = T_b_c[:3, 3].copy()
-        self._length = gravity_m_s2
+        self._length, self._known_length = gravity_m_s2, length
         self._prior = prior
         self._converged = False
         self._keyframes, self._landmarks = observations.seen.shape
@@ -241,8 +244,7 @@ class InertialBundle:
             return None
         spread = state.p - state.p.mean(axis=0)
         along = np.zeros(len(cov))
-        rows = (STATE * np.arange(n)[:, None] + np.arange(3, 6)).ravel()
-        along[rows] = (spread / max(float((spread**2).sum()), 1e-12)).ravel()
+        along[_positions(n)] = (spread / max(float((spread**2).sum()), 1e-12)).ravel()
         variance = float(along @ cov @ along)
         if not (np.isfinite(cov).all() and variance > 0.0 and np.isfinite(state.p).all()):
             return None
@@ -267,7 +269,8 @@ class InertialBundle:
     # errors and normal equations
 
     def _cost(self, state: WindowState, *, inertial: bool) -> float:
-        return self._corners.cost(state) + self._terms.cost(state, inertial=inertial)
+        known = self._known_length.cost(state.p) if self._known_length is not None and inertial else 0.0
+        return self._corners.cost(state) + self._terms.cost(state, inertial=inertial) + known
 
     def _linearise(self, state: WindowState, *, inertial: bool) -> _System:
         n, size = self._keyframes, STATE * self._keyframes + SHARED + TERMS
@@ -277,6 +280,8 @@ class InertialBundle:
         h[np.ix_(rows, rows)] += corners.h
         b[rows] += corners.b
         cost = corners.cost + self._terms.add(state, h, b, inertial=inertial)
+        if self._known_length is not None and inertial:
+            cost += self._known_length.add(state.p, _positions(n), h, b)
         return _System(cost, h, b, corners)
 
     def _moved(self, state: WindowState, step: F64, system: _System) -> WindowState:
@@ -312,6 +317,11 @@ class InertialBundle:
         square = float((spread**2).sum())
         found = float((spread * step).sum()) / square if square > 0.0 else 0.0
         return float(np.clip(found, -_MOST_GROWTH, _MOST_GROWTH))
+
+
+def _positions(keyframes: int) -> I64:
+    """Rows of the positions of so many keyframes among the unknowns."""
+    return np.asarray((STATE * np.arange(keyframes)[:, None] + np.arange(3, 6)).ravel())
 
 
 def lens_prior(config: InertialBundleConfig, focal_px: float) -> F64:

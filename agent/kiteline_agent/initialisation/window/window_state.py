@@ -15,6 +15,7 @@ T = TypeVar("T")
 InParts = Generator[None, None, T]  # a computation that pauses where an agent with little CPU time goes on later
 
 _MAX_REPROJECTION_PX = 0.9  # px; rms of a solution's inliers
+_MIN_COMMON = 3  # keyframes of two windows whose distances are compared
 _MAX_IMU_CHI2 = 1.5  # mean squared error of its inertial factors, in deviations
 
 
@@ -104,6 +105,14 @@ class SolvedWindow:
             state, R=state.R[rows], p=state.p[rows], v=state.v[rows], accel_bias=state.accel_bias[rows]
         )  # fmt: skip
         return WarmStart(part, xyz)
+
+    def lengths_apart(self, later: "SolvedWindow") -> float:
+        """Relative difference of lengths between keyframes of both; infinite if too few are in both."""
+        common = [t for t in later.t_ns if t in set(self.t_ns)]
+        if len(common) < _MIN_COMMON:
+            return np.inf
+        a, b = (w.solution.state.p[[w.t_ns.index(t) for t in common]] for w in (self, later))
+        return lengths_apart(a, b)
 
 
 def tangent(direction: F64) -> F64:

@@ -1,0 +1,34 @@
+"""How a map of one camera begins, by which sensors speak."""
+
+from types import SimpleNamespace
+from typing import Any
+
+from kiteline_agent.mapping.start_choice import StartChoice
+
+
+def choice(*, odometer: bool = True, any_map: bool = False, samples: bool = True, imu: bool = True) -> StartChoice:
+    motion = SimpleNamespace(odometer=SimpleNamespace(has_recent=lambda _t_ns: odometer))
+    camera: Any = SimpleNamespace(motion=motion, submaps=SimpleNamespace(any=any_map))
+    inertial: Any = SimpleNamespace(has_samples=samples) if imu else None
+    return StartChoice(camera, inertial)
+
+
+def test_images_and_imu_begin_a_map_and_an_odometer_helps_them() -> None:
+    assert choice().awaits_window(0)
+    assert choice(odometer=False).awaits_window(0)
+    assert not choice(imu=False).awaits_window(0)
+
+
+def test_an_imu_that_has_not_spoken_is_not_waited_for_where_an_odometer_speaks() -> None:
+    assert not choice(samples=False).awaits_window(0)
+    assert choice(samples=False, odometer=False).awaits_window(0)
+
+
+def test_an_odometer_leads_over_a_loss_by_itself() -> None:
+    assert not choice(any_map=True).awaits_window(0)
+    assert choice(any_map=True, odometer=False).awaits_window(0)
+
+
+def test_two_views_begin_the_map_if_no_window_tells_the_scale() -> None:
+    waits, second = choice(), 1_000_000_000
+    assert [waits.awaits_window(k * second) for k in (1, 4, 5, 6, 7)] == [True, True, True, False, False]
