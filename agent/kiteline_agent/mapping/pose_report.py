@@ -66,10 +66,10 @@ class PoseReport:
     def _knows_place(self) -> bool:
         """True if the active submap's pose in the flight's first one rests on more than odometry.
 
-        Always for maps of which each has a unit of its own.
+        Always in flights without metres, of whose maps each has a unit of its own.
         """
         submaps = self._camera.submaps
-        return not self._camera.motion.metric or submaps.in_first or self._corrections.is_recognised(submaps.active)
+        return not self._camera.had_metres or submaps.in_first or self._corrections.is_recognised(submaps.active)
 
     def odometry_quality(self, estimate: Estimate) -> int:
         """`quality` of T_o_b, which no map corrects: for a flight controller."""

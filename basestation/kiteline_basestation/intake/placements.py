@@ -79,7 +79,10 @@ class SubmapPlacements:
             if not self._map.is_up_to_scale(self._map.map_id(submap)):
                 continue
             if placed is None:
-                self._intake.fresh_scales.add(submap)
+                if self._place_waiting(submap):
+                    changed = True
+                else:
+                    self._intake.fresh_scales.add(submap)
                 continue
             factor = metres / sim3.scale_of(placed)
             if submap == self.first:
@@ -110,24 +113,39 @@ class SubmapPlacements:
             return
         if self._is_apart_in_metres(submap, keyframe):
             self._withdraw(list(self.S_w_m))
-        if not self.S_w_m:
-            gravity = self._intake.gravity.get(submap)
-            S_w_m = np.eye(4) if gravity is None else gravity.T_l_m
-        else:
-            before = SubmapId(submap - 1)
-            live, S_w_before = self._intake.last_pose.get(before), self.S_w_m.get(before)
-            first = self._map.submaps[submap][0]
-            T_m_first = self._map.pose(first)
-            T_before_k = self._map.pose(live.keyframe) if live else None
-            if live is None or S_w_before is None or T_before_k is None or T_m_first is None:
-                return
-            tracked_ns = self._intake.tracked_ns.get(before, live.t_ns)
-            if self._map.keyframes.t_ns[self._map.rows[first]] - tracked_ns > _ODOMETRY_GAP_S * 1e9:
-                return  # too long without images: a loop closure has to place it
-            T_w_c = sim3.place(S_w_before, T_before_k @ live.T_k_c)
-            scale = sim3.scale_of(S_w_before) if self._map.is_up_to_scale(submap) else 1.0
-            S_w_m = sim3.normalise(sim3.of(scale, T_w_c) @ se3.inverse(T_m_first))
-        self._place(submap, S_w_m)
+        if self.S_w_m:
+            self._place_by_odometry(submap)
+            return
+        gravity = self._intake.gravity.get(submap)
+        self._place(submap, np.eye(4) if gravity is None else gravity.T_l_m)
+
+    def _place_waiting(self, submap: SubmapId) -> bool:
+        """Place a submap whose unit was not known, and those that follow it. False if the first one has no place."""
+        first = submap
+        while submap not in self.S_w_m and (self._place_by_tie(submap) or self._place_by_odometry(submap)):
+            submap = SubmapId(submap + 1)
+        return submap != first
+
+    def _place_by_odometry(self, submap: SubmapId) -> bool:
+        """Place a submap where its agent left the one before; False if that is not known, or how long its unit is."""
+        before, keyframes = SubmapId(submap - 1), self._map.submaps.get(submap)
+        live, S_w_before = self._intake.last_pose.get(before), self.S_w_m.get(before)
+        T_m_first = self._map.pose(keyframes[0]) if keyframes else None
+        T_before_k = self._map.pose(live.keyframe) if live else None
+        if live is None or S_w_before is None or T_before_k is None or T_m_first is None or not keyframes:
+            return False
+        tracked_ns = self._intake.tracked_ns.get(before, live.t_ns)
+        if self._map.keyframes.t_ns[self._map.rows[keyframes[0]]] - tracked_ns > _ODOMETRY_GAP_S * 1e9:
+            return False  # too long without images: a loop closure has to place it
+        scale: float | None = 1.0
+        if self._map.is_up_to_scale(submap):
+            in_metres = not self._map.is_up_to_scale(self._map.map_id(before))
+            # Without a tie nothing measured the way over the loss: it would lie as if its unit were a metre.
+            scale = self._map.metres_per_unit.get(submap) if in_metres else sim3.scale_of(S_w_before)
+        if scale is None:
+            return False
+        T_w_c = sim3.place(S_w_before, T_before_k @ live.T_k_c)
+        return self._place(submap, sim3.normalise(sim3.of(scale, T_w_c) @ se3.inverse(T_m_first)))
 
     def _is_apart_in_metres(self, submap: SubmapId, keyframe: KeyframeId) -> bool:
         """True if nothing tells how a submap in metres lies to the placed ones, which are its agent's and not."""
