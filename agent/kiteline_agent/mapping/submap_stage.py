@@ -71,7 +71,7 @@ class SubmapStage:
         self._depth = depth
         self._two_view_start = two_view_start
         self._inertial_start = inertial_start
-        self.start_choice = StartChoice(camera, inertial_start)
+        self.start_choice = StartChoice(camera, inertial_start, has_time=not governor.on)
         self._governor = governor
         self._channel = channel
         self._path = UnscaledPath(local_map)
