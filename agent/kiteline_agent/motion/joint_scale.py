@@ -28,19 +28,19 @@ class JointScale:
             return []
         return [contradiction(by_odometer[0] / by_imu[0]) if self._contradicts else _AGAIN]
 
-    def fused(self, by_imu: Scale, by_odometer: Scale | None) -> Scale:
+    def fused(self, by_imu: Scale, by_odometer: Scale) -> Scale:
         """What both tell together."""
-        if by_odometer is None or self._contradicts:
+        if self._contradicts:
             return by_imu
         found = np.log([by_imu[0], by_odometer[0]])
         weight = np.array([by_imu[1] / by_imu[0], by_odometer[1] / by_odometer[0]]) ** -2.0
         scale = float(np.exp(weight @ found / weight.sum()))
         return scale, scale * float(weight.sum()) ** -0.5
 
-    def deviation(self, by_imu: Scale, by_odometer: Scale | None) -> float:
+    def deviation(self, by_imu: Scale, by_odometer: Scale) -> float:
         """Relative deviation of lengths in the map as it is: how well the scale is known, and how far off it seems."""
         scale, sigma = self.fused(by_imu, by_odometer)
-        apart = _apart(by_imu, by_odometer)[0] if self._contradicts and by_odometer is not None else 0.0
+        apart = _apart(by_imu, by_odometer)[0] if self._contradicts else 0.0
         return float(np.linalg.norm([sigma / scale, scale - 1.0, apart]))
 
 

@@ -106,7 +106,8 @@ class MotionModel:
         by_imu = self._scale_by_imu
         if by_imu is None:
             return self.odometer.deviation
-        return self._joint_scale.deviation(by_imu.scale, self.odometer.map_scale)
+        told = self.odometer.map_scale
+        return by_imu.deviation if told is None else self._joint_scale.deviation(by_imu.scale, told)
 
     @property
     def _scale_by_imu(self) -> ScaleFilter | None:
@@ -318,7 +319,10 @@ class MotionModel:
         by_imu = self._scale_by_imu
         if by_imu is None:
             return self.odometer.scale_correction()
-        return correction_due(*self._joint_scale.fused(by_imu.scale, self.odometer.map_scale), by_imu.age_s)
+        told = self.odometer.map_scale
+        if told is None:
+            return by_imu.correction()
+        return correction_due(*self._joint_scale.fused(by_imu.scale, told), by_imu.age_s)
 
     def reports(self) -> dict[str, Any]:
         """What was found of time offset, IMU and odometer; None for each that is not there."""
