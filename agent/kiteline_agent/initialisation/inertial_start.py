@@ -102,7 +102,7 @@ class InertialStart:
         start = config.inertial_start
         detector = replace(config.detector, cell_px=start.corner_tracks.cell_px, max_corners=corner_tracks.CORNERS)
         self._tracks = CornerTracks(camera, detector, start.corner_tracks)
-        self._odometry = WindowOdometry(odometry)
+        self.odometry = WindowOdometry(odometry)
         self.waiting = WaitingFrames(corner_tracks.KEYFRAME_S)
         self._buffer = SampleBuffer(_MAX_SPAN_S + 1.0, _MAX_GAP_S)
         self._before: SolvedWindow | None = None
@@ -132,7 +132,7 @@ class InertialStart:
     def clear(self) -> None:
         """A map is tracked: begin anew after it."""
         self._tracks.clear()
-        self._odometry.clear()
+        self.odometry.clear()
         self._attempt = self._before = self._tried_ns = self._noise = self._vibration = None
         self._by_stamps = False
         self._contradiction.begin_again()
@@ -149,7 +149,7 @@ class InertialStart:
 
     def take_warnings(self) -> list[str]:
         """Events since the last call: what the user should check."""
-        warnings, self._warnings = self._warnings + self._odometry.take_events(), []
+        warnings, self._warnings = self._warnings + self.odometry.take_events(), []
         return warnings
 
     @property
@@ -187,7 +187,7 @@ class InertialStart:
             self._work.followed += 1
             turn = None if every else self._turn(ctx.t_ns, imu)
             if self._tracks.add(ctx.t_ns, ctx.images.left, turn):
-                self._odometry.add(ctx.t_ns)
+                self.odometry.add(ctx.t_ns)
                 self._bound_window(ctx.t_ns)
                 if self._attempt is None:
                     self._attempt = self._begin(ctx, imu)
@@ -271,7 +271,7 @@ class InertialStart:
             return None
         solution, modelled = found.solution, self._noise
         noise, sigma = self._seen_noise(solution)
-        length = self._odometry.length(stamps, solution.state, sigma)
+        length = self.odometry.length(stamps, solution.state, sigma if solution.fits else np.inf)
         if joint_sigma(sigma, length) < _NEARLY * _SCALE_SIGMA:
             self._work.alignments += int(np.count_nonzero(observations.seen))
             aligned = realigned(keyframes, observations, solution.state, found.xyz, found.first, self._camera)

@@ -32,13 +32,13 @@ class WindowOdometry:
         self._mean = mean
         self._last_ns: int | None = None
         self._steps: deque[tuple[int, int, MeanVelocity]] = deque(maxlen=_STEPS)
-        self._contradicts = False  # the last window, by more than both deviations allow
+        self.contradicts = False  # the last window, by more than both deviations allow
         self._events: list[str] = []
 
     def clear(self) -> None:
         """Forget all."""
         self._steps.clear()
-        self._last_ns = None
+        self._last_ns, self.contradicts = None, False
 
     def add(self, t_ns: int) -> None:
         """A keyframe with this stamp, whose samples have come."""
@@ -50,17 +50,18 @@ class WindowOdometry:
     def length(self, t_ns: tuple[int, ...], state: WindowState, sigma: float) -> KnownLength | None:
         """Length of the path of a window with these stamps, and its deviation; None if too little tells it.
 
-        sigma: relative deviation of the window's own lengths. An odometer that contradicts them tells nothing.
+        sigma: relative deviation of the window's own lengths, infinite if it does not fit. An odometer that contradicts
+        them tells nothing.
         """
         found = self._metres_per_unit(t_ns, state)
         if found is None:
             return None
         metres, own = found[0], float(np.hypot(found[1] / found[0], _FLOOR))
-        before = self._contradicts
-        self._contradicts = abs(float(np.log(metres))) > _CONTRADICTS * float(np.hypot(own, sigma))
-        if self._contradicts and not before:
+        before = self.contradicts
+        self.contradicts = abs(float(np.log(metres))) > _CONTRADICTS * float(np.hypot(own, sigma))
+        if self.contradicts and not before:
             self._events.append(contradiction(metres))
-        return None if self._contradicts else KnownLength(metres * extent(state.p), own)
+        return None if self.contradicts else KnownLength(metres * extent(state.p), own)
 
     def take_events(self) -> list[str]:
         """Events since the last call, for the log."""

@@ -4,6 +4,7 @@ from kiteline_agent.initialisation.inertial_start import InertialStart
 from kiteline_agent.mapping.camera_state import CameraState
 
 _WINDOW_S = 5.0  # s of an odometer after which two views begin the first map, if no window has told the scale
+_CONTRADICTED_S = 15.0  # s, the same where it contradicts the window: the IMU may tell the scale alone
 
 
 class StartChoice:
@@ -25,4 +26,5 @@ class StartChoice:
         if self._camera.submaps.any or not (self._inertial.has_samples and self._has_time):
             return False
         self._since_ns = t_ns if self._since_ns is None else self._since_ns
-        return t_ns - self._since_ns < _WINDOW_S * 1e9
+        most_s = _CONTRADICTED_S if self._inertial.odometry.contradicts else _WINDOW_S
+        return t_ns - self._since_ns < most_s * 1e9

@@ -1,7 +1,7 @@
 """Scale of a map of one camera in metres, by IMU and odometer together.
 
 Each tells metres per unit of the map with a deviation; they are weighed by these. Where they contradict each other the
-IMU stands, since wheels slip for as long as they like, and lengths count as uncertain by the difference.
+IMU stands, since wheels slip for as long as they like: a bad odometer costs nothing.
 """
 
 import numpy as np
@@ -40,8 +40,7 @@ class JointScale:
     def deviation(self, by_imu: Scale, by_odometer: Scale) -> float:
         """Relative deviation of lengths in the map as it is: how well the scale is known, and how far off it seems."""
         scale, sigma = self.fused(by_imu, by_odometer)
-        apart = _apart(by_imu, by_odometer)[0] if self._contradicts else 0.0
-        return float(np.linalg.norm([sigma / scale, scale - 1.0, apart]))
+        return float(np.hypot(sigma / scale, scale - 1.0))
 
 
 def _apart(a: Scale, b: Scale) -> Scale:

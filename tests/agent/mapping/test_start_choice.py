@@ -7,11 +7,19 @@ from kiteline_agent.mapping.start_choice import StartChoice
 
 
 def choice(
-    *, odometer: bool = True, any_map: bool = False, samples: bool = True, imu: bool = True, has_time: bool = True
+    *,
+    odometer: bool = True,
+    any_map: bool = False,
+    samples: bool = True,
+    imu: bool = True,
+    has_time: bool = True,
+    contradicts: bool = False,
 ) -> StartChoice:
     motion = SimpleNamespace(odometer=SimpleNamespace(has_recent=lambda _t_ns: odometer))
     camera: Any = SimpleNamespace(motion=motion, submaps=SimpleNamespace(any=any_map))
-    inertial: Any = SimpleNamespace(has_samples=samples) if imu else None
+    inertial: Any = (
+        SimpleNamespace(has_samples=samples, odometry=SimpleNamespace(contradicts=contradicts)) if imu else None
+    )
     return StartChoice(camera, inertial, has_time=has_time)
 
 
@@ -39,3 +47,8 @@ def test_under_a_cpu_budget_an_odometer_is_sooner_than_a_window() -> None:
 def test_two_views_begin_the_map_if_no_window_tells_the_scale() -> None:
     waits, second = choice(), 1_000_000_000
     assert [waits.awaits_window(k * second) for k in (1, 4, 5, 6, 7)] == [True, True, True, False, False]
+
+
+def test_an_odometer_that_contradicts_the_imu_is_not_taken_in_its_place_at_once() -> None:
+    waits, second = choice(contradicts=True), 1_000_000_000
+    assert [waits.awaits_window(k * second) for k in (1, 7, 15, 17)] == [True, True, True, False]
