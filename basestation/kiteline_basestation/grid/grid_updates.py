@@ -11,7 +11,7 @@ from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.grid.kept_scan import KeptScan, keep
 from kiteline_basestation.grid.landmark_ground import LandmarkGround
 from kiteline_basestation.grid.scan_grid import ScanGrid
-from kiteline_basestation.grid.sparse_scan import sparse_ground, sparse_scan
+from kiteline_basestation.grid.sparse_scan import LandmarksAround, sparse_ground, sparse_scan
 from kiteline_basestation.map.map_tables import LANDMARK, NO_POSE
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_codec.schema import KeyframeScan
@@ -23,6 +23,7 @@ _MOST_WAITS = 3  # busy steps in a row that leave the drawing to the next one
 _LOOKED = 16  # keyframes looked at for each that one step may draw: most may not have moved
 _SPARSE_LAG = 5  # keyframes after which the landmarks of one without a scan are drawn again: they are refined by then
 _SPARSE_WINDOW = 4  # keyframes before and after it whose landmarks tell where its ground lies
+_STANDING_WINDOW = 12  # the same of those that stand: a table top is seen from one side, the floor below from others
 _GROUND_MOVED_M = 0.05  # m by which the ground below a keyframe has to be known better until its scan is made again
 _GROUND_KEYFRAMES = 20  # newest keyframes among which one must know the height of the ground: 20 s
 
@@ -239,9 +240,8 @@ class GridUpdates:
         submap = submap_of_keyframe(keyframe)
         siblings = self._map.submaps[submap]
         at = self._map.number_of(keyframe)
-        near = siblings[max(0, at - _SPARSE_WINDOW) : at + _SPARSE_WINDOW + 1]
-        seen = self._map.landmarks_of(keyframe)
-        around = self._map.sorted_by_id(np.concatenate([self._map.landmarks_of(k) for k in near]))
+        near, far = (siblings[max(0, at - n) : at + n + 1] for n in (_SPARSE_WINDOW, _STANDING_WINDOW))
+        around = self._map.sorted_by_id(np.concatenate([self._map.landmarks_of(k) for k in far]))
         xyz, known = self._map.positions(around)
         around, xyz = around[known], xyz[known]
         T_map_k = self._map.world_pose(keyframe)
@@ -250,14 +250,17 @@ class GridUpdates:
         scale = self._map.scale(submap)
         unit_m = sim3.scale_of(S_w_k)
         local = (xyz @ T_k_map[:3, :3].T + T_k_map[:3, 3]) * (unit_m / scale)
-        view = sparse_ground(self._config, S_w_k, local, unit_m)
+        close = np.isin(around, np.concatenate([self._map.landmarks_of(k) for k in near]))
+        view = sparse_ground(self._config, S_w_k, local[close], unit_m)
         if view is None:
             return
         self._ground.put(keyframe, view)
         plane = self._know_ground(keyframe, S_w_k)
         made = None
         if plane is not None:
-            made = sparse_scan(self._config, camera, S_w_k, local, np.isin(around, seen), plane)
+            views = np.diff(self._map.observations(around)[0]).astype(np.int64)
+            seen = np.isin(around, self._map.landmarks_of(keyframe))
+            made = sparse_scan(self._config, camera, S_w_k, LandmarksAround(local, seen, close, views), plane)
         if made is None:
             self._labels.pop(keyframe, None)
             self._hang(keyframe, 0, None)

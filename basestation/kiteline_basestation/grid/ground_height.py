@@ -6,7 +6,7 @@ a plane for each patch, fitted to the points near it in narrowing bands (a hard-
 
 import numpy as np
 
-from kiteline_basestation.grid import ground_kernels as kernels
+from kiteline_basestation.grid import sparse_kernels as kernels
 from kiteline_core.arrays import F32, F64, I64, Bool
 
 _CAMERA_ABOVE_M = 0.1  # m; ground points are at least this far below every camera that observes them

@@ -5,7 +5,8 @@ from functools import cache
 
 import numpy as np
 
-from kiteline_basestation.config import BaseConfig, GraphConfig
+from kiteline_basestation.config import BaseConfig, GraphConfig, GridConfig
+from kiteline_basestation.grid.sparse_scan import LandmarksAround, sparse_scan
 from kiteline_basestation.job_kinds import run_job
 from kiteline_basestation.jobs import JobDone
 from kiteline_basestation.merging.essential_graph import GraphInputs, optimise
@@ -47,7 +48,8 @@ def warm(config: BaseConfig | None = None) -> None:
     sparse_map = station.mapper.map
     stereo = sparse_map.cameras[AgentId(0)]
     sparse_map.set_camera(AgentId(0), replace(stereo, stereo=False))
-    station.mapper.grid_updates.update()  # of a camera that sends no scans, landmarks are drawn
+    station.mapper.grid_updates.update()  # of a camera that sends no scans, landmarks are drawn ...
+    _scan_landmarks(stereo)  # ... where they show the ground
     sparse_map.set_camera(AgentId(0), stereo)
     for before, far_m in ((2, 8.0), (1, 2.0)):  # the second one takes a part of the cells of the first
         agent.put(_scan(_KEYFRAMES - before, far_m))
@@ -79,6 +81,15 @@ def _scan(k: int, far_m: float) -> KeyframeScan:
     up = np.array([0.0, -1.0, 0.0])
     scan = ColumnScan(up, -0.4, 0.1, near, far, far, np.full(8, 7, np.uint8), far, 1.0)
     return KeyframeScan(keyframe_id(submap_id(0, 0, 0), k), scan, np.zeros(0, np.uint8))
+
+
+def _scan_landmarks(camera: RectifiedCamera) -> None:
+    """A scan of landmarks on a floor 1 m below the camera."""
+    ahead = np.linspace(1.0, 4.0, 8)
+    floor, level = np.column_stack([np.zeros(8), np.ones(8), ahead]), np.array([-1.0, 0.0, 0.0])
+    S_w_k = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+    every = np.ones(8, np.bool_)
+    sparse_scan(GridConfig(), camera, S_w_k, LandmarksAround(floor, every, every, np.full(8, 2)), level)
 
 
 def _keyframe(k: int) -> list[Record]:
