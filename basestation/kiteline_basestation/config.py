@@ -187,7 +187,7 @@ class GridConfig:
     views: int = 8  # scans of one view that are drawn, the newest: log-odds of 16 bits hold some thousand near views
     drawn_per_step: int = 16  # scans that one step draws, half a ms each: a loop's corrections wait for later steps
     scanless_keyframes: int = 8  # of a stereo agent without a scan, after which its landmarks are drawn: they tell less
-    made_per_step: int = 2  # scans that one step makes from landmarks, 3 ms each
+    made_per_step: int = 2  # scans that one step makes from landmarks, 6 ms each
     band_files: bool = False  # True: a file for each height band, too
     binary_files: bool = False  # True: a file in which one view occupies a cell for good, too (Segfloor)
     resident_tiles: int = 512  # tiles that stay inflated, 24 kB each: what a dozen drones draw on at a time
