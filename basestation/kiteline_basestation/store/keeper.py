@@ -21,6 +21,7 @@ from kiteline_codec.schema.owners import submap_of
 from kiteline_core.ids import SubmapId
 
 WRITE_NS = 250_000_000  # ns between two batches: a crash loses at most these, and the agents send them again
+_LOOK_S = 1.0  # s between two looks at the file while nothing is to be written
 _RETRY_S = 1.0  # s until a batch that could not be written is tried again
 _CLOSE_S = 10.0  # s that the last batch may take
 
@@ -51,8 +52,8 @@ class Keeper:
 
     @property
     def idle(self) -> bool:
-        """True if all batches are written."""
-        return self._writing == 0
+        """True if all batches are written, and the file is where it belongs."""
+        return self._writing == 0 and self.fault is None
 
     def load(self) -> SavedMap:
         """Read what earlier processes saved."""
@@ -99,13 +100,24 @@ class Keeper:
             self.batches += 1
             self._batches.put(batch)
 
+    def _next_batch(self) -> Batch | None:
+        """Wait for the next batch, or until the store has to be put back: then an empty one. None at the end."""
+        while True:
+            with contextlib.suppress(queue.Empty):
+                return self._batches.get(timeout=_LOOK_S)
+            if self._store is not None and self._store.displaced:
+                return Batch()
+
     def _run(self) -> None:
-        while (batch := self._batches.get()) is not None:
+        while (batch := self._next_batch()) is not None:
             self.fault = None
             while True:
                 try:
                     if self._store is None:
                         self._store = Store(self._folder)
+                    if self._store.displaced:
+                        self._store.put_back()
+                        _say(f"store: {self._store.path}: it was deleted or moved, and is written anew")
                     self._store.write(batch)
                     break
                 except StoreError as error:
@@ -117,21 +129,24 @@ class Keeper:
             if self.fault is not None:
                 _say("store: written again")
             self.fault = None
-            self._writing -= 1
+            if batch:  # an empty one was not counted
+                self._writing -= 1
 
     def close(self, station: Station) -> bool:
         """Write all that is left, and close the store. False if it could not be written; that is said."""
         if station.changed is not None:
             self._put(self._gather(station))
+        if self._store is not None and self._store.displaced:
+            self._batches.put(Batch())
         self._batches.put(None)
         self._thread.join(_CLOSE_S)
         self._closing.set()
         self._thread.join(_RETRY_S)
         if not self._thread.is_alive() and self._store is not None:
             self._store.close()
-        if self._writing:
+        if not self.idle:
             _say(f"store: the newest part of the map is not stored: {self.fault or 'the disk is too slow'}")
-        return self._writing == 0
+        return self.idle
 
 
 def _say(line: str) -> None:

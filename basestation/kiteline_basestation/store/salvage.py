@@ -1,4 +1,4 @@
-"""Files of a store on a disk that fails: read where nothing can be written, written anew from what is sound."""
+"""Files of a store that were damaged or taken away, or cannot be written: read as they are, written anew."""
 
 import contextlib
 import os
@@ -50,16 +50,29 @@ def _connected(file: Path, how: str, busy_s: float) -> sqlite3.Connection:
 
 def write_new(path: Path, saved: SavedMap) -> None:
     """Write a store of a map, all of it or nothing, and wait for the disk. Raises OSError, sqlite3.Error."""
+    with _new(path) as db:
+        checksums.make_tables(db)
+        checksums.write_all(db, saved)
+
+
+def put_back(path: Path, db: sqlite3.Connection) -> None:
+    """Copy an open database, whose file has lost its name, to where it was. Raises OSError, sqlite3.Error."""
+    with _new(path) as copy:
+        db.backup(copy)
+        copy.execute("PRAGMA journal_mode = DELETE")
+        for end in _BESIDE:  # they would be read as belonging to the new file
+            path.with_name(path.name + end).unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def _new(path: Path) -> Iterator[sqlite3.Connection]:
+    """An empty database that takes its name once it is whole and on the disk, or leaves nothing."""
     path.parent.mkdir(parents=True, exist_ok=True)
     new = path.with_name(path.name + ".new")
     new.unlink(missing_ok=True)
     try:
-        db = sqlite3.connect(new, isolation_level=None)
-        try:
-            checksums.make_tables(db)
-            checksums.write_all(db, saved)
-        finally:
-            db.close()
+        with contextlib.closing(sqlite3.connect(new, isolation_level=None)) as db:
+            yield db
         os.replace(new, path)
     finally:
         new.unlink(missing_ok=True)

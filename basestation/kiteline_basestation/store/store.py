@@ -15,6 +15,7 @@ tears a batch, and what is lost then the agents send again. FULL would wait for 
 import contextlib
 import errno
 import fcntl
+import os
 import sqlite3
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -29,6 +30,7 @@ from kiteline_core.errors import INPUT_FAULTS
 from kiteline_core.ids import SEQUENCE_BITS, SubmapId, agent_of_submap
 
 FILE = "map.sqlite"
+_LOCK = "lock"
 _BUSY_S = 5.0  # s to wait for a reader of the same file, such as `kiteline export`
 _DISK = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO}
 
@@ -72,16 +74,42 @@ class Store:
 
     def __init__(self, folder: Path) -> None:
         self.path = folder / FILE
+        self._folder = folder
         self._lock = _take(folder)
         self._damaged: SavedMap | None = None  # what is left of a damaged file that could not be written anew yet
         self._renewed = False  # its file was, and is not open yet
         try:
             with _explained(self.path):
                 salvage.finish(self.path)
-            self._db = _open(self.path)
+            self._connect()
         except BaseException:
             self._lock.close()
             raise
+
+    def _connect(self) -> None:
+        self._db = _open(self.path)
+        with _explained(self.path):
+            self._file = self.path.stat()
+
+    @property
+    def displaced(self) -> bool:
+        """True if the file was deleted or moved: SQLite writes on in it, where nobody finds it."""
+        return self._damaged is None and not _names(self.path, self._file)
+
+    def put_back(self) -> None:
+        """Write the store anew where its file was deleted or moved. Raises StoreError."""
+        with _explained(self.path):
+            if self.path.exists():
+                raise StoreError(
+                    f"{self.path}: another file is in the place of this base's: move it away, or start the base again"
+                )
+            if not _names(self._folder / _LOCK, os.fstat(self._lock.fileno())):
+                lock = _take(self._folder)
+                self._lock.close()
+                self._lock = lock
+            salvage.put_back(self.path, self._db)
+            self._db.close()  # which removes, by their names, the files that SQLite keeps beside a database
+            self._connect()
 
     def load(self) -> SavedMap:
         """Read the whole store. If it has faults, it is written anew from what is sound, as soon as the disk allows."""
@@ -101,7 +129,7 @@ class Store:
                 if not self._renewed:
                     salvage.renew(self.path, self._damaged)
                     self._renewed = True
-            self._db = _open(self.path)
+            self._connect()
             self._damaged = None
 
     def write(self, batch: Batch) -> None:
@@ -133,9 +161,20 @@ class Store:
 
     def close(self) -> None:
         """Close the database and unlock the folder."""
-        with contextlib.suppress(sqlite3.Error):
-            self._db.close()
+        if not self.displaced:  # else SQLite would remove the write-ahead log of the file that took its name
+            with contextlib.suppress(sqlite3.Error):
+                self._db.close()
         self._lock.close()
+
+
+def _names(path: Path, file: os.stat_result) -> bool:
+    """True if a path names a file, or a disk that fails does not tell."""
+    try:
+        return os.path.samestat(path.stat(), file)
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    except OSError:
+        return True
 
 
 def read(path: Path) -> SavedMap:
@@ -192,7 +231,7 @@ def _take(folder: Path) -> IO[bytes]:
     """Lock a folder for this process, until the file is closed or the process ends."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        lock = (folder / "lock").open("wb")
+        lock = (folder / _LOCK).open("wb")
     except OSError as error:
         kind = DiskError if error.errno in _DISK else StoreError
         raise kind(f"{folder}: {error.strerror or error}; a store is a folder that can be written") from None

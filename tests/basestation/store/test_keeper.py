@@ -1,6 +1,7 @@
 """The keeper writes batches in order, repeats failed writes and does not block the loop."""
 
 import itertools
+import shutil
 import sqlite3
 import threading
 import time
@@ -17,7 +18,7 @@ from kiteline_basestation.store import keeper as keeper_module
 from kiteline_basestation.store.checksums import StoreError
 from kiteline_basestation.store.keeper import WRITE_NS, Keeper
 from kiteline_basestation.store.saved_map import SavedMap
-from kiteline_basestation.store.store import Batch, Store, read
+from kiteline_basestation.store.store import FILE, Batch, Store, read
 from kiteline_codec.channel import CodedChannel, coded_channel
 from kiteline_codec.schema import KeyframeHeader, messages
 from kiteline_codec.sync.config import SyncConfig
@@ -127,3 +128,69 @@ def test_a_first_start_on_a_full_disk_begins_the_store_later(
     keeper.begin(station, SavedMap(texts={"name": "text"}), SavedMap())
     assert keeper.close(station)
     assert read(tmp_path).texts["name"] == "text"
+
+
+def delete_folder(folder: Path) -> None:
+    shutil.rmtree(folder)
+
+
+def delete_file(folder: Path) -> None:
+    """Alone: what SQLite keeps beside it stays, and does not belong to a new file of that name."""
+    (folder / FILE).unlink()
+
+
+def move_folder(folder: Path) -> None:
+    folder.rename(folder.with_name("moved"))
+
+
+@pytest.mark.parametrize("take_away", [delete_folder, delete_file, move_folder])
+@pytest.mark.parametrize("when", ["written", "idle", "at the end"])
+def test_a_store_that_is_deleted_or_moved_meanwhile_is_written_anew(
+    make_flight: MakeFlight, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+    take_away: Callable[[Path], None], when: str,
+) -> None:  # fmt: skip
+    monkeypatch.setattr(keeper_module, "_LOOK_S", 0.02 if when == "idle" else 20.0)
+    folder = tmp_path / "store"
+    flown = FlightSummary(make_flight(keyframes=6, turns=0.1), folder)
+    for n in range(6):
+        if n == 3:
+            take_away(folder)
+            if when == "idle":
+                wait_for((folder / FILE).exists)
+        if n < 3 or when != "at the end":
+            flown.step(n)
+            wait_for(lambda: flown.keeper.idle)
+    assert flown.keeper.close(flown.station)
+    assert kept_heads(folder) == (3 if when == "at the end" else 6)
+    assert not read(folder).faults
+    assert capsys.readouterr().err.count("was deleted or moved") == 1
+    Store(folder).close()  # its lock is free
+    if take_away is move_folder:
+        assert not read(tmp_path / "moved").faults
+        assert kept_heads(tmp_path / "moved") == 3
+
+
+def test_a_store_in_the_place_of_one_that_was_moved_stays_as_it_is(
+    make_flight: MakeFlight, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(keeper_module, "_CLOSE_S", 0.5)
+    folder = tmp_path / "store"
+    flown = FlightSummary(make_flight(keyframes=6, turns=0.1), folder)
+    flown.step(0)
+    wait_for(lambda: flown.keeper.idle)
+    move_folder(folder)
+    other = Store(folder)
+    other.write(Batch(texts={"name": "text"}))
+    flown.step(1)
+    wait_for(lambda: flown.keeper.fault is not None)
+    assert not flown.keeper.close(flown.station)
+    assert "another file is in the place" in capsys.readouterr().err
+    assert read(folder) == SavedMap(texts={"name": "text"})  # its write-ahead log, too, is still there
+    other.close()
+
+
+def wait_for(ready: Callable[[], bool]) -> None:
+    deadline_s = time.monotonic() + 20.0
+    while not ready():
+        assert time.monotonic() < deadline_s
+        time.sleep(0.005)
