@@ -24,6 +24,7 @@ class WholeFile:
     def __init__(self, path: Path) -> None:
         self.size = 0
         self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o666)
+        self._links = os.fstat(self._fd).st_nlink  # 0 from the beginning where a file system does not count names
 
     @property
     def closed(self) -> bool:
@@ -33,7 +34,7 @@ class WholeFile:
     @property
     def deleted(self) -> bool:
         """True if the file has no name any more."""
-        return self._fd < 0 or os.fstat(self._fd).st_nlink == 0
+        return self._fd < 0 or os.fstat(self._fd).st_nlink < self._links
 
     def write(self, data: bytes) -> int:
         """Append a piece. Raises OSError if the disk does not take all of it."""
@@ -67,8 +68,8 @@ class WholeFile:
 class BesideFile:
     """A WholeFile that is written by a thread of its own: a loop that flies does not wait for a disk that stalls.
 
-    Pieces wait in memory in their order, one that the disk refuses until it is taken, or the file was ended and is
-    deleted. Raises OSError if the file cannot be created.
+    Pieces wait in memory in their order, one that the disk refuses until it is taken. A file that is deleted before it
+    is ended takes no more. Raises OSError if the file cannot be created.
     """
 
     def __init__(self, path: Path, most_bytes: int = _MOST_BYTES) -> None:
@@ -146,11 +147,15 @@ class BesideFile:
                     break
                 data = self._pieces[0]
             try:
+                if self._file.deleted and not self._ended:
+                    raise FileNotFoundError(errno.ENOENT, "the file was deleted while it was written")
                 self._file.write(data)
             except OSError as error:
                 self._fault = error.errno or 0, error.strerror or str(error)
-                # An ended file that was deleted to make room gives it only once it is closed.
-                if self._closing.is_set() or (self._ended and self._file.deleted):
+                if self._file.deleted:  # it gives room only once it is closed
+                    self._most_bytes = 0
+                    break
+                if self._closing.is_set():
                     break
                 self._closing.wait(_RETRY_S)
                 continue

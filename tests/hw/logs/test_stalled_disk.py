@@ -148,9 +148,35 @@ def test_a_part_that_is_deleted_on_a_full_disk_is_closed_and_leaves_its_room(
     file = BesideFile(tmp_path / "log.mcap")
     file.write(b"123456")
     until(lambda: bool(file.waits_for))
-    (tmp_path / "log.mcap").unlink()
-    time.sleep(0.05)
-    assert not file._file.closed, "what comes may still find room"
     file.end()
+    time.sleep(0.05)
+    assert not file._file.closed, "there may still be room for it"
+    (tmp_path / "log.mcap").unlink()
     until(lambda: file._file.closed)
     assert file.unwritten == 1 and "No space" in str(file.fault)
+
+
+def test_a_log_that_is_deleted_meanwhile_takes_no_more_and_says_so(tmp_path: Path) -> None:
+    log, lines = LogWriter(tmp_path / "log.mcap", {}, beside=True), LineFile(tmp_path / "a.tum", beside=True)
+    log.blob("/a", 0, bytes(100_000))
+    lines.write("0\n")
+    log.flush()
+    until(lambda: (tmp_path / "log.mcap").stat().st_size > 100_000 and (tmp_path / "a.tum").stat().st_size > 0)
+    for path in tmp_path.iterdir():
+        path.unlink()
+    written = 0
+
+    def lost() -> bool:
+        nonlocal written
+        written += 1
+        log.blob("/a", written, bytes(100_000))  # a chunk of its own: nothing waits in memory for long
+        lines.write("1\n")
+        return bool(log.dropped and lines.lost)
+
+    until(lost)
+    log.close()
+    lines.close()
+    assert log.why == "the file was deleted while it was written"
+    assert log.why in lines.why
+    assert 1 <= log.dropped <= written + 1
+    assert list(tmp_path.iterdir()) == []
