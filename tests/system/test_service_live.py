@@ -7,6 +7,7 @@ import signal
 import socket
 import subprocess
 import sys
+import termios
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -90,6 +91,30 @@ def test_an_agent_stops_within_a_second_and_closes_its_log(serve: Serve, raw_fli
     with LogReader(path) as log:
         assert log.cut is None
         assert sum(1 for _ in log.messages((LEFT,))) >= 3
+
+
+def test_an_agent_whose_terminal_is_held_flies_on_and_stops(raw_flight: Path, tmp_path: Path) -> None:
+    """Ctrl-S holds it until Ctrl-Q; so does a pipe that nobody reads."""
+    end, terminal = os.openpty()
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "XDG_STATE_HOME": str(tmp_path)}
+    command = [sys.executable, "-m", "kiteline_cli", "agent", str(raw_flight), "--log", str(tmp_path / "logs")]
+    with subprocess.Popen(command, env=environment, stdin=subprocess.DEVNULL, stderr=terminal) as program:
+        try:
+            said = b""
+            while b"flying" not in said:
+                said += os.read(end, 4096)
+            termios.tcflow(terminal, termios.TCOOFF)
+            (path,) = (tmp_path / "logs" / "agent0").glob("boot*.live.tum")
+            deadline_s = time.monotonic() + 20.0
+            while path.read_text().count("\n") < 10:  # which lines follow: a submap is opened, a first pose is found
+                assert time.monotonic() < deadline_s
+                time.sleep(0.05)
+            assert stop_in_s(program) < STOP_S
+            assert program.returncode == 0
+        finally:
+            program.kill()
+    for one in (end, terminal):
+        os.close(one)
 
 
 @pytest.mark.usefixtures("forked")

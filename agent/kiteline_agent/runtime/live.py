@@ -60,7 +60,7 @@ def fly_live(
 
     numbers: of this agent's starts; one is taken when all else is at hand. None: the options hold them.
     """
-    with suppress(StoppedError), ExitStack() as stack:
+    with suppress(StoppedError), process.without_waiting_for_terminal(), ExitStack() as stack:
         with long_work(stop, "opening the source"):  # that of a recording without an index is read from end to end
             source = opened(options)
         stack.callback(source.close)

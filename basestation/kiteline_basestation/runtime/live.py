@@ -54,7 +54,7 @@ def fly_live(options: BaseOptions, parent: process.Parent | None, stop: process.
     if stop:
         return True
     clock, closed = MonotonicClock(), list[bool]()
-    with contextlib.ExitStack() as stack:
+    with process.without_waiting_for_terminal(), contextlib.ExitStack() as stack:
         logins = logins_of(Path(options.key)) if options.paired_only else {}
         link = open_link(options.link, "base", LinkOptions(framer=StreamFramer, required=False, logins=logins))
         stack.callback(link.close)

@@ -6,7 +6,6 @@ batches and does not delay the loop.
 
 import contextlib
 import queue
-import sys
 import threading
 from pathlib import Path
 
@@ -19,6 +18,7 @@ from kiteline_basestation.store.store import FILE, Batch, DiskError, Store, batc
 from kiteline_codec.channel import CodedChannel
 from kiteline_codec.schema.owners import submap_of
 from kiteline_core.ids import SubmapId
+from kiteline_hw.system import process
 
 WRITE_NS = 250_000_000  # ns between two batches: a crash loses at most these, and the agents send them again
 _LOOK_S = 1.0  # s between two looks at the file while nothing is to be written
@@ -150,9 +150,7 @@ class Keeper:
 
 
 def _say(line: str) -> None:
-    """Print a line; a terminal or a file that takes none does not stop the base."""
-    with contextlib.suppress(OSError):
-        print(line, file=sys.stderr, flush=True)
+    process.print_lines([line])
 
 
 def snapshot(station: Station, before: SavedMap) -> SavedMap:

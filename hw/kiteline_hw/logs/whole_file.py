@@ -102,8 +102,8 @@ class BesideFile:
 
     @property
     def waits_for(self) -> str:
-        """Why the disk takes nothing at present; "" if it does, or may be about to."""
-        is_late = self._fault is not None or 2 * self._bytes > self._most_bytes
+        """Why the disk takes nothing at present; "" if it does, or may be about to, or the file was deleted."""
+        is_late = self._most_bytes and (self._fault is not None or 2 * self._bytes > self._most_bytes)
         return str(self.fault.strerror) if is_late else ""
 
     def write(self, data: bytes) -> int:
@@ -153,7 +153,7 @@ class BesideFile:
             except OSError as error:
                 self._fault = error.errno or 0, error.strerror or str(error)
                 if self._file.deleted:  # it gives room only once it is closed
-                    self._most_bytes = 0
+                    self._most_bytes = 0  # nothing waits for it any more
                     break
                 if self._closing.is_set():
                     break

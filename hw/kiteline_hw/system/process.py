@@ -10,6 +10,7 @@ import socket
 import sys
 import threading
 import weakref
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from types import FrameType
@@ -19,6 +20,8 @@ from kiteline_core.errors import KitelineError
 
 _LLVM = f"{os.sep}llvmlite{os.sep}"  # in the paths of frames that hold native objects
 _PATIENCE_S = 1.5  # s until a user is told what is waited for
+_MOST_LINES = 200  # lines that wait for a terminal: half an hour of them
+_LAST_LINES_S = 0.5  # s that a terminal may take for the last ones
 _AGAIN_S = 0.01  # s until a handler that could not raise is called again
 
 
@@ -95,7 +98,7 @@ def exit_now(status: int) -> NoReturn:
     The interpreter's own shutdown is skipped: it would cancel threads of native libraries such as Zenoh in mid-call,
     which sometimes aborts the process.
     """
-    for stream in (sys.stdout, sys.stderr):
+    for stream in (sys.stdout, sys.stderr) if _writer is None else (sys.stdout,):
         with contextlib.suppress(OSError, ValueError):  # a file on a full disk, a closed pipe
             stream.flush()
     os._exit(status)
@@ -197,8 +200,63 @@ def home_path(text: str) -> Path:
         return Path(text)
 
 
+class _LineWriter:
+    """Prints lines on stderr in a thread: a terminal that is held (Ctrl-S), or a pipe that nobody reads, lets a write
+    wait without end. The newest lines wait in memory.
+    """
+
+    def __init__(self) -> None:
+        self._lines = deque[str](maxlen=_MOST_LINES)
+        self._ended = False
+        self._wake = threading.Condition()
+        self._thread = threading.Thread(target=self._run, name="kiteline-terminal", daemon=True)
+        self._thread.start()
+
+    def put(self, lines: Iterable[str]) -> None:
+        """Have lines printed. Never blocks."""
+        with self._wake:
+            self._lines.extend(lines)
+            self._wake.notify()
+
+    def end(self) -> bool:
+        """Wait a moment for the last lines; False if the terminal does not take them."""
+        with self._wake:
+            self._ended = True
+            self._wake.notify()
+        self._thread.join(_LAST_LINES_S)
+        return not self._thread.is_alive()
+
+    def _run(self) -> None:
+        while True:
+            with self._wake:
+                self._wake.wait_for(lambda: self._lines or self._ended)
+                if not self._lines:
+                    return
+                line = self._lines.popleft()
+            with contextlib.suppress(OSError, ValueError):
+                print(line, file=sys.stderr, flush=True)
+
+
+_writer: _LineWriter | None = None  # of `print_lines`, where it waits for no terminal
+
+
+@contextlib.contextmanager
+def without_waiting_for_terminal() -> Iterator[None]:
+    """Let `print_lines` not wait: for a loop that flies. A terminal that is held at the end is not awaited later."""
+    global _writer
+    writer = _writer = _LineWriter()
+    try:
+        yield
+    finally:
+        if writer.end():
+            _writer = None
+
+
 def print_lines(lines: Iterable[str]) -> None:
     """Print lines on stderr; a closed terminal does not stop the flight."""
+    if _writer is not None:
+        _writer.put(lines)
+        return
     with contextlib.suppress(OSError):
         for line in lines:
             print(line, file=sys.stderr, flush=True)

@@ -174,6 +174,7 @@ def test_a_log_that_is_deleted_meanwhile_takes_no_more_and_says_so(tmp_path: Pat
         return bool(log.dropped and lines.lost)
 
     until(lost)
+    assert not log.waits_for
     log.close()
     lines.close()
     assert log.why == "the file was deleted while it was written"

@@ -1,10 +1,13 @@
 """Processes: signals, children, memory and notices."""
 
+import contextlib
 import os
 import signal
 import socket
 import subprocess
 import sys
+import termios
+import time
 from pathlib import Path
 
 import pytest
@@ -221,3 +224,51 @@ def test_a_line_that_a_thread_adds_while_lines_are_taken_is_not_lost() -> None:
     add("rig: the disk is full")
     assert notices.take() == ["rig: the disk is full"]
     assert notices.take() == []
+
+
+def test_a_loop_waits_for_no_terminal_that_takes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(process, "_writer", None)
+    monkeypatch.setattr(process, "_LAST_LINES_S", 0.1)
+    end, terminal = os.pipe()
+    os.set_blocking(terminal, False)
+    with contextlib.suppress(BlockingIOError):
+        while True:
+            os.write(terminal, b"." * 4096)
+    os.set_blocking(terminal, True)
+    with open(terminal, "w") as held, open(end, "rb") as reader:
+        monkeypatch.setattr(sys, "stderr", held)
+        begin_s = time.monotonic()
+        with process.without_waiting_for_terminal():
+            for n in range(10_000):
+                process.print_lines([f"line {n}"])
+        process.print_lines(["last"])
+        assert time.monotonic() - begin_s < 2.0
+        said = b""
+        while not said.endswith(b"last\n"):
+            said += reader.read1(1 << 16)
+    lines = said.lstrip(b".").decode().splitlines()
+    assert lines[-200:] == [*(f"line {n}" for n in range(9801, 10_000)), "last"]
+    assert len(lines) <= 201  # one was under way
+
+
+def test_lines_are_printed_in_order_where_the_terminal_takes_them(capsys: pytest.CaptureFixture[str]) -> None:
+    with process.without_waiting_for_terminal():
+        process.print_lines(["a", "b"])
+        process.print_lines(["c"])
+    process.print_lines(["d"])
+    assert capsys.readouterr().err == "a\nb\nc\nd\n"
+
+
+def test_a_process_whose_terminal_takes_nothing_ends(tmp_path: Path) -> None:
+    end, terminal = os.openpty()
+    termios.tcflow(terminal, termios.TCOOFF)  # as Ctrl-S does
+    code = "with process.without_waiting_for_terminal(): process.print_lines(['a line'] * 3)\nprocess.exit_now(3)"
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    command = [sys.executable, "-c", "from kiteline_hw.system import process\n" + code]
+    with subprocess.Popen(command, env=environment, stderr=terminal) as program:
+        try:
+            assert program.wait(20.0) == 3
+        finally:
+            program.kill()
+    for one in (end, terminal):
+        os.close(one)
