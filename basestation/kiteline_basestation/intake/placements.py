@@ -105,13 +105,14 @@ class SubmapPlacements:
     def place_new(self, keyframe: KeyframeId) -> None:
         """Place the submap of a new keyframe: the first of all at w, a later one where the last one was left.
 
-        One in metres begins a new w if all placed ones are of its agent and in units of their own, to which nothing
-        ties it: those would keep grid and poses out of w for the rest of the flight. They return by a merge.
+        It begins a new w if nothing tells how it lies to the placed ones, which are its agent's, and they would keep
+        grid and poses out of w for the rest of the flight: it is in metres and they are not, or they are of a keyframe
+        each, by which no place is recognised. Those return by a merge.
         """
         submap = submap_of_keyframe(keyframe)
         if submap in self.S_w_m or self._place_by_tie(submap):
             return
-        if self._is_apart_in_metres(submap, keyframe):
+        if self._has_to_begin_anew(submap, keyframe):
             self._withdraw(list(self.S_w_m))
         if self.S_w_m:
             self._place_by_odometry(submap)
@@ -147,16 +148,23 @@ class SubmapPlacements:
         T_w_c = sim3.place(S_w_before, T_before_k @ live.T_k_c)
         return self._place(submap, sim3.normalise(sim3.of(scale, T_w_c) @ se3.inverse(T_m_first)))
 
-    def _is_apart_in_metres(self, submap: SubmapId, keyframe: KeyframeId) -> bool:
-        """True if nothing tells how a submap in metres lies to the placed ones, which are its agent's and not."""
+    def _has_to_begin_anew(self, submap: SubmapId, keyframe: KeyframeId) -> bool:
+        """True if nothing tells how a submap lies to the placed ones, which are its agent's, and nothing will."""
         tie = self._intake.loss_ties.get(submap)
         tied = tie is not None and submap_of_keyframe(tie.since) in self.S_w_m
-        if submap not in self._map.metric_submaps or tied or self._in_metres:
+        first_in_metres = submap in self._map.metric_submaps and not self._in_metres
+        if tied or not (first_in_metres or self._places_single_keyframes(submap)):
             return False
         stamps = self._map.keyframes.t_ns[[self._map.rows[k] for k in (self._map.submaps[submap][0], keyframe)]]
         if stamps[1] - stamps[0] < _LATE_TIE_S * 1e9:
             return False
         return {agent_of_submap(placed) for placed in self.S_w_m} == {agent_of_submap(submap)}
+
+    def _places_single_keyframes(self, submap: SubmapId) -> bool:
+        """True if each placed submap is a keyframe alone, as of a start that was broken off, and in no better unit."""
+        if self._in_metres and self._map.is_up_to_scale(submap):
+            return False
+        return all(self._map.submaps_of_map(s) == [s] and len(self._map.submaps[s]) == 1 for s in self.S_w_m)
 
     def tell_rooted(self) -> None:
         """Publish the poses that were chosen for keyframes at which submaps begin without their first ones."""

@@ -1,4 +1,4 @@
-"""Where submaps lie in the world, when a map in metres follows one in another unit."""
+"""Where submaps lie in the world, when one follows that will never be recognised in those before."""
 
 from collections.abc import Callable
 from typing import Any
@@ -39,3 +39,20 @@ def test_a_map_in_metres_begins_a_new_world_where_nothing_ties_it_to_one_in_anot
                 assert list(mapper.placements) == [own_submap]  # a tie may come late
     assert list(mapper.placements) == [own_submap if agent else submap]
     assert withdrawn == ([] if agent else [own_submap])
+
+
+@pytest.mark.parametrize("keyframes", [1, 2])
+@pytest.mark.parametrize("by", ["the same agent", "another agent"])
+def test_a_start_that_was_broken_off_after_one_keyframe_does_not_keep_the_next_out_of_the_world(
+    make_flight: MakeFlight, by: str, keyframes: int
+) -> None:
+    """No merge accepts matches with a keyframe alone, so that no later flight would ever have a place."""
+    agent = int(by == "another agent")
+    broken_off = make_flight(keyframes=keyframes, turns=0.02 * keyframes)
+    later = make_flight(agent=agent, keyframes=10, turns=0.18, boot=2)
+    first, submap = (submap_of_keyframe(f.keyframes[0]) for f in (broken_off, later))
+    mapper = Mapper(WITHOUT_GRID)
+    for flight in (broken_off, later):
+        for n, batch in enumerate([[CameraIntrinsics(flight.agent, flight.camera)], *flight.records, []]):
+            mapper.step(MapperInput(((flight.agent, tuple(batch)),)), n * STEP_NS)
+    assert list(mapper.placements) == [submap if keyframes == 1 and not agent else first]
