@@ -12,6 +12,7 @@ import signal
 import struct
 import subprocess
 import sys
+import time
 from concurrent.futures import Future
 
 import numpy as np
@@ -22,11 +23,16 @@ from kiteline_hw.sensors.images import encode_image, store_image
 
 _REQUEST, _ANSWER = struct.Struct("<III"), struct.Struct("<II")
 END_S = 2.0  # s in which the process ends once its input has
+_START_S = 20.0  # s that it may take to load
+_SILENCE_S = 10.0  # s without an image after which it counts as hung, or stopped: one takes some milliseconds
 _HEADROOM = 4096  # bytes by which a stored PNG exceeds its pixels and rows
 
 
 class EncoderProcess:
-    """A queue of images at another process. Not for several threads. What a process that ended left is stored plain."""
+    """A queue of images at another process. Not for several threads.
+
+    What a process leaves that ends, or does not go on, is stored plain.
+    """
 
     def __init__(self, shape: tuple[int, int], slots: int) -> None:
         """shape: height and width of the largest image. Raises OSError where no process can be started."""
@@ -48,6 +54,8 @@ class EncoderProcess:
         self._free = list(range(slots))
         self._sent: dict[int, tuple[Future[EncodedImage], tuple[int, int]]] = {}
         self._answers = b""
+        self._silence_s = _SILENCE_S
+        self._heard_s = time.monotonic() + _START_S  # when it last was idle, or answered
         self.alive = True
 
     def submit(self, pixels: U8) -> Future[EncodedImage] | None:
@@ -58,6 +66,8 @@ class EncoderProcess:
         if not self.alive or not self._free or 2 * (h * (w + 2) + _HEADROOM) > self._slot_bytes:
             return None
         slot = self._free.pop()
+        if not self._sent:
+            self._heard_s = max(self._heard_s, time.monotonic())
         begin = slot * self._slot_bytes
         np.frombuffer(self._memory, np.uint8, h * w, begin).reshape(h, w)[:] = pixels
         done: Future[EncodedImage] = Future()
@@ -75,12 +85,15 @@ class EncoderProcess:
         try:
             data = os.read(self._from, 4096)
         except BlockingIOError:
+            if time.monotonic() - self._heard_s > self._silence_s:
+                self._give_up()
             return
         except OSError:
             data = b""
         if not data:
             self._give_up()
             return
+        self._heard_s = time.monotonic()
         self._answers += data
         whole = len(self._answers) // _ANSWER.size * _ANSWER.size
         for slot, length in _ANSWER.iter_unpack(self._answers[:whole]):
@@ -96,8 +109,13 @@ class EncoderProcess:
             select.select([self._from], [], [], 1.0)
             self.poll()
 
+    def hurry(self) -> None:
+        """No image follows: what is left may take no longer than END_S."""
+        self._silence_s, self._heard_s = END_S, min(self._heard_s, time.monotonic())
+
     def _give_up(self) -> None:
-        """The process has ended: encode here what it left behind."""
+        """The process has ended, or does not go on: store here what it left behind."""
+        self._process.kill()  # else it might write there meanwhile
         self.alive = False
         sent, self._sent = self._sent, {}
         for slot, (done, (h, w)) in sent.items():

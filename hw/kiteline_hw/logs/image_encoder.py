@@ -126,6 +126,8 @@ class ImageEncoder:
 
     def close(self) -> None:
         """Write everything, and end thread and process."""
+        if self._process is not None:
+            self._process.hurry()
         self.drain()
         if self._process is not None:
             self._process.close()

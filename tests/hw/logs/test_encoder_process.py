@@ -113,3 +113,31 @@ def test_a_pair_costs_this_process_little(tmp_path: Path) -> None:
     # Of the cheaper ones: what else runs on the machine only adds.
     raw_ms, encoded_ms, encoding_ms, copy_ms = (np.percentile(spent[5:], 25) / 1e6 for _, spent in tried)
     assert raw_ms - encoded_ms < 0.1 * encoding_ms + copy_ms
+
+
+@pytest.mark.parametrize("silence_s", [0.3, 60.0])
+def test_a_log_is_whole_and_ends_where_the_process_does_not_go_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, silence_s: float
+) -> None:
+    """Nothing was written after the image that it had, all of it waited in memory, and the log did not end."""
+    monkeypatch.setattr(encoder_process, "_SILENCE_S", silence_s)
+    monkeypatch.setattr(encoder_process, "END_S", 0.5)
+    encoder = ImageEncoder(EncodingPolicy(most_waiting=6))
+    encoder.stores = encoder.apart = True
+    log = LogWriter(tmp_path / "log.mcap", {}, encoder=encoder)
+    log.frame(Frame(0, picture(0), picture(100)))
+    log.flush()
+    os.kill(encoder._process._process.pid, signal.SIGSTOP)
+    begin_s = time.monotonic()
+    for k in range(1, 30):
+        log.frame(Frame(k, picture(k), picture(100 + k)))
+        time.sleep(0.03)
+    log.blob("/packets", 30, b"last")
+    assert encoder._process.alive == (silence_s == 60.0)  # with 60 s, it is found at the end
+    log.close()
+    assert time.monotonic() - begin_s < 5.0
+    with LogReader(tmp_path / "log.mcap") as read:
+        images = [(m.t_ns, decode_grey(m.image())[0]) for m in read.messages((LEFT,))]
+        assert [m.blob() for m in read.messages(("/packets",))] == [b"last"]
+    assert [t_ns for t_ns, _ in images] == list(range(30))
+    assert all(np.array_equal(pixels, picture(t_ns)) for t_ns, pixels in images)
