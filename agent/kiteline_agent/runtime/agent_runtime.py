@@ -213,14 +213,16 @@ class AgentRuntime:
         """True after the last frame of a recording; a camera has none."""
         return self.camera is None and self.next_ns is None
 
-    def drop_stale(self, flight_ns: int) -> bool:
-        """Drop frames until the next one is the newest at a flight time. False if none is left."""
+    def drop_stale(self, flight_ns: int, in_time: Callable[[], bool]) -> bool:
+        """Drop frames until the next one is the newest at a flight time, or none is left. False if it took too long."""
         if self.camera is not None:
             return True  # a camera itself drops what newer frames replaced
         while self.next_ns is not None and 0 < self.reader.period_ns <= flight_ns - self.next_ns:
+            if not in_time():
+                return False
             self.reader.drop()
             self.counts.dropped += 1
-        return self.next_ns is not None
+        return True
 
     def end_of_frames(self) -> None:
         """The last frame was flown: what follows is draining, which is reported apart."""

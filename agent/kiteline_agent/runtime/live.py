@@ -45,6 +45,7 @@ from kiteline_hw.system.long_work import StoppedError, long_work, starting
 from kiteline_hw.system.start_numbers import Start, StartNumbers
 
 _Batch = TypeVar("_Batch", ImuBatch, OdometryBatch)
+_CATCH_UP_NS = 50_000_000  # ns between two steps while late frames are read and dropped, more slowly than they come
 _IDLE_TICK_S = 0.05  # s between two steps while no frame is due: keeps acknowledgements and heartbeats moving
 _DRAIN_S = 10.0  # s that a live flight waits at its end for the link to become quiet
 _DRAIN_TOLD_S = 1.5  # s of that wait after which the user is told of it: over a fast link it is over by then
@@ -142,6 +143,7 @@ class _LiveFlight:
         self._predictions, self._obstacles = (
             PoseSchedule(own_hz or obstacles_hz, begin_ns), PoseSchedule(obstacles_hz, begin_ns)
         )  # fmt: skip
+        self._newest_ns: int | None = None  # flight time of the newest frame, while those before it are dropped
         self._shift_ns = runtime.options.start_ns - begin_ns  # from the clock to the stamps of frames
 
     def fly(self) -> None:
@@ -212,7 +214,13 @@ class _LiveFlight:
         """What is due: a frame, a pose between frames, or nothing but packets; None at the end of the source."""
         runtime, controller = self._runtime, self._controller
         if runtime.next_ns is not None and now_ns >= self._begin_ns + runtime.next_ns:
-            if not runtime.drop_stale(now_ns - self._begin_ns):
+            if self._newest_ns is None:
+                self._newest_ns = now_ns - self._begin_ns
+            until_ns = now_ns + _CATCH_UP_NS
+            if not runtime.drop_stale(self._newest_ns, lambda: self._clock.now_ns() < until_ns):
+                return _Due(now_ns, StepInput())
+            self._newest_ns = None
+            if runtime.over:
                 return None
             captured_ns = self._begin_ns + runtime.next_ns
             frame, imu, odometry = runtime.reader.take()
