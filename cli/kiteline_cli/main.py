@@ -128,8 +128,6 @@ def main(argv: Sequence[str]) -> int:
 
 def _flush_output() -> None:
     """Write out what was printed. Raises OSError; what could not be written is then forgotten."""
-    if sys.stdout is None:  # as it is where the caller has closed it
-        return
     try:
         sys.stdout.flush()
     except OSError:
@@ -228,8 +226,9 @@ def run() -> None:
     """The command line of this process."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, _on_signal)
-    if sys.stderr is None:  # closed by the caller: notes and progress are for nobody
-        sys.stderr = os.fdopen(os.open(os.devnull, os.O_WRONLY), "w")
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:  # closed by the caller; a log or a socket would take its number
+            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_RDWR), mode))
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # a terminal in ASCII, a file name in another encoding
             with contextlib.suppress(OSError):  # of a stream that has its place in a file no more

@@ -235,3 +235,10 @@ def test_errors_that_are_closed_are_no_fault() -> None:
         ["sh", "-c", '"$0" -c "$1" 2>&-', sys.executable, code], capture_output=True, check=False, timeout=60
     )
     assert (done.returncode, done.stdout) == (0, b"")
+
+
+def test_no_file_takes_the_number_of_a_stream_that_is_closed() -> None:
+    """A live base had sockets and pipes where libraries print, and ended with status 1 as it had no output."""
+    text = "    from kiteline_hw.system import process\n    process.exit_now(open('/dev/null').fileno())"
+    command = ["sh", "-c", '"$0" -c "$1" <&- >&- 2>&-', sys.executable, STAND_IN.format(text=text)]
+    assert subprocess.run(command, check=False, timeout=60).returncode > 2
