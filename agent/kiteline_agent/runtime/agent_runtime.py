@@ -37,6 +37,7 @@ from kiteline_hw.lockstep.messages import Down, Phase, Up
 from kiteline_hw.lockstep.shared_core import CoreProcess
 from kiteline_hw.logs.image_encoder import EncodingPolicy, ImageEncoder
 from kiteline_hw.logs.log_budget import LogBudget
+from kiteline_hw.logs.machine import MACHINE, machine
 from kiteline_hw.logs.mcap_log import LogWriter
 from kiteline_hw.logs.spill_file import SpillFile
 from kiteline_hw.logs.whole_file import LineFile
@@ -131,7 +132,7 @@ class AgentRuntime:
         """Begin log and trajectories; None where a vehicle flies without, as its disk takes none."""
         options, source = self.options, self.source
         folder = Path(options.folder)
-        about = metadata(options, source.name, config, self.channel)
+        about = {**metadata(options, source.name, config, self.channel), MACHINE: machine()}
         budget = LogBudget(folder, LOG_STEM, options.log_mib << 20) if options.log_mib > 0 else None
         try:
             folder.mkdir(parents=True, exist_ok=True)

@@ -34,6 +34,7 @@ from kiteline_hw.links.kinds import link_traits
 from kiteline_hw.lockstep.messages import Down, Phase, Up
 from kiteline_hw.lockstep.shared_core import SharedCore
 from kiteline_hw.logs.log_budget import LogBudget
+from kiteline_hw.logs.machine import MACHINE, machine
 from kiteline_hw.logs.mcap_log import LogWriter
 from kiteline_hw.ports import SourceError
 from kiteline_hw.sim.links.link_model import LinkModelConfig, LinkModels, link_seed
@@ -105,7 +106,7 @@ class BaseRuntime:
         self._folder = Path(options.folder)
         self._notices = Notices()
         self._budget: LogBudget | None = None
-        self._log = self._open_log(metadata_of(options, self.config, plain_channels=plain))
+        self._log = self._open_log({**metadata_of(options, self.config, plain_channels=plain), MACHINE: machine()})
         disorder = LinkModelConfig(
             loss=options.loss, duplicate=options.disorder, reorder=options.disorder,
             delay_ns=round(options.delay_s * 1e9),

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import cv2
 
+from kiteline_hw.logs.machine import machine
 from kiteline_lab.references.comparison import TOLERANCE, differences
 from kiteline_lab.references.flights import FOLDER, KeptFlight, by_name, make_logs
-from kiteline_lab.references.machine import machine
 from kiteline_lab.references.observation import Observation, from_text, to_text
 from kiteline_lab.references.replays import replay
 

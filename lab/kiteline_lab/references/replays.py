@@ -18,6 +18,7 @@ from kiteline_core.frame import Trajectory
 from kiteline_core.geometry import se3
 from kiteline_core.ids import AgentId
 from kiteline_hw.links.kinds import link_traits
+from kiteline_hw.logs.machine import machine
 from kiteline_hw.logs.mcap_log import RIG, LogReader
 from kiteline_hw.logs.rig_json import rig_from_json
 from kiteline_hw.sources.open import open_source
@@ -25,7 +26,6 @@ from kiteline_lab.evaluation import metrics
 from kiteline_lab.evaluation.metrics import TrajectoryAlignment
 from kiteline_lab.references import kept_log
 from kiteline_lab.references.flights import KeptFlight, agent_log_of, base_log_of
-from kiteline_lab.references.machine import machine
 from kiteline_lab.references.observation import Half, Observation, Row, add_digests, digest
 from kiteline_lab.replay.logged_steps import Step, agent_input, agent_of_log, check_replayable, steps
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import numpy as np
 
 from kiteline_agent.onboard import OnboardAgent
 from kiteline_agent.runtime import flight_log as agent_log
@@ -23,10 +24,12 @@ from kiteline_basestation.station import Station
 from kiteline_basestation.store.restore import restore
 from kiteline_basestation.store.saved_map import unpack
 from kiteline_core.arguments import limit
+from kiteline_core.geometry import se3
 from kiteline_core.ids import AgentId
 from kiteline_core.wording import counted
 from kiteline_hw.links.kinds import link_traits
 from kiteline_hw.logs.log_parts import WholeLog
+from kiteline_hw.logs.machine import MACHINE, apart, machine
 from kiteline_hw.logs.mcap_log import LogReader
 from kiteline_hw.ports import SourceError
 from kiteline_hw.system import kernel_cache, process
@@ -37,10 +40,15 @@ from kiteline_lab.replay.logged_steps import Step, agent_input, agent_of_log, ch
 
 @dataclass(slots=True)
 class ReplayResult:
-    """Outcome of a replay. difference: the first one in words, None without any. station: the base at the end."""
+    """Outcome of a replay. difference: the first one in words, None without any. station: the base at the end.
+
+    apart_m, apart_rad: largest distances between odometry poses and the logged ones.
+    """
 
     steps: int = 0
     difference: str | None = None
+    apart_m: float = 0.0
+    apart_rad: float = 0.0
     counts: FrameCounts = field(default_factory=FrameCounts)
     live: list[str] = field(default_factory=list)
     odometry: list[str] = field(default_factory=list)
@@ -60,6 +68,10 @@ class ReplayResult:
             wrong = [key for key in logged[0].keys() | made.keys() if logged[0].get(key) != made.get(key)]
             if wrong:
                 self.note_difference(step, f"the {name} has another {', '.join(sorted(wrong))}")
+            if "T_o_b" in wrong and {len(pose["T_o_b"]) for pose in (logged[0], made)} == {16}:
+                was, now = (np.reshape(pose["T_o_b"], (4, 4)) for pose in (logged[0], made))
+                shift_m, turn_rad = se3.shift_and_turn(se3.inverse(was) @ now)
+                self.apart_m, self.apart_rad = max(self.apart_m, shift_m), max(self.apart_rad, turn_rad)
 
     def compare_packets(self, step: Step, topic: str, sent: tuple[bytes, ...]) -> None:
         """Note a difference between packets and the logged ones."""
@@ -188,8 +200,11 @@ def main(argv: list[str]) -> int:
         kernel_cache.fill((*AGENT_WARMING, *BASE_WARMING))
         agent_warm()
         base_warm()
+        made_on = log.metadata.get(MACHINE, machine())
+        elsewhere = made_on != machine()
         with Progress("replaying", log.topics.get(agent_log.STEP), "steps") as progress:
-            done = (replay_agent if is_agent else replay_base)(log, progress, stop_at_first=a.verify)
+            stop = a.verify and not elsewhere
+            done = (replay_agent if is_agent else replay_base)(log, progress, stop_at_first=stop)
         cut = log.cut
     if a.out is not None and is_agent:
         write_whole(a.out / "live.tum", "".join(done.live).encode())
@@ -198,7 +213,18 @@ def main(argv: list[str]) -> int:
         print(f"the log was {cut}; what stands before was replayed")
     if done.difference is not None:
         print(f"differs: {done.difference}")
+        if elsewhere:
+            print(_of_another_machine(made_on, done if is_agent else None))
         return 1 if a.verify else 0
     frames = f", {counted(done.counts.frames, 'frame')}" if is_agent else ""
     print(f"{counted(done.steps, 'step')}{frames}: every output as in the log")
     return 0
+
+
+def _of_another_machine(made_on: str, agent: ReplayResult | None) -> str:
+    """Why outputs differ that were made elsewhere, and by how much an agent's do."""
+    there, here = apart(made_on, machine())
+    text = f"last digits do, as the log was made with {there}, and this is {here}"
+    if agent is None:
+        return text
+    return f"{text}; odometry is up to {1e3 * agent.apart_m:.1f} mm and {np.degrees(agent.apart_rad):.2f}° apart"

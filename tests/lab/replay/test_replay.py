@@ -4,6 +4,7 @@ import errno
 import shutil
 import struct
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,8 +20,8 @@ from kiteline_hw.ports import SourceError
 from kiteline_hw.sources.open import open_source
 from kiteline_lab.flights.fly import fly
 from kiteline_lab.flights.plan import Options
-from kiteline_lab.replay.logged_steps import check_replayable
-from kiteline_lab.replay.replay import main, replay_agent
+from kiteline_lab.replay.logged_steps import Step, check_replayable
+from kiteline_lab.replay.replay import ReplayResult, main, replay_agent
 from kiteline_lab.tools import logs
 from tests.wall import PERIOD_S, STEP_M
 
@@ -33,14 +34,14 @@ def flown(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def rewritten(log: Path, to: Path, topic: str, number: int, change: bytes) -> Path:
-    """A copy of a log in which the last bytes of one message are others."""
+def rewritten(log: Path, to: Path, topic: str, number: int, change: bytes, about: dict[str, str] | None = None) -> Path:
+    """A copy of a log in which the last bytes of one message are others, and so are these of its metadata."""
     source = McapFile(log)
     with to.open("wb") as stream:
         writer = Writer(stream, compression=CompressionType.NONE)
         writer.start("", "test")
         for record in source.metadata:
-            writer.add_metadata(record.name, record.metadata)
+            writer.add_metadata(record.name, {**record.metadata, **(about or {})})
         schemas = {k: writer.register_schema(s.name, s.encoding, s.data) for k, s in sorted(source.schemas.items())}
         channels = {
             k: writer.register_channel(c.topic, c.message_encoding, schemas[c.schema_id], c.metadata)
@@ -138,6 +139,33 @@ def test_another_estimate_in_the_log_is_found(flown: Path, tmp_path: Path, capsy
     log = rewritten(flown / "agent0" / "log.mcap", tmp_path / "log.mcap", "/estimate", 4, struct.pack("<d", 9.0))
     assert main([str(log), "--verify"]) == 1
     assert "T_w_b" in capsys.readouterr().out
+
+
+def test_a_log_of_another_machine_is_told_and_replayed_to_its_end(
+    flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A drone's log at a desk: `differs: step 1` alone seems to say that the replay is broken."""
+    with LogReader(flown / "agent0" / "log.mcap") as reader:
+        here, steps = reader.metadata["machine"], reader.topics["/step"]
+    there = here.replace(here.partition(";")[0], "sparc64", 1)
+    log = rewritten(
+        flown / "agent0" / "log.mcap", tmp_path / "log.mcap", "/estimate", 4, b"!", {"machine": there}
+    )  # fmt: skip
+    assert main([str(log), "--verify"]) == 1
+    told = capsys.readouterr().out
+    assert "the log was made with sparc64, and this is" in told and "odometry is up to 0.0 mm" in told
+    with LogReader(log) as reader:
+        assert replay_agent(reader, stop_at_first=False).steps == steps
+
+
+def test_how_far_poses_are_apart() -> None:
+    there, here = np.eye(4), np.eye(4)
+    here[:3, 3] = 0.03, 0.0, 0.04
+    result, logged = ReplayResult(), {"T_o_b": there.ravel().tolist()}
+    step = Step(1, {"now_ns": 0}, {"/estimate": [SimpleNamespace(json=lambda: logged)]})
+    result.compare_pose(step, "/estimate", "estimate", {"T_o_b": here.ravel().tolist()})
+    assert result.apart_m == pytest.approx(0.05) and result.apart_rad == 0.0
+    assert result.difference is not None and "T_o_b" in result.difference
 
 
 def test_a_base_that_heard_something_else_answers_otherwise(

@@ -1,4 +1,4 @@
-"""What numbers depend on beside the code: library versions, and the CPU kernels that libraries choose."""
+"""What the numbers in a log depend on beside the code: library versions, and the CPU kernels that libraries choose."""
 
 import ctypes
 import hashlib
@@ -13,15 +13,26 @@ import numpy as np
 
 from kiteline_hw.system.kernel_cache import compiled_for
 
+MACHINE = "machine"  # its name in the metadata of a log
+
 _LIBRARIES = ("numpy", "numba", "opencv-python-headless", "gtsam")
 
 
 @cache
 def machine() -> str:
-    """Processor type, versions, the kernels of OpenBLAS, numpy and OpenCV, and numba's CPU, as one line."""
+    """Processor type, versions, the kernels of OpenBLAS, numpy and OpenCV, and numba's CPU, as one line.
+
+    Where it is the same, a replay computes the same bits.
+    """
     versions = [f"{name} {_version(name)}" for name in _LIBRARIES]
     kernels = f"OpenBLAS for {_blas_core()}", f"numpy for {_numpy_features()}", f"OpenCV for {_opencv_features()}"
     return "; ".join((platform.machine(), *versions, *kernels, f"numba for {_numba_cpu()}"))
+
+
+def apart(one: str, other: str) -> tuple[str, str]:
+    """The parts in which two machines differ, of each."""
+    a, b = (text.split("; ") for text in (one, other))
+    return "; ".join(part for part in a if part not in b), "; ".join(part for part in b if part not in a)
 
 
 def _version(name: str) -> str:
