@@ -1,15 +1,17 @@
 """Arrays by the type of their elements, for annotations; shapes are told in docstrings."""
 
-import numpy as np
-from numpy.typing import NDArray
+from typing import Any
 
-F64 = NDArray[np.float64]
-F32 = NDArray[np.float32]
-I64 = NDArray[np.int64]
-I32 = NDArray[np.int32]
-I16 = NDArray[np.int16]
-I8 = NDArray[np.int8]
-U64 = NDArray[np.uint64]
-U16 = NDArray[np.uint16]
-U8 = NDArray[np.uint8]
-Bool = NDArray[np.bool_]
+import numpy as np
+
+# Not NDArray: what it is differs between versions of numpy, and the store reads annotations to read its values back.
+F64 = np.ndarray[tuple[Any, ...], np.dtype[np.float64]]
+F32 = np.ndarray[tuple[Any, ...], np.dtype[np.float32]]
+I64 = np.ndarray[tuple[Any, ...], np.dtype[np.int64]]
+I32 = np.ndarray[tuple[Any, ...], np.dtype[np.int32]]
+I16 = np.ndarray[tuple[Any, ...], np.dtype[np.int16]]
+I8 = np.ndarray[tuple[Any, ...], np.dtype[np.int8]]
+U64 = np.ndarray[tuple[Any, ...], np.dtype[np.uint64]]
+U16 = np.ndarray[tuple[Any, ...], np.dtype[np.uint16]]
+U8 = np.ndarray[tuple[Any, ...], np.dtype[np.uint8]]
+Bool = np.ndarray[tuple[Any, ...], np.dtype[np.bool_]]
