@@ -1,6 +1,6 @@
 """Jobs: long work done outside the state machine, by a worker process or in modelled time."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +12,17 @@ class Job:
     id: int
     kind: str
     inputs: Any
+
+
+class JobIds(Iterator[int]):
+    """The numbers of jobs from 1 on, each once. Of a base that is copied they can be, which iterators cannot."""
+
+    def __init__(self) -> None:
+        self._last = 0
+
+    def __next__(self) -> int:
+        self._last += 1
+        return self._last
 
 
 @dataclass(frozen=True, slots=True)

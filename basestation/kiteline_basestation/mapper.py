@@ -3,7 +3,6 @@
 Method: "DS-PTAM: a distributed stereo PTAM", the mapper of chapter 3, with the culling of ORB-SLAM2.
 """
 
-import itertools
 import math
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Sequence
@@ -21,7 +20,7 @@ from kiteline_basestation.grid.scan_job import SCAN
 from kiteline_basestation.intake.confirmation import is_confirmed
 from kiteline_basestation.intake.intake import Intake
 from kiteline_basestation.intake.placements import SubmapPlacements
-from kiteline_basestation.jobs import Job, JobDone
+from kiteline_basestation.jobs import Job, JobDone, JobIds
 from kiteline_basestation.management import Answer, Command, MapManager
 from kiteline_basestation.map.map_tables import CULLED, LANDMARK
 from kiteline_basestation.map.sparse_map import SparseMap
@@ -85,7 +84,7 @@ class Mapper:
         self._confirmed: Counter[AgentId] = Counter()  # keyframes since `take_confirmed`
         self.cpu_ns: Callable[[], int] = lambda: 0  # clock of `grid_ns`, which no output depends on
         self.grid_ns: deque[int] = deque(maxlen=_TIMED_UPDATES)  # time of the updates of the grid
-        job_ids = itertools.count(1)
+        job_ids = JobIds()
         self._intake = Intake(self.config.intake, self.map)
         self._publisher = Publisher(self.map, self.config.publish)
         self._placements = SubmapPlacements(self.map, self._intake, self._publisher)

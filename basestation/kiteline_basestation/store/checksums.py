@@ -73,11 +73,11 @@ def check_tables(db: sqlite3.Connection, path: Path) -> None:
         raise StoreError(
             f"{path}: {what}, expected version {VERSION}; begin an empty store and import logs of this version"
         )
-    made = sqlite3.connect(":memory:", isolation_level=None)
-    make_tables(made)
-    if found != _schema(made):
+    with contextlib.closing(sqlite3.connect(":memory:", isolation_level=None)) as made:
+        make_tables(made)
+        expected = _schema(made)
+    if found != expected:
         raise StoreError(f"{path}: other tables than a store has: damaged, or changed by someone; put a backup there")
-    made.close()
 
 
 def _schema(db: sqlite3.Connection) -> list[tuple[Any, ...]]:

@@ -31,6 +31,7 @@ from kiteline_core.ids import SEQUENCE_BITS, SubmapId, agent_of_submap
 
 FILE = "map.sqlite"
 _LOCK = "lock"
+_LEFT_OPEN: list[sqlite3.Connection] = []  # until the process ends: a connection that nothing holds is closed
 _BUSY_S = 5.0  # s to wait for a reader of the same file, such as `kiteline export`
 _DISK = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO}
 
@@ -161,7 +162,9 @@ class Store:
 
     def close(self) -> None:
         """Close the database and unlock the folder."""
-        if not self.displaced:  # else SQLite would remove the write-ahead log of the file that took its name
+        if self.displaced:  # SQLite would remove the write-ahead log of the file that took its name
+            _LEFT_OPEN.append(self._db)
+        else:
             with contextlib.suppress(sqlite3.Error):
                 self._db.close()
         self._lock.close()

@@ -4,6 +4,7 @@ import contextlib
 import os
 import sqlite3
 import time
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -153,12 +154,12 @@ def test_what_is_left_of_a_damaged_file_is_taken(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("column", ["type", "name", "tbl_name", "sql"])
 def test_a_schema_whose_text_became_bytes_is_refused(column: str) -> None:
-    db = sqlite3.connect(":memory:", isolation_level=None)
-    checksums.make_tables(db)
-    db.execute("PRAGMA writable_schema = ON")
-    db.execute(f"UPDATE sqlite_master SET {column} = CAST({column} AS BLOB) WHERE name = 'code'")
-    with pytest.raises(StoreError, match="other tables"):
-        checksums.check_tables(db, Path("kept.kiteline"))
+    with closing(sqlite3.connect(":memory:", isolation_level=None)) as db:
+        checksums.make_tables(db)
+        db.execute("PRAGMA writable_schema = ON")
+        db.execute(f"UPDATE sqlite_master SET {column} = CAST({column} AS BLOB) WHERE name = 'code'")
+        with pytest.raises(StoreError, match="other tables"):
+            checksums.check_tables(db, Path("kept.kiteline"))
 
 
 HOSTILE_SCHEMAS = [
@@ -195,8 +196,7 @@ def test_rows_that_no_base_writes_are_left_out(tmp_path: Path, row: tuple[object
     store.write(Batch(rows=[(1, 0, 3, 5, 1, b"head")]))
     store.close()
     content = row[5] if isinstance(row[5], bytes) else str(row[5]).encode()
-    with sqlite3.connect(tmp_path / FILE) as db:
+    with closing(sqlite3.connect(tmp_path / FILE, isolation_level=None)) as db:
         db.execute("INSERT INTO code VALUES (?, ?, ?, ?, ?, ?, ?)", (*row, sum_of(row[:5], content)))
-    db.close()
     saved = read(tmp_path)
     assert saved.agents[AgentId(1)].received == {Key(3, 5, 1): b"head"} and saved.faults
