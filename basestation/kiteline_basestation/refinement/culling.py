@@ -65,4 +65,4 @@ def _redundant(sparse_map: SparseMap, keyframe: KeyframeId) -> bool:
     which = np.repeat(np.arange(len(landmarks)), np.diff(starts))
     finer = table.octave[slots].astype(np.int64) <= table.octave[mine[which]].astype(np.int64) + 1
     others = np.bincount(which[finer & (table.row[slots] != row)], minlength=len(landmarks))
-    return len(landmarks) > 0 and float(np.mean(others >= _KEYFRAME_OTHERS)) >= _KEYFRAME_SHARE
+    return float(np.mean(others >= _KEYFRAME_OTHERS)) >= _KEYFRAME_SHARE
