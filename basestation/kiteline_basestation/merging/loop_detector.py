@@ -148,7 +148,7 @@ class LoopDetector:
             found = found or self._weigh(match) or self._verify_neighbours(match)
         return found
 
-    def contradict(self, pairs: Iterable[SubmapPair], weighed: SubmapPair | None = None) -> None:
+    def contradict(self, pairs: Iterable[SubmapPair], weighed: SubmapPair) -> None:
         """The matches of these submaps made a wrong merge: more of them, and others, have to merge them again.
 
         weighed: submaps whose matches contradicted it, which stay to be weighed against each other.

@@ -1,8 +1,8 @@
 """Merges maps and corrects them at loop closures.
 
 Loop closure -> merge of the newer map into the older one -> pose graph (job) -> fusion of matched landmarks -> full
-bundle (job). A newer closure in a map cancels its pending jobs. A merge that the bundle or later matches contradict is
-undone. Every method that moves maps returns what the mapper has to apply.
+bundle (job). A newer closure in a map cancels its pending jobs. A merge that later matches contradict is undone. Every
+method that moves maps returns what the mapper has to apply.
 """
 
 from collections.abc import Collection, Iterator, Sequence
@@ -30,7 +30,6 @@ from kiteline_basestation.merging.merges import (
     MergerState,
     edges_out_of,
     fused_across,
-    is_contradicted,
     resting_on,
 )
 from kiteline_basestation.refinement import disparity_calibration as disparity
@@ -157,10 +156,6 @@ class MapMerger:
             return NOTHING
         if not (np.isfinite(result.T_c_m).all() and np.isfinite(result.points).all()):
             return NOTHING
-        last = next((m for m in reversed(self.merges) if m.into == map_id), None)
-        if last is not None and is_contradicted(self._map, last, window, result, self._config):
-            self.detector.contradict(edges_out_of(last.moved, self._edges))
-            return self.undo(last)
         changed = self._apply_full_bundle(bundle, result)
         if agents:
             self._corrections.uncertain_at.pop(map_id, None)
@@ -286,10 +281,7 @@ class MapMerger:
         known = (e for e in state.edges if sparse_map.pose(e.new) is not None and sparse_map.pose(e.old) is not None)
         self._edges = list(known)
         self._unfused = {s: known_matches(sparse_map, matches) for s, matches in state.unfused.items()}
-        for merge in state.merges:
-            a, b = slot_pairs(sparse_map, merge.fused[:, 0], merge.fused[:, 1])
-            fused = np.column_stack([sparse_map.landmark_ids(a), sparse_map.landmark_ids(b)])
-            self.merges.append(replace(merge, fused=fused))
+        self.merges += map(replace, state.merges)
 
     # -- loop closures -----------------------------------------------------------------------------------------------
 
@@ -356,18 +348,13 @@ class MapMerger:
         """Fuse the landmarks of verified matches, then match landmarks around the new keyframes of these matches."""
         table, config = self._map.keypoints, self._config.landmark_matching
         matches = self._unfused.pop(map_id, [])
-        fused: list[tuple[int, int]] = []
         for match in matches:
             slots = slot_pairs(self._map, match.new_landmarks, match.old_landmarks)
             for a, b in zip(slots[0].tolist(), slots[1].tolist()):
                 a, b = int(table.root[a]), int(table.root[b])
                 if {self._map.map_of(a), self._map.map_of(b)} != {map_id}:
                     continue  # a match names the roots of its time: of a map that was split off since
-                if a != b and landmark_matching.fuse_landmarks(self._map, a, b, self._publisher):
-                    fused.append((a, b))
-        if fused and self.merges and self.merges[-1].into == map_id:
-            ids = self._map.landmark_ids(np.array(fused, np.int32).ravel()).reshape(-1, 2)
-            self.merges[-1].fused = np.concatenate([self.merges[-1].fused, ids])
+                landmark_matching.fuse_landmarks(self._map, a, b, self._publisher)
         seen: set[KeyframeId] = set()
         for match in matches:
             around = self._map.covisible_keyframes(match.new, MIN_SHARED)

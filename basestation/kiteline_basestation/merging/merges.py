@@ -5,34 +5,24 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.map.map_tables import LANDMARK
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.merging.loop_detector import DetectorState, SubmapPair
 from kiteline_basestation.merging.loop_edges import LoopEdge, LoopMatch
-from kiteline_basestation.refinement.bundle_window import BundleWindow
-from kiteline_core.arrays import F64, I32, I64
+from kiteline_core.arrays import F64, I32
 from kiteline_core.ids import SEQUENCE_BITS, KeyframeId, SubmapId, submap_of_keyframe
-from kiteline_core.optimisation.bundle import BundleResult
-
-_MIN_KEPT = 0.5  # share of inliers among observations that a merge fused: below it the merge is undone
-
-
-def _no_pairs() -> I64:
-    return np.empty((0, 2), np.int64)
 
 
 @dataclass(slots=True, eq=False)
 class MapMerge:
     """A merge of the map `map_id` into the map `into`.
 
-    moved: S_w_m (4,4) of each submap of the merged map before the merge. fused: (n,2) landmark ids fused by the merge.
+    moved: S_w_m (4,4) of each submap of the merged map before the merge.
     """
 
     map_id: SubmapId
     into: SubmapId
     moved: dict[SubmapId, F64]
-    fused: I64 = field(default_factory=_no_pairs)
 
     def forget(self, submaps: Collection[SubmapId]) -> None:
         """Submaps are deleted, or no part of the merged map any more."""
@@ -55,22 +45,6 @@ class MergerState:
     unfused: Mapping[SubmapId, tuple[LoopMatch, ...]] = field(default_factory=dict)
     merges: tuple[MapMerge, ...] = ()
     detector: DetectorState = field(default_factory=DetectorState)
-
-
-def is_contradicted(
-    sparse_map: SparseMap, merge: MapMerge, window: BundleWindow, result: BundleResult, config: BaseConfig
-) -> bool:
-    """True if a full bundle rejects most observations of the landmarks that a merge fused."""
-    if not len(merge.fused):
-        return False
-    table = sparse_map.keypoints
-    roots = np.unique(table.root[sparse_map.find_landmarks(merge.fused.ravel())])
-    which = np.repeat(window.points, np.diff(window.problem.starts))
-    submap = sparse_map.keyframes.id[table.row[window.slots]] >> SEQUENCE_BITS
-    moved = np.isin(submap, sorted(merge.moved)) & np.isin(which, roots)
-    if int(np.count_nonzero(moved)) < config.loops.min_inliers:
-        return False
-    return float(np.mean(result.inlier[moved])) < _MIN_KEPT
 
 
 def edges_out_of(submaps: Collection[SubmapId], edges: Iterable[LoopEdge]) -> list[SubmapPair]:

@@ -1,4 +1,4 @@
-"""When a full bundle contradicts a merge: by what the moved map observes of the landmarks that the merge fused."""
+"""Maps that were merged wrongly, all checks before a merge being off: later matches undo it."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -7,62 +7,56 @@ from typing import Any
 import numpy as np
 import pytest
 
+from kiteline_basestation.config import BaseConfig
 from kiteline_basestation.mapper import Mapper
-from kiteline_basestation.merging.correction import full_bundle_window
-from kiteline_basestation.merging.merges import MapMerge, fused_across, is_contradicted
-from kiteline_basestation.refinement.bundle_window import BundleWindow
-from kiteline_core.arrays import Bool
+from kiteline_basestation.merging import loop_consistency
+from kiteline_basestation.merging.loop_detector import LoopClosure, LoopDetector
+from kiteline_basestation.merging.merges import MapMerge, MergeResult
 from kiteline_core.geometry import se3, sim3
-from kiteline_core.ids import SEQUENCE_BITS, submap_of_keyframe
-from kiteline_core.optimisation.bundle import BundleResult
+from kiteline_core.ids import submap_of_keyframe
+from tests.basestation.conftest import straight, two_rooms
 from tests.basestation.feeding import WITHOUT_GRID, feed
 
 ELSEWHERE = se3.exp(np.array([3.0, -1.0, 0.2, 0.02, -0.03, 1.1]))
+CREDULOUS = replace(WITHOUT_GRID, loops=replace(BaseConfig().loops, min_matched_share=0.0, min_inliers_all=20))
 
 
-@pytest.fixture(scope="module")
-def merged(make_flight: Callable[..., Any], words: Any) -> tuple[Mapper, BundleWindow, Bool]:
-    """Two maps that are one, its full bundle, and which of its observations bear on the merge."""
-    a = make_flight(keyframes=12, turns=0.3)
-    b = make_flight(keyframes=12, turns=0.3, start=0.1, variant=1, agent=1, T_w_m=ELSEWHERE)
-    mapper = Mapper(WITHOUT_GRID, words)
-    feed(mapper, [a, b])
-    sparse_map, merger = mapper.map, mapper.merger
-    assert merger is not None
-    (merge,) = merger.merges
-    window = full_bundle_window(sparse_map, merge.into, merger.edges, mapper.config)
-    assert window is not None
-    root, fused = sparse_map.keypoints.root, fused_across(sparse_map, merge.moved)
-    pairs = [sparse_map.landmark_ids(slots) for slots in (fused, root[fused])]
-    merger.merges[0] = replace(merge, fused=np.stack(pairs, 1))
-    moved = sparse_map.keyframes.id[sparse_map.keypoints.row[window.slots]] >> SEQUENCE_BITS == merge.map_id
-    return mapper, window, moved & np.isin(root[window.slots], root[fused])
-
-
-def contradicts(merged: tuple[Mapper, BundleWindow, Bool], inlier: Bool, merge: MapMerge | None = None) -> bool:
-    mapper, window, _ = merged
-    assert mapper.merger is not None
-    result = BundleResult(window.problem.T_c_m, window.problem.points, inlier, 0.0, 0.0, 1, 0)
-    return is_contradicted(mapper.map, merge or mapper.merger.merges[0], window, result, mapper.config)
-
-
-@pytest.mark.parametrize(("rejected", "contradicted"), [(0.0, False), (0.45, False), (0.55, True), (1.0, True)])
-def test_a_merge_is_contradicted_where_most_of_what_it_fused_is_rejected(
-    merged: tuple[Mapper, BundleWindow, Bool], rejected: float, contradicted: bool
+@pytest.mark.parametrize("stereo", [True, False])
+@pytest.mark.parametrize("places", ["rooms with one wallpaper", "rooms that share half of it", "pieces of a corridor"])
+def test_a_wrong_merge_is_undone_by_later_matches(
+    make_flight: Callable[..., Any], words: Any, monkeypatch: pytest.MonkeyPatch, places: str, stereo: bool
 ) -> None:
-    _, _, bearing = merged
-    inlier = np.ones(len(bearing), np.bool_)
-    which = np.flatnonzero(bearing)
-    inlier[which[: round(rejected * len(which))]] = False
-    assert contradicts(merged, inlier) == contradicted
+    """All that it fused fits: a bundle rejects hardly any of it. That keyframes match elsewhere is what tells."""
+    monkeypatch.setattr(loop_consistency, "has_depth_relief", lambda *_: True)
+    monkeypatch.setattr(LoopDetector, "_is_ambiguous", lambda *_: False)
+    if "rooms" in places:
+        scenes = two_rooms(1.0 if "one" in places else 0.5, 40)
+        keyframes, turns, start = 24, 0.72, 0.0
+    else:
+        scenes = 2 * (straight(10, 3.0, 1.0, 12),)
+        keyframes, turns, start = 16, 0.3, 0.4
+    given = {"keyframes": keyframes, "turns": turns, "stereo": stereo}
+    other = {"scene": scenes[1], "start": start, "agent": 1, "variant": 1, "T_w_m": ELSEWHERE}
+    flights = [make_flight(scene=scenes[0], **given), make_flight(**given, **other)]
+    mapper = Mapper(CREDULOUS, words)
+    merger = mapper.merger
+    assert merger is not None
+    merge, undo, known = merger._merge, merger.undo, list[int]()
 
+    def merge_and_count(closure: LoopClosure) -> MergeResult:
+        known.append(len(mapper.map.rows))
+        return merge(closure)
 
-def test_what_does_not_bear_on_a_merge_does_not_contradict_it(merged: tuple[Mapper, BundleWindow, Bool]) -> None:
-    mapper, _, bearing = merged
-    assert not contradicts(merged, bearing)
-    assert mapper.merger is not None
-    few = replace(mapper.merger.merges[0], fused=mapper.merger.merges[0].fused[:2])
-    assert not contradicts(merged, np.zeros(len(bearing), np.bool_), few)
+    def undo_and_count(wrong: MapMerge) -> MergeResult:
+        known.append(len(mapper.map.rows))
+        return undo(wrong)
+
+    monkeypatch.setattr(merger, "_merge", merge_and_count)
+    monkeypatch.setattr(merger, "undo", undo_and_count)
+    feed(mapper, flights)
+    assert mapper.summary()["merges"] == 0 and mapper.summary()["merges_undone"] == len(known) / 2
+    merged, undone = known[:2]
+    assert undone - merged <= 20  # keyframes of both agents
 
 
 def test_keyframes_of_a_merged_map_are_searched_for_in_the_other_one(

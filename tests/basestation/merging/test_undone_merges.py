@@ -11,7 +11,6 @@ import pytest
 from kiteline_basestation.job_kinds import run_job
 from kiteline_basestation.management import Command
 from kiteline_basestation.mapper import Mapper, MapperInput
-from kiteline_basestation.merging import map_merger
 from kiteline_basestation.merging.loop_detector import Contradiction
 from kiteline_basestation.store.integrity import contradictions
 from kiteline_codec.schema import Key, SubmapPlacement
@@ -87,25 +86,6 @@ def test_a_map_that_took_in_the_one_that_defines_w_loses_its_place_with_it(
     assert contradictions(mapper) == []
 
 
-@pytest.mark.parametrize("requested", [False, True])
-def test_a_merge_that_bundles_contradict_is_not_made_again_at_each_keyframe(
-    make_flight: MakeFlight, words: Any, monkeypatch: pytest.MonkeyPatch, requested: bool
-) -> None:
-    """A bundle that rejects it asks for more matches the next time, also after a user's command to search for them."""
-    monkeypatch.setattr(map_merger, "is_contradicted", lambda *_: True)
-    a = make_flight(keyframes=40, turns=0.8)
-    b = make_flight(keyframes=40, turns=0.8, start=0.1, variant=1, agent=1, T_w_m=ELSEWHERE)
-    mapper = Mapper(WITHOUT_GRID, words)
-    merger = mapper.merger
-    assert merger is not None
-    pair = submap_of_keyframe(a.keyframes[0]), submap_of_keyframe(b.keyframes[0])
-    if requested:
-        merger.search_overlap(pair[1], pair[0])
-    feed(mapper, [a, b])
-    assert 1 <= merger.undone < 10  # of 80 keyframes
-    assert merger.detector.state().contradicted == {pair: merger.undone} and not merger.detector.requested
-
-
 def test_matches_that_made_a_merge_do_not_make_it_again_once_others_contradict_it(
     make_flight: MakeFlight, words: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -122,8 +102,10 @@ def test_matches_that_made_a_merge_do_not_make_it_again_once_others_contradict_i
     maps = [submap_of_keyframe(flight.keyframes[0]) for flight in (a, b, beside)]
     assert {mapper.map.map_id(submap) for submap in maps} == {maps[0]}
     assert (maps[0], maps[1]) in merger.detector.state().matches
+    merger.detector.requested.add((maps[0], maps[1]))  # as if a user had asked to search for it
     monkeypatch.setattr(merger.detector, "query", lambda keyframe: Contradiction((maps[1], maps[2])))
     merger.add_keyframe(b.keyframes[-1])
     assert [mapper.map.map_id(submap) for submap in maps] == [maps[0], maps[1], maps[0]]
     state = merger.detector.state()
     assert state.contradicted == {(maps[0], maps[1]): 1} and (maps[0], maps[1]) not in state.matches
+    assert not state.requested

@@ -29,7 +29,7 @@ def full_state() -> MapperState:
     match = LoopMatch(KeyframeId(71), KeyframeId(6), T, 40, 2.5, 1.0, np.array([3, 9]), np.array([4, 2**50]))
     merger = MergerState(
         loops=2, last_return={A: 30}, graphs_due=(A,), requery=(KeyframeId(9),), edges=(edge, edge),
-        unfused={B: (match,)}, merges=(MapMerge(B, A, {B: S}), MapMerge(A, B, {A: T}, np.array([[1, 2], [3, 4]]))),
+        unfused={B: (match,)}, merges=(MapMerge(B, A, {B: S}), MapMerge(A, B, {A: T})),
         detector=DetectorState({(A, B): (match, match)}, {(A, B): 1}, (B, A), ((frozenset({A}), frozenset({B})),)),
     )  # fmt: skip
     return MapperState(
@@ -49,7 +49,7 @@ def test_a_state_comes_back_to_the_last_bit() -> None:
     assert texts_of(again) == texts
     assert list(again.placements.S_w_m) == [B, A]  # the first submap of all stays the first
     assert np.array_equal(again.placements.S_w_m[B], S)
-    assert again.merger.merges[0].fused.shape == (0, 2)
+    assert [list(merge.moved) for merge in again.merger.merges] == [[B], [A]]
     assert again.merger.detector.matches[A, B][1].old_landmarks.tolist() == [4, 2**50]
     assert texts_of(state_of({})) == texts_of(MapperState())
 
@@ -63,6 +63,9 @@ def test_a_state_of_an_earlier_version_can_be_read() -> None:
     assert again.map.disparity_sigma_px == {}
     assert again.map.measured_with_px == {}
     assert again.map.disparity_calibrated == {AgentId(1)}
+    merge = json.loads(texts["mapper.merger.merges/000000"]) | {"fused": [[1, 2], [3, 4]]}
+    again = state_of({**texts, "mapper.merger.merges/000000": json.dumps(merge)})
+    assert list(again.merger.merges[0].moved) == [B]
     del before["root_submaps"]  # always there
     with pytest.raises(KeyError):
         state_of({**texts, "mapper.map": json.dumps(before)})
@@ -74,7 +77,7 @@ def test_only_changed_parts_are_written() -> None:
     assert writer.changes(state) == {}
     copied = replace(state.merger, merges=tuple(replace(m) for m in state.merger.merges))
     assert writer.changes(replace(state, merger=copied)) == {}
-    more = replace(state.merger.merges[0], fused=np.array([[5, 6]]))
+    more = replace(state.merger.merges[0], moved={B: T})
     changed = replace(copied, edges=copied.edges[:1], merges=(more, *copied.merges[1:]))
     expected = {"mapper.merger.merges/000000", "mapper.merger.edges/000001"}
     assert set(writer.changes(replace(state, merger=changed))) == expected
