@@ -119,7 +119,7 @@ def read_distances(  # type: ignore[no-untyped-def]
                     break
                 gap = gap + step_m if state < 0 else 0.0
                 if gap > gap_m:
-                    unknown = min(unknown, r - gap)
+                    unknown = min(unknown, r)
                     if r > near_m:
                         break  # what lies behind is not told
                 r += step_m

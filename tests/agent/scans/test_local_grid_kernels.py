@@ -73,3 +73,33 @@ def test_distances_are_those_of_plain_arithmetic(gap_m: float, near_m: float) ->
         assert out[s] == pytest.approx(expected, nan_ok=True, abs=1e-9), s
         kinds.add("nan" if np.isnan(expected) else "inf" if np.isinf(expected) else "finite")
     assert "finite" in kinds and ("nan" in kinds) == (gap_m < 1.0)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_what_lies_left_is_told_as_what_lies_right(seed: int) -> None:
+    """Rays of a sector are followed one after the other: which one first must not matter."""
+    rng = np.random.default_rng(seed)
+    own = rng.choice([-2, 0, 4], (20, 20), p=[0.55, 0.43, 0.02]).astype(np.int8).repeat(4, 0).repeat(4, 1)
+    drawn, none = np.ones((80, 80), np.int16), np.zeros((0, 0), np.int8)
+    out, mirrored, still = np.empty(36), np.empty(36), np.zeros(3)
+    at = np.array([2.0123, 1.9876, 0.4])
+    kernels.read_distances(own, drawn, 0.05, at, none, 0.05, still, 0.1, 0.4, 0.6, 1.9, 5, out)
+    own, at = np.ascontiguousarray(own[::-1]), np.array([at[0], 4.0 - at[1], -at[2]])
+    kernels.read_distances(own, drawn, 0.05, at, none, 0.05, still, 0.1, 0.4, 0.6, 1.9, 5, mirrored)
+    np.testing.assert_allclose(mirrored[(-np.arange(36)) % 36], out, atol=1e-9)
+
+
+@pytest.mark.parametrize(("near_m", "told"), [(1.6, False), (1.8, True)])
+def test_an_obstacle_that_is_near_is_told_even_if_what_lies_before_it_is_unknown(near_m: float, told: bool) -> None:
+    own, drawn, none = np.full((80, 80), -2, np.int8), np.ones((80, 80), np.int16), np.zeros((0, 0), np.int8)
+    own[:, 14:34], own[:, 42:] = 0, 4  # unknown from 0.7 to 1.7 m, solid from 2.1 m
+    out, still = np.empty(36), np.zeros(3)
+    at = np.array([0.52, 2.02, 0.0])
+    kernels.read_distances(own, drawn, 0.05, at, none, 0.05, still, 0.1, 0.5, near_m, 3.0, 5, out)
+    assert np.isfinite(out[0]) == told and (not told or out[0] == pytest.approx(1.58 + 0.15, abs=0.06))
+
+
+def test_evidence_is_bounded_so_that_a_few_views_turn_a_cell() -> None:
+    cells = drawn([1.2, 1.2], times=30)
+    assert cells.max() == kernels.MOST and cells.min() == kernels.LEAST
+    assert kernels.MOST + 9 * kernels.MISS <= kernels.FREE and kernels.LEAST + 4 * kernels.HIT >= kernels.OCCUPIED
