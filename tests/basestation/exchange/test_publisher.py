@@ -75,6 +75,17 @@ def test_a_batch_has_the_newest_poses_then_what_has_waited_longest_and_the_newes
     assert not out.waiting and sent(out) == []
 
 
+def test_what_changes_while_a_batch_is_sent_goes_with_the_next_one() -> None:
+    _, out = publisher(step_values=2)
+    mark(out, POSE, range(5))
+    assert sent(out) == poses(3, 4)
+    mark(out, POSE, (4, 7))
+    assert [sent(out) for _ in range(3)] == [poses(1, 2), poses(0), poses(4, 7)]
+    mark(out, POSE, range(3))
+    assert sent(out) == poses(1, 2) and out.waiting
+    assert sent(out) == poses(0) and not out.waiting
+
+
 @pytest.mark.parametrize(("room_bytes", "count"), [(1, 1), (24, 1), (25, 2), (48, 2), (49, 3)])
 def test_a_batch_fills_the_room_and_has_one_change_at_least(room_bytes: int, count: int) -> None:
     _, out = publisher()
