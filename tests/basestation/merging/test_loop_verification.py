@@ -12,7 +12,7 @@ from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.mapper import Mapper
 from kiteline_basestation.merging import loop_verification
 from kiteline_basestation.merging.loop_edges import LoopMatch
-from kiteline_basestation.merging.loop_verification import guessed_pose, spread_out, verify_loop
+from kiteline_basestation.merging.loop_verification import depth_scale, guessed_pose, spread_out, verify_loop
 from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import KeyframeId, submap_of_keyframe
@@ -108,14 +108,28 @@ def test_views_of_different_places_are_not_verified(maps: tuple[SparseMap, Any, 
     assert verify_loop(sparse_map, b.keyframes[-1], a.keyframes[0], CONFIG) is None
 
 
-def test_one_keyframes_landmarks_are_too_few_in_a_distant_view(
+def test_a_distant_view_is_verified_by_landmarks_of_neighbours(
     maps: tuple[SparseMap, Any, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Those of its neighbours are matched as well."""
-    with_neighbours = verified(maps)
-    monkeypatch.setattr(loop_verification, "MAX_NEIGHBOURS", 0)
-    alone = verified(maps)
-    assert with_neighbours is not None and (alone is None or alone.inliers < 0.9 * with_neighbours.inliers)
+    """One keyframe alone has too few of those that it shows."""
+    sparse_map, a, b = maps
+    pair, local = (b.keyframes[9], a.keyframes[3]), loop_verification.local_landmarks
+    assert verify_loop(sparse_map, *pair, CONFIG) is not None
+    monkeypatch.setattr(loop_verification, "local_landmarks", lambda of, keyframe, neighbours: local(of, keyframe, 0))
+    assert verify_loop(sparse_map, *pair, CONFIG) is None
+
+
+def ratios(logarithms: list[float]) -> float | None:
+    own = np.linspace(1.0, 5.0, len(logarithms))
+    return depth_scale(own, own * np.exp(logarithms))
+
+
+def test_a_scale_is_told_by_enough_depths_that_agree_closely() -> None:
+    assert ratios([0.7] * 20) == pytest.approx(np.exp(0.7)) and ratios([0.7] * 19) is None
+    assert ratios([0.7] * 14 + [1.8] * 6) is not None and ratios([0.7] * 13 + [1.8] * 7) is None
+    assert ratios([0.7] * 13 + [0.89] * 7) is not None and ratios([0.7] * 13 + [0.91] * 7) is None
+    assert ratios([0.65] * 12 + [0.7] + [0.75] * 12) == pytest.approx(np.exp(0.7))  # known to 1.9 %
+    assert ratios([0.64] * 12 + [0.7] + [0.76] * 12) is None  # to 2.2 %
 
 
 def pixels(cells: int, each: int) -> F64:
