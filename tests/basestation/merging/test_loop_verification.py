@@ -21,17 +21,17 @@ from tests.basestation.test_monocular import in_own_unit
 
 ELSEWHERE = se3.exp(np.array([3.0, -1.0, 0.2, 0.02, -0.03, 1.1]))
 CONFIG, OLD, NEW = LoopConfig(), 5, 4
-UNIT = 0.5  # of the newer map, where both have one eye
+OLD_UNIT, NEW_UNIT = 1.3, 0.5  # of lengths in maps of one eye
 
 
-@pytest.fixture(scope="module", params=[True, False], ids=["stereo", "one eye"])
+@pytest.fixture(scope="module", params=["stereo", "one eye", "one eye, then stereo"])
 def maps(request: pytest.FixtureRequest, make_flight: Callable[..., Any]) -> tuple[SparseMap, Any, Any]:
     """Two maps of one room that nobody has merged, and their flights, the older first."""
-    stereo = bool(request.param)
-    a = make_flight(keyframes=12, turns=0.3, stereo=stereo)
-    b = make_flight(keyframes=12, turns=0.3, start=0.02, variant=1, agent=1, T_w_m=ELSEWHERE, stereo=stereo)
+    of_old, of_new = request.param != "stereo", request.param == "one eye"
+    a = make_flight(keyframes=12, turns=0.3, stereo=not of_old)
+    b = make_flight(keyframes=12, turns=0.3, start=0.02, variant=1, agent=1, T_w_m=ELSEWHERE, stereo=not of_new)
     mapper = Mapper(WITHOUT_GRID)
-    feed(mapper, [a, b if stereo else in_own_unit(b, UNIT)])
+    feed(mapper, [in_own_unit(a, OLD_UNIT) if of_old else a, in_own_unit(b, NEW_UNIT) if of_new else b])
     return mapper.map, a, b
 
 
@@ -45,22 +45,25 @@ def test_a_match_tells_how_the_cameras_lie_to_each_other_in_the_old_maps_unit(ma
     match = verified(maps)
     assert match is not None and match.inliers == len(match.new_landmarks) == len(match.old_landmarks) >= 35
     between = se3.inverse(a.true_T_w_k[OLD]) @ b.true_T_w_k[NEW]
-    one_eye = sparse_map.is_up_to_scale(submap_of_keyframe(match.new))
-    assert np.linalg.norm((match.T_old_new - between)[:3, 3]) < 0.04
+    units = [
+        unit if sparse_map.is_up_to_scale(submap_of_keyframe(keyframe)) else 1.0
+        for unit, keyframe in ((OLD_UNIT, match.old), (NEW_UNIT, match.new))
+    ]
+    assert np.linalg.norm(match.T_old_new[:3, 3] - units[0] * between[:3, 3]) < 0.04 * units[0]
     assert np.linalg.norm(se3.so3_log(between[:3, :3].T @ match.T_old_new[:3, :3])) < 0.01
-    assert match.scale == pytest.approx(1.0 / UNIT if one_eye else 1.0, rel=0.03)
+    assert match.scale == pytest.approx(units[0] / units[1], rel=0.03)
     rows = [(a.point_of[int(old)], b.point_of[int(new)]) for new, old in zip(match.new_landmarks, match.old_landmarks)]
     assert np.mean([old == new for old, new in rows]) > 0.97
     depths = se3.transform(se3.inverse(b.true_T_w_k[NEW]), a.world[[old for old, _ in rows]])[:, 2]
-    assert match.depth_m == pytest.approx(float(np.median(depths)), rel=0.05)
+    assert match.depth_m == pytest.approx(units[0] * float(np.median(depths)), rel=0.05)
 
 
 @pytest.mark.parametrize("moved", ["old", "new"])
 def test_where_and_how_large_maps_lie_in_w_does_not_matter(maps: tuple[SparseMap, Any, Any], moved: str) -> None:
     sparse_map, a, b = maps
     before = verified(maps)
-    one_eye = sparse_map.is_up_to_scale(submap_of_keyframe(b.keyframes[0]))
     submap = submap_of_keyframe((a if moved == "old" else b).keyframes[0])
+    one_eye = sparse_map.is_up_to_scale(submap)
     held = sparse_map.submap_pose(submap)
     sparse_map.move_submap(
         submap, sim3.of(3.0 if one_eye else 1.0, se3.exp(np.array([5.0, 2.0, -1.0, 0.5, 0.4, -2.0])))

@@ -7,7 +7,7 @@ from kiteline_basestation.merging.merges import MapMerge, MergeResult, edges_out
 from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
-from kiteline_core.ids import AgentId, KeyframeId, SubmapId, keyframe_id, submap_id
+from kiteline_core.ids import AgentId, KeyframeId, SubmapId, keyframe_id, point_id, submap_id
 from tests.basestation.map.test_sparse_map import SUBMAP, chain, kf
 
 A, B, C, D = (SubmapId(submap_id(agent, 1, 0)) for agent in range(4))
@@ -45,8 +45,14 @@ def test_landmarks_are_fused_across_where_root_and_landmark_are_on_two_sides() -
         keyframe, 0, np.arange(6, dtype=np.uint16), np.full((6, 2), 100, np.float32), np.full(6, 0.25, np.float32),
         np.zeros(6, np.uint8), np.zeros(6, np.uint8), descriptor,
     )  # fmt: skip
+    later = keyframe_id(other, 1)
+    sparse_map.add_keyframe(later, 1, keyframe, np.eye(4), 1)
+    sparse_map.put_observations(
+        later, 0, np.zeros(1, np.uint16), np.full((1, 2), 100, np.float32), np.zeros(1, np.float32),
+        np.zeros(1, np.uint8), np.array([point_id(keyframe, 1)], np.int64),
+    )  # fmt: skip
     mine, theirs = sparse_map.slots_of(kf(0)), sparse_map.slots_of(keyframe)
-    sparse_map.fuse(int(theirs[1]), int(mine[1]))  # observed in kf(1), too
+    sparse_map.fuse(int(theirs[1]), int(mine[1]))  # observed by both
     sparse_map.fuse(int(mine[5]), int(theirs[2]))
     sparse_map.fuse(int(sparse_map.slots_of(kf(2))[5]), int(mine[4]))  # on one side
     expected = sorted([int(theirs[1]), int(mine[5])])
