@@ -10,6 +10,7 @@ _LEAST_WINDOWS = 5  # least number of agreeing windows for a scale
 _LEAST_SHARE = 0.7  # least share of the windows that must agree
 _NEWEST = 2  # windows of which one must lie near the median: else the unit changes, or the odometer slips now
 _LEAST_MOVED_M = 0.05  # m; least motion by the odometer in a window that counts
+_LEAST_SPREAD = 1e-9  # relative spread of windows, at least: some that agree to the last digit are no outliers
 _OUTLYING = 3.0  # deviations of a window from the median scale: slip, a moment of bad images
 
 
@@ -48,7 +49,7 @@ class UnitScale:
         each = along / square
         middle = float(np.median(each))
         spread = 1.4826 * float(np.median(np.abs(each - middle)))
-        near = np.abs(each - middle) <= _OUTLYING * spread
+        near = np.abs(each - middle) <= _OUTLYING * max(spread, _LEAST_SPREAD * middle)
         if not near[-_NEWEST:].any():
             return None
         metres = float(along[near].sum() / square[near].sum())
