@@ -381,6 +381,11 @@ class Agent:
         """True if lengths in the active submap are metres; a monocular camera alone measures in a unit of its own."""
         return self._camera.motion.metric
 
+    @property
+    def in_metres(self) -> bool:
+        """True if poses are in metres: also where a sensor told a new map's unit roughly, as their covariances say."""
+        return self._camera.motion.in_metres
+
     def odometry_quality(self, estimate: Estimate) -> int:
         """`quality` of T_o_b, which no map corrects: for a flight controller."""
         return self._report.odometry_quality(estimate)

@@ -83,7 +83,7 @@ class Estimate(_InOdometryFrame):
     how the vehicle turned, once the IMU tells the vertical.
     p_l_o: (3,) m, origin of the odometry frame in the gravity-aligned one: the vehicle stays at its place where R_l_o
     changes. None: the same origin.
-    initialising: there is no map yet, or one whose scale is still to come, and so no pose: T_o_b means nothing.
+    initialising: there is no map yet, or one whose scale nothing has told yet, and so no pose: T_o_b means nothing.
     """
 
     t_ns: int

@@ -36,7 +36,7 @@ class EkfAgent:
     The filter's frame is o: nothing but images and odometry corrects it. What the base corrects moves the submap m.
     """
 
-    metric = True  # lengths are those of the odometry
+    metric = in_metres = True  # lengths are those of the odometry
 
     def __init__(self, rig: CameraRig, config: AgentConfig, identity: Identity, channel: RecordChannel) -> None:
         self._config, self._channel = config, channel

@@ -224,7 +224,7 @@ class CameraState:
         self.leave_map()
         if self.submaps.opened == 1:
             self._T_o_first = self.pose.T_o_m.copy()
-        if self.motion.metric or unit_m == 1.0:
+        if self.motion.in_metres or unit_m == 1.0:
             return self.pose.rescale(unit_m)
         self.pose.rescale_map(unit_m)
         return np.eye(4)

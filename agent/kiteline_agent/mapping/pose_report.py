@@ -50,7 +50,7 @@ class PoseReport:
             self._channel.put(LivePose(self._agent, ctx.t_ns, keyframe, T_k_c, quality))
         if outcome.T_o_n is not None:
             self._corrections.relocalise(outcome.T_o_n)
-        T_w_b = self._corrections.in_world(submap, T_m_b, T_o_m, ctx.t_ns, metric=camera.motion.metric)
+        T_w_b = self._corrections.in_world(submap, T_m_b, T_o_m, ctx.t_ns, metric=camera.motion.in_metres)
         self._T_w_b = None
         if tracked and T_w_b is not None:
             in_base_map = self._corrections.in_base_map(submap, T_m_b)

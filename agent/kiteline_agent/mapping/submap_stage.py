@@ -11,7 +11,7 @@ from kiteline_agent.inertial.inertial_tracker import InertialTracker
 from kiteline_agent.initialisation.inertial_map import InertialMap
 from kiteline_agent.initialisation.inertial_start import InertialStart
 from kiteline_agent.initialisation.metric_restart import MetricPoints, metric_points
-from kiteline_agent.initialisation.two_view_start import TwoViewMap, TwoViewStart
+from kiteline_agent.initialisation.two_view_start import TwoViewStart
 from kiteline_agent.initialisation.unscaled_path import UnscaledPath
 from kiteline_agent.initialisation.window import lens_correction
 from kiteline_agent.keyframes.depth_from_motion import DepthFromMotion
@@ -25,7 +25,7 @@ from kiteline_agent.mapping.loss_tie import LossTie
 from kiteline_agent.mapping.start_choice import StartChoice
 from kiteline_agent.mapping.start_watch import VIEWS_S, StartWatch
 from kiteline_agent.mapping.submaps import TRACKED_M, TRACKED_RAD
-from kiteline_agent.motion.odometer_scale import LEAST_MOVED_M
+from kiteline_agent.mapping.told_unit import told_unit
 from kiteline_agent.relocalisation.relocaliser import Relocaliser
 from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_agent.tracking.track import Track
@@ -202,9 +202,10 @@ class SubmapStage:
             if not camera.submaps.any:
                 self._warnings += self._views_watch.note(ctx.t_ns, Fault.PARALLAX)
             return None
-        unit, told_by = self._unit_by_motion(ctx, two_views), "convention"
+        unit, told_by = told_unit(camera, ctx, two_views), "convention"
         if unit is not None:
-            two_views, told_by = two_views.scaled(unit), "the motion that a sensor tells"
+            two_views = two_views.scaled(unit.metres)
+            told_by = f"the motion that a sensor tells, within {100.0 * unit.sigma:.0f} %"
         since, T_k_a = camera.reference.keyframe, camera.reference.T_k_c @ se3.inverse(two_views.T_a_b)
         is_tied = unit is not None and not camera.pose.is_guess
         sigma_m, sigma_rad = camera.covariance.dead_reckoning_sigma
@@ -213,7 +214,7 @@ class SubmapStage:
         events = ["submap: opened", f"mono: scale by {told_by}, median depth {two_views.median_depth_m:.3g} m"]
         if unit is None and camera.had_metres:
             events.append(_NO_METRES)
-        camera.motion.begin_unscaled_map()
+        camera.motion.begin_unscaled_map(None if unit is None else unit.sigma)
         submap = camera.open_submap()
         if is_tied:  # else the base does not place it in a map in metres
             self._loss_tie.share(submap, since, T_k_a, sigma_m, sigma_rad)
@@ -235,16 +236,6 @@ class SubmapStage:
         camera.pose.set_motion(se3.exp(se3.log(two_views.T_a_b) / two_views.frames), velocity)
         self._keyframes.add(ctx, track)
         return OpenedSubmap(True, events)
-
-    def _unit_by_motion(self, ctx: FrameContext, views: TwoViewMap) -> float | None:
-        """Metres in one unit of two views, by the way between them that a sensor told; None if none did.
-
-        Roughly: it keeps the odometry frame from jumping until the scale is known.
-        """
-        told_m = float(np.linalg.norm(ctx.T_m_c[:3, 3] - views.T_m_a[:3, 3]))
-        seen = float(np.linalg.norm(views.T_a_b[:3, 3]))
-        measured = self._camera.submaps.any and self._camera.had_metres and self._camera.motion.told
-        return told_m / seen if measured and told_m > LEAST_MOVED_M and seen > 0.0 else None
 
     def join_older(self, ctx: FrameContext, track: Track) -> list[str]:
         """Search the older submaps beside a new one; if one is found, make a keyframe in both and continue in the old.
@@ -283,7 +274,9 @@ class SubmapStage:
     def _restart(self, ctx: FrameContext, unit_m: float, metric: MetricPoints) -> F64:
         """Begin a submap in metres here. Returns T_new_old (4,4)."""
         camera = self._camera
-        old, own_unit = camera.submaps.active, not camera.motion.metric
+        old, own_unit = camera.submaps.active, not camera.motion.in_metres
+        if not (own_unit or camera.motion.metric):  # lengths so far are off by what is told now
+            camera.covariance.set_scale_sigma(float(np.hypot(unit_m - 1.0, _SCALE_SIGMA)))
         self._channel.put(SubmapScale(old, unit_m))
         T_new_old = self._begin_at_track(ctx, unit_m, metric, tells_scale=True)
         if own_unit:

@@ -107,6 +107,11 @@ class Odometer:
         return self._carried and self._alone_s == 0.0
 
     @property
+    def velocity_cov(self) -> F64:
+        """(3,3) (m/s)^2 of the velocity in the last frame, in b."""
+        return self._velocity_cov
+
+    @property
     def predicts(self) -> bool:
         """True if the last prediction came from the odometer."""
         return self._carried

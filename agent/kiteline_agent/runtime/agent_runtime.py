@@ -247,7 +247,7 @@ class AgentRuntime:
             self._record.step(step_input, output, now_ns, now_ns + self._log_shift_ns)
         if frame is not None:
             self.counts.count(output.estimate, output.predicted)
-            if output.estimate is not None and output.estimate.tracked and not self.agent.metric:
+            if output.estimate is not None and output.estimate.tracked and not self.agent.in_metres:
                 self._own_unit.add(output.estimate.submap)
             if len(self._warnings) < _MOST_WARNINGS:
                 self._warnings += [event for event in output.events if event.startswith(_WARNING)]
@@ -290,7 +290,7 @@ class AgentRuntime:
             "link": self.channel.report() if isinstance(self.channel, CodedChannel) else {},
             "skipped": dict(sorted(skipped.items())),
             "notes": notes,
-            "scale": "metric" if self.agent.metric else "own",
+            "scale": "metric" if self.agent.in_metres else "own",
             "own_unit_submaps": sorted(self._own_unit),
             **self.agent.motion_reports(),
             "drain": {key: total[key] - self.flight_counts[key] for key in ("bytes_up", "bytes_down")},

@@ -74,17 +74,17 @@ class UnsentPoses:
         self._why = ""
         self._since_ns: int | None = None  # stamp of the first pose in a row whose vertical is not known
 
-    def lines(self, estimate: Estimate | None, *, metric: bool) -> list[str]:
-        """What has changed. estimate: of the last frame. metric: its lengths are metres."""
+    def lines(self, estimate: Estimate | None, *, in_metres: bool) -> list[str]:
+        """What has changed. estimate: of the last frame. in_metres: its lengths are metres."""
         if estimate is None or not estimate.tracked:
             return []
-        before, self._why = self._why, self._reason(estimate, metric)
+        before, self._why = self._why, self._reason(estimate, in_metres)
         if self._why == before:
             return []
         return [f"flight controller: no pose is sent, as {self._why}" if self._why else "flight controller: gets poses"]
 
-    def _reason(self, estimate: Estimate, metric: bool) -> str:
-        if not metric:
+    def _reason(self, estimate: Estimate, in_metres: bool) -> str:
+        if not in_metres:
             return "lengths are not in metres"
         if estimate.R_l_o is not None:
             self._since_ns = None
@@ -99,7 +99,7 @@ def pose_sample(agent: OnboardAgent, output: StepOutput, t_ns: int, epoch: int) 
     One that is not tracked is sent too, for its quality; in another unit it would be flown by some settings of PX4.
     """
     pose: Estimate | PredictedPose | None = output.estimate or output.predicted
-    if pose is None or pose.T_l_b is None or not agent.metric:
+    if pose is None or pose.T_l_b is None or not agent.in_metres:
         return None
     if isinstance(pose, PredictedPose):
         return PoseSample(t_ns, pose.T_l_b, pose.tracked, pose.quality, epoch, pose.cov_l, pose.velocity_l, pose.rate_b)

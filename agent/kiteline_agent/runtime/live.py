@@ -242,7 +242,7 @@ class _LiveFlight:
             found = [] if controller is None else [f.line for f in controller.take_findings()]
             if runtime.output:
                 if controller is not None:
-                    found += self._unsent.lines(runtime.output.estimate, metric=runtime.agent.metric)
+                    found += self._unsent.lines(runtime.output.estimate, in_metres=runtime.agent.in_metres)
                 lines = self._status.lines(runtime.output, runtime.counts, now_ns - self._begin_ns, found)
                 process.print_lines(lines)
         elif runtime.counts.frames % PROGRESS_FRAMES == 0:

@@ -53,6 +53,22 @@ def test_the_way_that_an_odometer_told_is_told_on(data_dir: Path) -> None:
     assert min(off) < 0.05
 
 
+def test_there_are_poses_as_certain_as_the_way_that_was_told(data_dir: Path) -> None:
+    """Before the metre of the new map is known to 2 %."""
+    agent, _ = flown(data_dir, np.inf)
+    run, begin_ns = agent.run, agent.run.t_ns[0]
+    seen = [e for e in run.estimates if e is not None and e.t_ns - begin_ns >= DARK_S[1] * 1e9]
+    lost = [e for e in seen if not e.tracked]
+    assert len(lost) <= 10 and not agent.box.metric and agent.box.in_metres
+    found = [e for e in seen if e.tracked]
+    true = dict(zip(run.t_ns, run.truth, strict=True))
+    way, true_way = (se3.inverse(a) @ b for a, b in ((found[0].T_o_b, found[-1].T_o_b),
+                                                     (true[found[0].t_ns], true[found[-1].t_ns])))  # fmt: skip
+    off_m = abs(float(np.linalg.norm(way[:3, 3]) - np.linalg.norm(true_way[:3, 3])))
+    sigma_m = float(np.sqrt(np.linalg.eigvalsh(found[-1].cov_o[:3, :3])[-1]))
+    assert 0.05 * float(np.linalg.norm(true_way[:3, 3])) < sigma_m and off_m < 2.0 * sigma_m
+
+
 def test_what_nothing_measured_is_said_and_has_no_quality(data_dir: Path) -> None:
     agent, said = flown(data_dir, 3.9)
     submap = agent.box.submap

@@ -19,14 +19,14 @@ PREDICTED = PredictedPose(0, "imu", True, np.eye(4), np.zeros(3), np.zeros(3), 9
 
 
 def test_no_pose_goes_out_in_another_unit_or_tilted() -> None:
-    agent: Any = SimpleNamespace(metric=True, odometry_quality=lambda _estimate: 80)
+    agent: Any = SimpleNamespace(in_metres=True, odometry_quality=lambda _estimate: 80)
     of_frame, between = StepOutput(ESTIMATE, (), ()), StepOutput(None, (), (), PREDICTED)
     for output in (of_frame, between):
         sample = pose_sample(agent, output, 0, 0)
         assert sample is not None and sample.tracked
-    agent.metric = False
+    agent.in_metres = False
     assert pose_sample(agent, of_frame, 0, 0) is None and pose_sample(agent, between, 0, 0) is None
-    agent.metric = True
+    agent.in_metres = True
     tilted = replace(of_frame, estimate=replace(ESTIMATE, R_l_o=None))
     assert pose_sample(agent, tilted, 0, 0) is None
     lost = pose_sample(agent, replace(of_frame, estimate=replace(ESTIMATE, tracked=False)), 0, 0)
@@ -42,9 +42,9 @@ def test_why_no_pose_goes_out_is_told_when_it_begins_and_when_it_ends() -> None:
         (11.0, tilted, True), (12.0, ESTIMATE, False), (12.5, None, False),
         (13.0, replace(ESTIMATE, tracked=False), True), (14.0, ESTIMATE, True),
     ]  # fmt: skip
-    for t_s, estimate, metric in flight:
+    for t_s, estimate, in_metres in flight:
         at = None if estimate is None else replace(estimate, t_ns=round(t_s * S))
-        told += [(t_s, line) for line in unsent.lines(at, metric=metric)]
+        told += [(t_s, line) for line in unsent.lines(at, in_metres=in_metres)]
     assert [t_s for t_s, _ in told] == [6.0, 10.0, 12.0, 14.0]
     assert "which way is up" in told[0][1] and "--no-imu" in told[0][1]
     assert told[1][1] == told[3][1] == "flight controller: gets poses"

@@ -8,7 +8,7 @@ import pytest
 
 from kiteline_agent.initialisation.two_view_start import TwoViewMap
 from kiteline_agent.keyframes.new_landmarks import NewPoints
-from kiteline_agent.mapping.submap_stage import SubmapStage
+from kiteline_agent.mapping.told_unit import ToldUnit, told_unit
 from kiteline_core.geometry import se3
 
 FIRST = se3.exp(np.array([3.0, -1.0, 0.5, 0.1, 0.4, -0.2]))
@@ -20,25 +20,34 @@ def views(images: Any = None) -> TwoViewMap:
     return TwoViewMap(images, 0, FIRST, 3, STEP, points, 4.0)
 
 
-def stage(*, measures: bool = True, metres: bool = True, any_map: bool = True) -> Any:
-    motion, submaps = SimpleNamespace(told=measures), SimpleNamespace(any=any_map)
-    return SimpleNamespace(_camera=SimpleNamespace(motion=motion, submaps=submaps, had_metres=metres))
+def camera(*, measures: bool = True, metres: bool = True, any_map: bool = True, sigma_m_s: float = 0.0) -> Any:
+    motion, submaps = SimpleNamespace(told=measures, velocity_sigma=sigma_m_s), SimpleNamespace(any=any_map)
+    return SimpleNamespace(motion=motion, submaps=submaps, had_metres=metres)
 
 
-def unit(of: Any, way_m: float = 0.5) -> float | None:
+def unit(of: Any, way_m: float = 0.5) -> ToldUnit | None:
     told = FIRST @ se3.from_rt(np.eye(3), np.array([0.0, 0.0, way_m]))
-    ctx: Any = SimpleNamespace(T_m_c=told)
-    return SubmapStage._unit_by_motion(of, ctx, views())
+    ctx: Any = SimpleNamespace(T_m_c=told, t_ns=400_000_000)
+    return told_unit(of, ctx, views())
 
 
 def test_the_unit_is_the_way_that_was_told_over_that_of_the_images() -> None:
-    assert unit(stage()) == pytest.approx(0.5 / np.linalg.norm(STEP[:3, 3]))
-    assert unit(stage(), way_m=0.01) is None  # too short to tell
+    found = unit(camera())
+    assert found is not None and found.metres == pytest.approx(0.5 / np.linalg.norm(STEP[:3, 3]))
+    assert unit(camera(), way_m=0.01) is None  # too short to tell
+
+
+def test_lengths_are_as_uncertain_as_the_way_and_a_young_map() -> None:
+    sure, unsure, short = unit(camera()), unit(camera(sigma_m_s=0.2)), unit(camera(sigma_m_s=0.2), way_m=0.2)
+    assert sure is not None and unsure is not None and short is not None
+    assert 0.05 < sure.sigma < 0.15
+    assert unsure.sigma**2 - sure.sigma**2 == pytest.approx((0.2 * 0.4 / 0.5) ** 2)
+    assert short.sigma > 0.4
 
 
 @pytest.mark.parametrize("lacking", ["measures", "metres", "any_map"])
 def test_where_nothing_tells_metres_the_unit_is_a_convention(lacking: str) -> None:
-    assert unit(stage(**{lacking: False})) is None
+    assert unit(camera(**{lacking: False})) is None
 
 
 def test_all_lengths_of_a_map_grow_together() -> None:
