@@ -47,6 +47,7 @@ class CameraState:
         self.reference = ReferenceKeyframe(local_map)
         self.submaps = Submaps(identity)
         self._had_metres = has_depth
+        self._own_units: dict[SubmapId, float | None] = {}  # `motion.rough_unit` of submaps that are not in metres
         self._T_o_first: F64 | None = None  # the first submap where images led from it into the next one
 
     @property
@@ -185,6 +186,8 @@ class CameraState:
     def return_to(self, found: Relocalisation, frame_number: int) -> None:
         """Continue in the submap in which the frame was relocalised."""
         self.leave_map()
+        if found.submap != self.submaps.active:
+            self._return_to_unit(found.submap)
         self.submaps.return_to(found.submap)
         self._map.activate(found.submap)
         self.reference.return_to(found.keyframe, found.track.inliers, frame_number)
@@ -196,6 +199,13 @@ class CameraState:
         else:
             self.covariance.update(found.track)
         self.covariance.confirm_relocalisation()
+
+    def _return_to_unit(self, submap: SubmapId) -> None:
+        """Measure in the unit of an older submap again."""
+        if submap in self._own_units:
+            self.motion.begin_unscaled_map(self._own_units[submap])
+        elif not self.motion.metric:
+            self.motion.return_to_metres()
 
     # new submaps
 
@@ -250,9 +260,11 @@ class CameraState:
         self.leave_map()
         self.pose.enter_submap()
 
-    def open_submap(self) -> SubmapId:
-        """Open a submap at the present pose."""
+    def open_submap(self, *, metric: bool = True) -> SubmapId:
+        """Open a submap at the present pose. metric: its unit is a metre."""
         self.covariance.begin_submap(self.T_m_b, self.pose.T_o_m)
         submap = self.submaps.open_next()
+        if not metric:
+            self._own_units[submap] = self.motion.rough_unit
         self._map.activate(submap)
         return submap

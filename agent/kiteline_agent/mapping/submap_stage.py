@@ -215,7 +215,7 @@ class SubmapStage:
         if unit is None and camera.had_metres:
             events.append(_NO_METRES)
         camera.motion.begin_unscaled_map(None if unit is None else unit.sigma)
-        submap = camera.open_submap()
+        submap = camera.open_submap(metric=False)
         if is_tied:  # else the base does not place it in a map in metres
             self._loss_tie.share(submap, since, T_k_a, sigma_m, sigma_rad)
         camera.pose.reset_motion()
@@ -369,7 +369,7 @@ class SubmapStage:
             camera.begin_metres()
         if unit_m != 1.0:
             self._map.drop_submap(camera.submaps.active)
-        submap = camera.open_submap()
+        submap = camera.open_submap(metric=tells_scale or self._two_view_start is None)
         keyframe = self._keyframes.make(ctx, None, points.points, camera.pose.T_m_c, Extra.SUBMAP)
         points.set_sigma(self._map, keyframe)
         if tells_scale:

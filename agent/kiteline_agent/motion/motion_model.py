@@ -76,7 +76,7 @@ class MotionModel:
         self._sample_clock, self._sample_check = SampleClock(), SampleCheck()
         self._watch = ImuWatch(SILENT_S, config.gravity_m_s2)
         self._events: list[str] = []
-        self._rough_unit: float | None = None  # relative deviation of lengths, of a map whose metre is told roughly
+        self.rough_unit: float | None = None  # relative deviation of lengths, of a map whose metre is told roughly
         self.has_false_vertical = False  # it came from an IMU that never agreed with the images
 
     @property
@@ -102,13 +102,13 @@ class MotionModel:
     @property
     def in_metres(self) -> bool:
         """True if lengths are in metres, if only as roughly as `scale_sigma` says."""
-        return self.metric or self._rough_unit is not None
+        return self.metric or self.rough_unit is not None
 
     @property
     def scale_sigma(self) -> float:
         """Relative deviation of the map's lengths in metres; 0 where images measure them, or in a unit of its own."""
         if self._metric or not self.metric:
-            return self._rough_unit or 0.0
+            return self.rough_unit or 0.0
         by_imu = self._scale_by_imu
         if by_imu is None:
             return self.odometer.deviation
@@ -300,7 +300,7 @@ class MotionModel:
 
     def begin_unscaled_map(self, sigma: float | None = None) -> None:
         """Begin a map of unknown scale. sigma: relative deviation of its lengths, if they are roughly in metres."""
-        self._rough_unit = sigma
+        self.rough_unit = sigma
         self.odometer.set_metric(metric=False)
         if self._steps is not None:
             self._steps.clear()
@@ -308,10 +308,17 @@ class MotionModel:
             self.tracker.reset()
             self.tracker.metric = False
 
+    def return_to_metres(self) -> None:
+        """Continue in an older map in metres. `restart` follows."""
+        self.rough_unit = None
+        self.odometer.set_metric(metric=True)
+        if self.tracker is not None:
+            self.tracker.rescale(1.0)
+
     def begin_metric_map(self, t_ns: int, state: InertialStartState) -> None:
         """Begin a map in metres at the present pose, in a known inertial state."""
         assert self.tracker is not None
-        self._rough_unit = None
+        self.rough_unit = None
         self.tracker.start(t_ns, self._pose.T_m_c @ self._T_c_b, state)
         self._restart_steps(t_ns)
         self.odometer.set_metric(metric=True)
@@ -350,7 +357,7 @@ class MotionModel:
 
     def set_scale(self, t_ns: int, metres_per_unit: float, T_new_old: F64) -> None:
         """Scale the state to metres, in a submap that begins at this frame; the old one lies at T_new_old (4,4)."""
-        self._rough_unit = None
+        self.rough_unit = None
         self.odometer.set_metric(metric=True, factor=metres_per_unit if self.metric else 1.0)
         if self.tracker is not None:
             self.tracker.rescale(metres_per_unit)
