@@ -301,7 +301,7 @@ class MotionModel:
     def begin_unscaled_map(self, sigma: float | None = None) -> None:
         """Begin a map of unknown scale. sigma: relative deviation of its lengths, if they are roughly in metres."""
         self.rough_unit = sigma
-        self.odometer.set_metric(metric=False)
+        self.odometer.set_metric(metric=False, rough=sigma is not None)
         if self._steps is not None:
             self._steps.clear()
         if self.tracker is not None:

@@ -47,6 +47,7 @@ class Odometer:
         self._T_b_c, self._T_c_b = T_b_c, se3.inverse(T_b_c)
         self._config = config
         self.metric = metric
+        self._in_metres = metric  # if only roughly
         self._samples = OdometerSamples(config.keep_s, config.max_gap_s)
         self._scale = OdometerScale(of_map=not metric)
         self._noise, self._rate_noise = _START_M_S**2, _START_RAD_S**2  # variances
@@ -152,8 +153,8 @@ class Odometer:
 
     @property
     def _usable(self) -> bool:
-        """True if poses can be predicted: samples agree with the images, and the map is in metres."""
-        return self._samples.any and self._trusted and self.metric
+        """True if poses can be predicted: samples agree with the images, and the map is in metres, if only roughly."""
+        return self._samples.any and self._trusted and self._in_metres
 
     # per frame
 
@@ -234,7 +235,7 @@ class Odometer:
         """Process a frame that images (and an IMU) placed at T_m_c (4,4)."""
         if self._samples.any:
             self._compare(T_m_c, t_ns)
-            if self._last is not None and t_ns > self._last[0] and self.image_loss_s == 0.0 and self.metric:
+            if self._last is not None and t_ns > self._last[0] and self.image_loss_s == 0.0 and self._in_metres:
                 self._set_velocity(self._last[1], T_m_c, (t_ns - self._last[0]) * 1e-9)
         self._last = (t_ns, T_m_c)
         if self._unscaled_ns is None and not self.metric:
@@ -312,8 +313,11 @@ class Odometer:
         self._path = r @ self._path
         self._path_cov, self._path_cross = r @ self._path_cov @ r.T, r @ self._path_cross @ r.T
 
-    def set_metric(self, *, metric: bool, factor: float = 1.0) -> None:
-        """Change the map's unit to metres, or to an unknown one. factor: by which a map in metres was scaled."""
+    def set_metric(self, *, metric: bool, factor: float = 1.0, rough: bool = False) -> None:
+        """Change the map's unit to metres, or to an unknown one, or to metres that are known roughly.
+
+        factor: by which a map in metres was scaled.
+        """
         if metric:
             self._scale.begin(factor)
         else:
@@ -321,7 +325,7 @@ class Odometer:
         found = self.metres_per_unit()
         if metric and found is not None:
             self.unit_sigma = float(np.hypot(found[1] / found[0], _UNIT_FLOOR))
-        self.metric = metric
+        self.metric, self._in_metres = metric, metric or rough
         self._anchor = self._last = None
         self._unit_scale.clear()
         self._unscaled_ns, self._doubted = None, False

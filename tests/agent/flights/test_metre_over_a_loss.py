@@ -17,10 +17,12 @@ DARK_S = (4.0, 5.5)
 
 
 @cache
-def flown(data_dir: Path, odometer_until_s: float) -> tuple[FlyingAgent, list[Record]]:
-    """The agent after six seconds, and what it told the base."""
-    whole = load(str(data_dir / "room_flight.mcap")).left_only().without_imu().seconds(6.0, 12.5)
-    flight = dark_between(with_odometer_between(whole, ((-np.inf, odometer_until_s),)), (DARK_S,))
+def flown(
+    data_dir: Path, odometer_until_s: float, until_s: float = 6.5, *dark_s: tuple[float, float]
+) -> tuple[FlyingAgent, list[Record]]:
+    """The agent after so many seconds, and what it told the base. dark_s: more spans in which nothing is seen."""
+    whole = load(str(data_dir / "room_flight.mcap")).left_only().without_imu().seconds(6.0, 6.0 + until_s)
+    flight = dark_between(with_odometer_between(whole, ((-np.inf, odometer_until_s),)), (DARK_S, *dark_s))
     near, far = plain_pair()
     agent = FlyingAgent(flight.rig, None, channel=near, vocabulary=False)
     for item in flight.items:
@@ -67,6 +69,17 @@ def test_there_are_poses_as_certain_as_the_way_that_was_told(data_dir: Path) -> 
     off_m = abs(float(np.linalg.norm(way[:3, 3]) - np.linalg.norm(true_way[:3, 3])))
     sigma_m = float(np.sqrt(np.linalg.eigvalsh(found[-1].cov_o[:3, :3])[-1]))
     assert 0.05 * float(np.linalg.norm(true_way[:3, 3])) < sigma_m and off_m < 2.0 * sigma_m
+
+
+def test_an_odometer_leads_on_where_images_are_lost_again(data_dir: Path) -> None:
+    """While the metre is told roughly: the way is known, and lengths are metres as before."""
+    agent, _ = flown(data_dir, np.inf, 8.6, (6.4, 8.0))
+    run, begin_ns = agent.run, agent.run.t_ns[0]
+    late = {round((e.t_ns - begin_ns) * 1e-9, 2): e for e in run.found if e.t_ns - begin_ns >= 6.4 * 1e9}
+    assert not agent.box.metric and not words(agent, "mono: lengths are not metres")
+    assert all(e.tracked and e.bridged for t_s, e in late.items() if 6.45 < t_s < 7.3)
+    assert all(e.quality > 0 for e in late.values())
+    assert sum(not e.tracked for t_s, e in late.items() if t_s >= 8.0) <= 10 and agent.box.in_metres
 
 
 def test_what_nothing_measured_is_said_and_has_no_quality(data_dir: Path) -> None:
