@@ -12,10 +12,12 @@ _WARNING = (
     "(T_BS), the intrinsics, the units (rad/s, m/s^2) and the time offset (one of up to 0.15 s is found)"
 )
 _NO_SCALE = (
-    "imu: no scale is known after {:.0f} s in motion, and no pose in metres before: speed up and slow down, in "
+    "imu: no scale is known after {:.0f} s in motion, and no pose in metres before{}: speed up and slow down, in "
     "changing directions; if that was flown, check the signs of the accelerations, and that samples come at 200 Hz and "
-    "without gaps, or fewer as means over their steps"
+    "without gaps, or fewer as means over their steps; --no-imu flies the images alone, in a unit of their own"
 )
+_KNOWN = "; lengths are known to {:.1f} %, and {:g} % are needed"
+_VIBRATION = ", with vibration of {:.1f} m/s^2 (a softer mount of the IMU lowers it)"
 _WAITS_S = 10.0  # s of windows in motion without a scale, after which it is said: most starts know it after 6 s
 _APART_S = 2.5  # s between two windows, at most: between those further apart the vehicle stood still
 _BOTH_LENS_CHI2 = 12.0  # with _BOTH_GYRO_NOISE: a focal length that is off by a tenth has 13
@@ -61,11 +63,17 @@ class ContradictionWatch:
         self._told = False
         self._window_ns: int | None = None  # of the last window of this start
         self._moved_s, self._wait_told = 0.0, False
+        self._so_far = ""  # how well the newest window tells lengths
         self.certain = False
 
     def begin_again(self) -> None:
         """A map has begun: the next start waits for its scale anew."""
-        self._window_ns, self._moved_s = None, 0.0
+        self._window_ns, self._moved_s, self._so_far = None, 0.0, ""
+
+    def note_lengths(self, sigma: float, needed: float, vibration_m_s2: float) -> None:
+        """A window fits: the relative deviation of its lengths, that which is needed, and the vibration in it."""
+        shakes = _VIBRATION.format(vibration_m_s2) if vibration_m_s2 > 0.0 else ""
+        self._so_far = _KNOWN.format(100.0 * sigma, 100.0 * needed) + shakes if sigma > needed else ""
 
     def note(self, t_ns: int, *, contradicts: bool | None, by_imu: bool = True) -> list[str]:
         """Process a window that ends at t_ns; returns the events for the log. contradicts: None if it tells neither."""
@@ -79,7 +87,7 @@ class ContradictionWatch:
         if self._wait_told or self._moved_s < _WAITS_S:
             return []
         self._wait_told = True
-        return [_NO_SCALE.format(self._moved_s)]
+        return [_NO_SCALE.format(self._moved_s, self._so_far)]
 
     def _note_contradiction(self, t_ns: int, contradicts: bool | None, by_imu: bool) -> list[str]:
         if contradicts is None:

@@ -9,7 +9,7 @@ from kiteline_agent.config import AgentConfig
 from kiteline_agent.governor.cost_model import Work
 from kiteline_agent.inertial.clocks.frame_clock import FrameClock
 from kiteline_agent.inertial.imu_prior import ImuPrior
-from kiteline_agent.inertial.preintegration import BiasPrior, Samples, TimeOffset, preintegrate
+from kiteline_agent.inertial.preintegration import BiasPrior, TimeOffset, preintegrate
 from kiteline_agent.inertial.samples.imu_watch import SILENT_S, has_recent
 from kiteline_agent.inertial.samples.sample_buffer import SampleBuffer
 from kiteline_agent.initialisation import corner_tracks
@@ -19,8 +19,9 @@ from kiteline_agent.initialisation.inertial_map import InertialMap
 from kiteline_agent.initialisation.landmark_realignment import realigned
 from kiteline_agent.initialisation.metric_restart import window_points
 from kiteline_agent.initialisation.window.known_length import KnownLength, joint_sigma
+from kiteline_agent.initialisation.window.noise_of_windows import NoiseOfWindows
 from kiteline_agent.initialisation.window.window_bundle import InertialBundle, lens_prior
-from kiteline_agent.initialisation.window.window_noise import LEAST, MOST, Vibration, WindowNoise, vibration
+from kiteline_agent.initialisation.window.window_noise import WindowNoise
 from kiteline_agent.initialisation.window.window_samples import WindowSamples
 from kiteline_agent.initialisation.window.window_state import (
     InParts,
@@ -52,7 +53,6 @@ _ATTEMPT_S = 0.45  # s between two solutions: each costs as much as some frames
 _ATTEMPT_SHARE = 0.09  # of the window's length between two solutions: long windows cost more
 _LANDMARKS_EACH = 70  # in each keyframe: in fast turns no track is long
 _AGREEMENT = 0.04  # relative difference of the scale to that of the solution before, on its keyframes
-_LEAST_ACCEL_NOISE = 0.5  # times the noise of single samples: vibration averages out to half of it
 _STATE_INFLATION = 2.0  # of the deviations of the state with which tracking begins
 _STRUCTURE_PX = 1.2  # px; median error of corners with the gyro's rotations: 0.3 if these are right, else 2
 _SCALE_SIGMA = 0.02  # relative deviation of the scale below which it is metric
@@ -106,8 +106,7 @@ class InertialStart:
         self.waiting = WaitingFrames(corner_tracks.KEYFRAME_S)
         self._buffer = SampleBuffer(_MAX_SPAN_S + 1.0, _MAX_GAP_S)
         self._before: SolvedWindow | None = None
-        self._noise: WindowNoise | None = None  # as the windows so far show it
-        self._vibration: Vibration | None = None  # of the newest window
+        self._noise = NoiseOfWindows(calibration, start.bundle)
         self._lens_prior = lens_prior(start.bundle, camera.fx)
         self._lens_info = self._lens_prior  # of what is left of the lens's errors
         self._contradiction = ContradictionWatch(start.contradiction)
@@ -133,7 +132,8 @@ class InertialStart:
         """A map is tracked: begin anew after it."""
         self._tracks.clear()
         self.odometry.clear()
-        self._attempt = self._before = self._tried_ns = self._noise = self._vibration = None
+        self._attempt = self._before = self._tried_ns = None
+        self._noise.clear()
         self._by_stamps = False
         self._contradiction.begin_again()
 
@@ -257,8 +257,7 @@ class InertialStart:
         columns = corner_tracks.covering(all_corners, _LANDMARKS, _LANDMARKS_EACH)
         observations = all_corners.part(columns)
         before, stamps = self._before, tuple(k.t_ns for k in keyframes)
-        self._measure_vibration(imu.samples.at(imu.offset.offset_s) or [])
-        assert self._noise is not None
+        self._noise.measure(imu.samples.at(imu.offset.offset_s) or [], self._buffer.density[0])
         warm = None if before is None else before.warm_start(stamps, observations.ids)
         found = None if warm is None else (yield from self._solve(observations, imu, warm))
         if found is None or not found.solution.fits:
@@ -269,8 +268,8 @@ class InertialStart:
             wrong_turns = self._structure_px > _STRUCTURE_PX
             self._note_contradiction(ctx.t_ns, contradicts=True if wrong_turns else None)
             return None
-        solution, modelled = found.solution, self._noise
-        noise, sigma = self._seen_noise(solution)
+        solution, modelled = found.solution, self._noise.now
+        noise, sigma = self._noise.seen(solution)
         length = self.odometry.length(stamps, solution.state, sigma if solution.fits else np.inf)
         if joint_sigma(sigma, length) < _NEARLY * _SCALE_SIGMA:
             self._work.alignments += int(np.count_nonzero(observations.seen))
@@ -278,23 +277,25 @@ class InertialStart:
             all_corners = corner_tracks.with_found(all_corners, columns, aligned)
             yield
             keep = aligned.seen.sum(axis=0) >= _MIN_VIEWS
-            self._noise = noise
+            self._noise.now = noise
             again = self._bundle(aligned.part(keep), imu, length)
             warmer = WarmStart(solution.state, found.xyz[keep])
             solution = (yield from self._counted(again.solving(warmer), len(keyframes))) or solution
-            noise, sigma = self._seen_noise(solution)
+            noise, sigma = self._noise.seen(solution)
         self._before = SolvedWindow(stamps, observations.ids, found.xyz, solution)
         (wrong, by_imu), fits = self._contradicts(solution, noise), solution.converged and solution.fits
+        if fits:
+            self._contradiction.note_lengths(sigma, _SCALE_SIGMA, self._noise.vibration_m_s2)
         self._note_contradiction(ctx.t_ns, contradicts=wrong if wrong or fits else None, by_imu=by_imu)
         if not fits:
             self._doubt(imu.clock)
         known = fits and sigma < _SCALE_SIGMA and not wrong
         agrees = before is not None and before.lengths_apart(self._before) < _AGREEMENT  # later frames confirm it
-        self._noise = modelled
+        self._noise.now = modelled
         if known and agrees and warm is not None:
             if not (yield from self._is_lowest(found, observations, imu)):
                 return None
-        self._noise = noise
+        self._noise.now = noise
         if not known or not agrees:
             return None
         bundle = self._bundle(all_corners, imu)
@@ -309,8 +310,7 @@ class InertialStart:
         duration_s = (stamps[-1] - stamps[0]) * 1e-9
         self._lens_info = np.asarray(np.linalg.inv(solution.lens_cov), np.float64)
         lens = solution.state.lens
-        assert self._vibration is not None
-        accel_noise = noise.accel * max(self._vibration.level_now, 1.0)
+        accel_noise = noise.accel * max(self._noise.level_now, 1.0)
         return InertialMap(
             ctx, points, solution, cov, solution.scale_sigma, duration_s, accel_noise, lens, tuple(keyframes),
             all_corners,
@@ -351,39 +351,9 @@ class InertialStart:
         self._before = replace(self._before, xyz=cold.xyz, solution=cold.solution)
         return False
 
-    def _seen_noise(self, solution: WindowSolution) -> tuple[WindowNoise, float]:
-        """The IMU's noise as a solution shows it, and the deviation of its scale if that is larger."""
-        before = self._noise
-        assert before is not None
-        least = _LEAST_ACCEL_NOISE * self._measured_noise().accel
-        now = solution.evidence.updated(before, least)
-        return now, solution.scale_sigma * max(now.accel / before.accel, now.walk / before.walk)
-
-    def _measure_vibration(self, intervals: list[Samples]) -> None:
-        """Measure the vibration of a window; the noise found so far is that of the mean over the window before."""
-        before, self._vibration = self._vibration, vibration(intervals)
-        if self._noise is None:
-            self._noise = self._measured_noise()
-        elif before is not None and before.density > 0.0:
-            accel = self._noise.accel * self._vibration.density / before.density
-            self._noise = replace(self._noise, accel=float(np.clip(accel, LEAST, MOST)))
-
-    def _measured_noise(self) -> WindowNoise:
-        """The noise of single samples: more than that of intervals, since much of it is vibration and motion.
-
-        From too much noise its true size is found, which from too little is taken for motion.
-        """
-        bundle, calibration = self._config.inertial_start.bundle, self._calibration
-        assert self._vibration is not None
-        gyro, accel = self._buffer.density[0] / bundle.imu_inflation, self._vibration.density / bundle.imu_inflation
-        return WindowNoise(
-            float(np.clip(gyro / calibration.gyro_noise, 1.0, MOST)),
-            float(np.clip(accel / calibration.accel_noise, 1.0, MOST)),
-        )
-
     def _contradicts(self, solution: WindowSolution, noise: WindowNoise) -> tuple[bool, bool]:
         """Whether a window contradicts, and whether it does so by more than its lens."""
-        gyro_noise, prior = noise.gyro / self._measured_noise().gyro, self._default_prior()
+        gyro_noise, prior = noise.gyro / self._noise.of_samples.gyro, self._default_prior()
         wrong = contradicts(solution, gyro_noise, prior, self._lens_prior)
         return wrong, wrong and exceeds_lens_errors(solution, gyro_noise, prior)
 
@@ -394,7 +364,7 @@ class InertialStart:
         return InertialBundle(
             corners, imu.samples.at, self._calibration, self._camera.T_b_c, self._camera.fx,
             self._config.inertial.gravity_m_s2, imu.prior, self._config.inertial_start.bundle,
-            self._noise, self._lens_info, imu.offset, length,
+            self._noise.now, self._lens_info, imu.offset, length,
         )  # fmt: skip
 
     def _default_prior(self) -> BiasPrior:

@@ -19,7 +19,6 @@ from kiteline_agent.initialisation.contradiction import ContradictionWatch, cont
 from kiteline_agent.initialisation.corner_tracks import CornerObservations
 from kiteline_agent.initialisation.inertial_start import InertialStart
 from kiteline_agent.initialisation.window.inertial_terms import CutSamples
-from kiteline_agent.initialisation.window.window_noise import WindowNoise
 from kiteline_core.arrays import F64
 from tests.agent.initialisation.test_inertial_start import CAMERA, Recorded, Tracks
 from tests.agent.initialisation.window.test_window_bundle import CALIBRATION, PRIOR, changed, window
@@ -41,7 +40,7 @@ def start_with(monkeypatch: pytest.MonkeyPatch, change: Change) -> tuple[float, 
     start = InertialStart(CAMERA, CALIBRATION, replace(config, inertial_start=brief), Work())
     start._tracks = Tracks(corners)  # type: ignore[assignment]
     monkeypatch.setattr(inertial_start, "WindowSamples", lambda *args: Recorded(cut, len(args[2])))
-    monkeypatch.setattr(start, "_measured_noise", WindowNoise)
+    monkeypatch.setattr(start._noise, "measure", lambda *_: None)  # noise as calibrated
     warnings: list[str] = []
     for k in range(keyframes):
         ctx: Any = SimpleNamespace(t_ns=250_000_000 * k, images=SimpleNamespace(left=None))
@@ -175,3 +174,15 @@ def test_windows_that_tell_no_scale_are_told_of_once_and_rests_do_not_count() ->
     fly(209.5, 260.0)
     assert [t_s for t_s, _ in said] == [210.0]
     assert said[0][1].startswith("imu: no scale is known after 10 s in motion")
+
+
+def test_a_wait_for_the_scale_says_how_well_it_is_known_and_what_shakes() -> None:
+    def said(sigma: float, vibration_m_s2: float) -> str:
+        watch = ContradictionWatch(ContradictionConfig())
+        watch.note_lengths(sigma, 0.02, vibration_m_s2)
+        return next(e for k in range(40) for e in watch.note(500_000_000 * k, contradicts=False))
+
+    assert "lengths are known to 6.2 %, and 2 % are needed, with vibration of 1.1 m/s^2 (a softer" in said(0.062, 1.14)
+    assert "lengths are known to 6.2 %, and 2 % are needed: speed up" in said(0.062, 0.0)
+    assert "lengths are known" not in said(0.018, 0.0)  # but windows do not agree
+    assert "--no-imu" in said(0.062, 0.0)

@@ -20,7 +20,6 @@ from kiteline_agent.initialisation.corner_tracks import CornerObservations, Corn
 from kiteline_agent.initialisation.inertial_start import InertialStart
 from kiteline_agent.initialisation.metric_restart import MetricPoints
 from kiteline_agent.initialisation.window.inertial_terms import CutSamples
-from kiteline_agent.initialisation.window.window_noise import WindowNoise
 from kiteline_agent.initialisation.window.window_state import SolvedWindow, finished
 from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_agent.tracking.waiting_frames import WaitingFrames
@@ -100,7 +99,7 @@ def begins_after(monkeypatch: pytest.MonkeyPatch, poor: int) -> tuple[float, flo
     start = InertialStart(CAMERA, CALIBRATION, config, Work())
     start._tracks = Tracks(corners)  # type: ignore[assignment]
     monkeypatch.setattr(inertial_start, "WindowSamples", lambda *args: Recorded(cut, len(args[2])))
-    monkeypatch.setattr(start, "_measured_noise", WindowNoise)
+    monkeypatch.setattr(start._noise, "measure", lambda *_: None)  # noise as calibrated
     for k in range(24):
         ctx: Any = SimpleNamespace(t_ns=250_000_000 * k, images=SimpleNamespace(left=None))
         if start.add(ctx, EXACT) is not None:

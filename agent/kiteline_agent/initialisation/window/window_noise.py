@@ -53,10 +53,11 @@ class NoiseEvidence:
 class Vibration:
     """Noise of single samples of the accelerometer. density: root mean square over a window, m/s^2 per sqrt(Hz).
 
-    levels: (K-1,) deviation of the noise about each interval over that mean.
+    deviation: of one sample, m/s^2. levels: (K-1,) deviation of the noise about each interval over that mean.
     """
 
     density: float
+    deviation: float
     levels: F64
 
     @property
@@ -79,8 +80,8 @@ def vibration(intervals: Sequence[Samples]) -> Vibration:
     known = np.isfinite(variance)
     mean = float(variance[known].mean()) if known.any() else 0.0
     if mean == 0.0:
-        return Vibration(0.0, np.ones(len(intervals)))
+        return Vibration(0.0, 0.0, np.ones(len(intervals)))
     even = np.pad(np.where(known, variance, mean) / mean, _BESIDE, mode="edge")
     around = np.convolve(even, np.full(2 * _BESIDE + 1, 1.0 / (2 * _BESIDE + 1)), mode="valid")
     levels = np.clip(np.sqrt(around), _LEAST_LEVEL, _MOST_LEVEL)
-    return Vibration(float(np.sqrt(mean * usual_s)), levels)
+    return Vibration(float(np.sqrt(mean * usual_s)), float(np.sqrt(mean)), levels)
