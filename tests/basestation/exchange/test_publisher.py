@@ -149,7 +149,8 @@ def test_an_urgent_placement_replaces_what_waits_and_goes_apart() -> None:
     out.withdraw_placement(other)
     assert out.waiting
     ((agent, record),) = out.take_urgent()
-    assert agent == AGENT and record == SubmapPlacement(SUBMAP, record.S_w_m, True, scale_sigma=0.1)
+    assert isinstance(record, SubmapPlacement) and record.recognised
+    assert (agent, record.submap, record.scale_sigma) == (AGENT, SUBMAP, 0.1)
     assert out.take_urgent() == () and not out.waiting
 
 
