@@ -15,7 +15,7 @@ class Job:
 
 
 class JobIds(Iterator[int]):
-    """The numbers of jobs from 1 on, each once. Of a base that is copied they can be, which iterators cannot."""
+    """Numbers of jobs from 1 on, each once. It can be copied with a base, which itertools.count soon cannot."""
 
     def __init__(self) -> None:
         self._last = 0

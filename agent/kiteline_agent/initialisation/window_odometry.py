@@ -8,7 +8,7 @@ import numpy as np
 
 from kiteline_agent.initialisation.window.known_length import KnownLength, extent
 from kiteline_agent.initialisation.window.window_state import WindowState
-from kiteline_agent.motion.joint_scale import contradiction
+from kiteline_agent.motion.joint_scale import CONTRADICT, contradiction
 from kiteline_agent.motion.odometer_samples import MeanVelocity, measured_part
 from kiteline_agent.motion.unit_scale import UnitScale
 from kiteline_core.arrays import F64
@@ -16,9 +16,7 @@ from kiteline_core.geometry import se3
 
 _STEPS = 128  # more than a window has keyframes
 _TOGETHER = 2  # steps that are compared at once: half a second, in which a slow vehicle moves enough
-_ALIGNED = 0.9  # least cosine between displacements by odometer and window
 _FLOOR = 0.01  # least relative deviation of lengths: an odometer's own scale
-_CONTRADICTS = 3.0  # deviations between lengths by odometer and window
 _WELL = 0.09  # (m/s)^2; directions measured worse than this count less and less
 
 Mean = Callable[[int, int], MeanVelocity | None]
@@ -58,7 +56,7 @@ class WindowOdometry:
             return None
         metres, own = found[0], float(np.hypot(found[1] / found[0], _FLOOR))
         before = self.contradicts
-        self.contradicts = abs(float(np.log(metres))) > _CONTRADICTS * float(np.hypot(own, sigma))
+        self.contradicts = abs(float(np.log(metres))) > CONTRADICT * float(np.hypot(own, sigma))
         if self.contradicts and not before:
             self._events.append(contradiction(metres))
         return None if self.contradicts else KnownLength(metres * extent(state.p), own)
@@ -71,7 +69,7 @@ class WindowOdometry:
     def _metres_per_unit(self, t_ns: tuple[int, ...], state: WindowState) -> tuple[float, float] | None:
         """Metres by the odometer in one of the window, and the deviation of that."""
         means = {(begin, end): mean for begin, end, mean in self._steps}
-        unit = UnitScale(_ALIGNED, _STEPS)
+        unit = UnitScale(_STEPS)
         steps: list[F64] = []
         for k, ends in enumerate(pairwise(t_ns)):
             if ends not in means:

@@ -7,7 +7,7 @@ IMU stands, since wheels slip for as long as they like: a bad odometer costs not
 import numpy as np
 
 _AGAIN = "odometer: agrees with the IMU about lengths again"
-_CONTRADICT, _AGREE = 3.0, 2.0  # deviations of the difference from which both contradict, and agree again
+CONTRADICT, _AGREE = 3.0, 2.0  # deviations of the difference from which both contradict, and agree again
 
 Scale = tuple[float, float]  # metres per unit of the map, and the standard deviation
 
@@ -23,7 +23,7 @@ class JointScale:
         if by_odometer is None:
             return []
         apart, sigma = _apart(by_imu, by_odometer)
-        before, self._contradicts = self._contradicts, apart > (_AGREE if self._contradicts else _CONTRADICT) * sigma
+        before, self._contradicts = self._contradicts, apart > (_AGREE if self._contradicts else CONTRADICT) * sigma
         if self._contradicts == before:
             return []
         return [contradiction(by_odometer[0] / by_imu[0]) if self._contradicts else _AGAIN]

@@ -310,18 +310,16 @@ class MotionModel:
 
     def return_to_metres(self) -> None:
         """Continue in an older map in metres. `restart` follows."""
-        self.rough_unit = None
-        self.odometer.set_metric(metric=True)
+        self._set_metric()
         if self.tracker is not None:
             self.tracker.rescale(1.0)
 
     def begin_metric_map(self, t_ns: int, state: InertialStartState) -> None:
         """Begin a map in metres at the present pose, in a known inertial state."""
         assert self.tracker is not None
-        self.rough_unit = None
         self.tracker.start(t_ns, self._pose.T_m_c @ self._T_c_b, state)
         self._restart_steps(t_ns)
-        self.odometer.set_metric(metric=True)
+        self._set_metric()
         self.odometer.restart(self._pose.T_m_c, t_ns)
 
     def metres_per_unit(self, sigma: float) -> float | None:
@@ -357,8 +355,7 @@ class MotionModel:
 
     def set_scale(self, t_ns: int, metres_per_unit: float, T_new_old: F64) -> None:
         """Scale the state to metres, in a submap that begins at this frame; the old one lies at T_new_old (4,4)."""
-        self.rough_unit = None
-        self.odometer.set_metric(metric=True, factor=metres_per_unit if self.metric else 1.0)
+        self._set_metric(metres_per_unit if self.metric else 1.0)
         if self.tracker is not None:
             self.tracker.rescale(metres_per_unit)
             self.tracker.move_map(T_new_old)
@@ -368,6 +365,11 @@ class MotionModel:
         """Continue in a submap that begins at this frame, in the same unit; the old one lies at T_new_old (4,4)."""
         self.move_map(T_new_old)
         self._restart_steps(t_ns)
+
+    def _set_metric(self, factor: float = 1.0) -> None:
+        """Lengths are in metres from now on. factor: as in `Odometer.set_metric`."""
+        self.rough_unit = None
+        self.odometer.set_metric(metric=True, factor=factor)
 
     def _restart_steps(self, t_ns: int) -> None:
         if self._steps is not None:

@@ -36,7 +36,6 @@ _SEEN_RAD_S = 0.02  # rad/s; the same of the rotation rate
 _RISE = 0.5  # weight of such an unusual error: a slip is detected within 0.2 s
 _DOUBTED = 0.25  # relative deviation of lengths that odometer and images disagree on
 _SETTLED = 0.4  # share of a rejected jump below which the velocity must fall before it is used again
-_ALIGNED = 0.9  # least cosine between both displacements of a window for the unit
 
 
 class Odometer:
@@ -65,7 +64,7 @@ class Odometer:
         self.image_loss_s = 0.0
         self._path, self._path_cov, self._path_cross = np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3))  # in m
         self._rotation_cov, self._rotation_cross = np.zeros((3, 3)), np.zeros((3, 3))  # about the body's axes
-        self._unit_scale = UnitScale(_ALIGNED)
+        self._unit_scale = UnitScale()
         self.unit_sigma = 0.0  # relative deviation of metres per unit, once they were found
         self._unscaled_ns: int | None = None  # stamp of the first frame in a map of unknown scale
         self._trusted = self._reported_trust = False

@@ -3,11 +3,10 @@
 import numpy as np
 
 from kiteline_agent.inertial.scale_filter import MAP_WALK, correction_due
-from kiteline_agent.motion.unit_scale import UnitScale
+from kiteline_agent.motion.unit_scale import ALIGNED, UnitScale
 from kiteline_core.arrays import F64
 
 LEAST_MOVED_M = 0.02  # m; motion in a window below which axes and scale are not observable
-_ALIGNED = 0.9  # least cosine between both displacements for their lengths to be compared
 _START = 0.1  # relative deviation at the start
 _MOST = 0.25  # relative; a larger difference is a fault, not a scale
 _FLOOR = 0.01  # least relative deviation
@@ -30,7 +29,7 @@ class OdometerScale:
     def __init__(self, *, of_map: bool) -> None:
         """of_map: the map of one camera, whose lengths the odometer tells: the map is off by it, not the odometer."""
         self._of_map = of_map
-        self._lasting = UnitScale(_ALIGNED, _LASTING)
+        self._lasting = UnitScale(_LASTING)
         self.value, self.var = 1.0, _START**2
         self._age_s = 0.0  # of compared windows since the map began, or was corrected
         self._grown_s = 0.0  # of those since it was in a unit of its own
@@ -52,7 +51,7 @@ class OdometerScale:
         noise_m_s = min(max(noise_m_s, _LEAST_M_S), _SIGMA_M_S) if self._of_map else _SIGMA_M_S
         var = (noise_m_s * dt_s / distance) ** 2 if distance > 0.0 else np.inf
         off = measured - self.value
-        aligned = along > _ALIGNED * distance * float(np.sqrt(square))
+        aligned = along > ALIGNED * distance * float(np.sqrt(square))
         if aligned and off * off < _GATE**2 * (self.var + var):
             gain = self.var / (self.var + var)
             self.value = float(np.clip(self.value + gain * off, 1.0 - _MOST, 1.0 + _MOST))

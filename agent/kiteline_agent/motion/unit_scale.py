@@ -5,6 +5,7 @@ import numpy as np
 from kiteline_core.arrays import F64
 
 WINDOW_S = 0.4  # s; window of a comparison
+ALIGNED = 0.9  # least cosine between both displacements of a window for their lengths to be compared
 _WINDOWS = 20  # newest windows that are kept: the unit of a young map drifts
 _LEAST_WINDOWS = 5  # least number of agreeing windows for a scale
 _LEAST_SHARE = 0.7  # least share of the windows that must agree
@@ -17,9 +18,9 @@ _OUTLYING = 3.0  # deviations of a window from the median scale: slip, a moment 
 class UnitScale:
     """Windows in which odometer and images moved, and the metres per unit of the map that they give."""
 
-    def __init__(self, aligned: float, windows: int = _WINDOWS) -> None:
-        """aligned: least cosine between both displacements of a window that agrees. windows: newest ones, kept."""
-        self._aligned, self._most = aligned, windows
+    def __init__(self, windows: int = _WINDOWS) -> None:
+        """windows: newest ones, kept."""
+        self._most = windows
         # Displacement by the odometer times that by the images, m times units; the latter's square; agrees.
         self._windows: list[tuple[float, float, bool]] = []
 
@@ -33,7 +34,7 @@ class UnitScale:
         if a < _LEAST_MOVED_M or b <= 0.0:
             return
         along = float(by_odometer @ by_images)
-        self._windows.append((along, b * b, along > self._aligned * a * b))
+        self._windows.append((along, b * b, along > ALIGNED * a * b))
         del self._windows[: -self._most]
 
     def metres_per_unit(self, newest: int | None = None) -> tuple[float, float] | None:

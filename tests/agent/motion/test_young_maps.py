@@ -17,7 +17,7 @@ def moved(k: int, metres: float = 0.2) -> F64:
 
 def test_a_unit_that_has_just_changed_is_not_known() -> None:
     """Of seven windows two differ, the newest ones: left out as outliers they would make it certain, and wrong."""
-    unit, units = UnitScale(0.9), [0.50, 0.51, 0.50, 0.505, 0.50, 0.62, 0.63]
+    unit, units = UnitScale(), [0.50, 0.51, 0.50, 0.505, 0.50, 0.62, 0.63]
     for k, metres in enumerate(units[:5]):
         unit.add(moved(k), moved(k) / metres)
     found = unit.metres_per_unit()

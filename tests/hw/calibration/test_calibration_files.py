@@ -130,6 +130,13 @@ def told(folder: Path, **texts: str) -> FileCalibration:
     return read_calibration(",".join(str(folder / f"{name}.yaml") for name in texts))
 
 
+def expect_refusal(folder: Path, text: str, old: str, new: str, message: str) -> None:
+    """Fail unless a calibration with `new` in place of `old` is refused with the file's name and a message."""
+    assert old in text
+    with pytest.raises(SourceError, match=r"rig\.yaml.*" + message):
+        told(folder, rig=text.replace(old, new, 1))
+
+
 def test_a_kalibr_chain_with_its_imu(tmp_path: Path) -> None:
     c = told(tmp_path, camchain=CHAIN, imu=IMU)
     assert c.cameras[0].lens is Lens.EQUIDISTANT and c.cameras[0].fx == 190.97847715128717
@@ -259,9 +266,7 @@ CHANGES = [
 def test_each_fault_names_file_key_and_what_was_expected(
     tmp_path: Path, text: str, old: str, new: str, message: str
 ) -> None:
-    assert old in text
-    with pytest.raises(SourceError, match=r"rig\.yaml.*" + message):
-        told(tmp_path, rig=text.replace(old, new, 1))
+    expect_refusal(tmp_path, text, old, new, message)
 
 
 @pytest.mark.parametrize(
