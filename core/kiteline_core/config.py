@@ -139,7 +139,7 @@ def in_range(config: T, default: T, path: str) -> T:
         value, normal, inner = getattr(config, f.name), getattr(default, f.name), f"{path}.{f.name}"
         if is_dataclass(value):
             in_range(value, normal, inner)
-        elif isinstance(value, int | float) and isinstance(normal, int | float):
+        elif isinstance(value, int | float) and isinstance(normal, int | float) and not isinstance(value, bool):
             if not math.isfinite(value):
                 raise ConfigError(f"{inner}: found {_shown(value)}, expected a finite number")
             if value < 0 <= normal:

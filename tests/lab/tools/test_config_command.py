@@ -100,6 +100,18 @@ def test_nothing_stands_for_a_number_only_where_the_reason_says_what_that_means(
         assert all("expected" in p.text for p in problems), problems
 
 
+def test_each_switch_can_be_turned_over_in_a_file(tmp_path: Path) -> None:
+    switches = [o for s in sections() for o in s.options if isinstance(o.default, bool)]
+    assert {o.name for o in switches} > {"agent.scan.on", "agent.disparities.on"}
+    for option in switches:
+        section, name = option.name.rsplit(".", 1)
+        file = tmp_path / "options.toml"
+        file.write_text(f"[{section}]\n{name} = {'false' if option.default else 'true'}\n")
+        read = agent_config if section.startswith("agent") else base_config
+        assert read(str(file)) != read("")
+        assert command.main(["--check", str(file)]) == 0
+
+
 def test_reasons_do_not_repeat_the_unit_and_name_values_as_toml_has_them() -> None:
     options = [o for s in sections() for o in s.options]
     assert [o for o in options if o.unit and o.reason.startswith(f"{o.unit} ")] == []
