@@ -38,7 +38,7 @@ from kiteline_agent.step import Estimate, Identity, PredictedPose, StepInput, St
 from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_agent.tracking.frame_images import frame_images
 from kiteline_agent.tracking.map_anchor import MapAnchor
-from kiteline_agent.tracking.rolling_shutter import RollingShutter
+from kiteline_agent.tracking.shutter_stage import ShutterStage
 from kiteline_agent.tracking.stuck_camera import StuckCamera
 from kiteline_agent.tracking.track import Track
 from kiteline_agent.tracking.tracker import Tracker
@@ -52,7 +52,6 @@ from kiteline_core.places.place_index import Vocabulary
 
 # Forward, right, down of a vehicle that flies where its camera looks.
 _T_C_F = np.array([[0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
-_STILL_PX = 0.3  # by which a rolling shutter moves pixels of a vehicle that stands still, at most
 _OBSTACLE_TOLD_S = 1.0  # s between two lines of the log about the nearest obstacle
 
 
@@ -82,6 +81,7 @@ class Agent:
         self._effort = FULL
         self._camera = CameraState(rig, imu, config, identity, self.map)
         tracker = Tracker(self.map, self.work)
+        self._shutter = ShutterStage(self.map, self._rectifier, config.readout, self._camera.known_twist)
         self._stuck_camera = StuckCamera(camera)
         self._relocaliser = Relocaliser(
             self.map, tracker, config, vocabulary, self.map_cache,
@@ -130,7 +130,6 @@ class Agent:
         self._last_t_ns: int | None = None  # of the last processed frame
         self._last_track: Track | None = None  # of the last frame, if images gave its pose in the submap
         self._placed_ns: int | None = None  # of the last frame with a pose
-        self._motion_known = False  # in the last frame, for a rolling shutter
         self._was_lost = False  # the last frame had no pose from the images
         self._obstacle_event_ns = 0  # stamp of the last event about the nearest obstacle
         channel.put(CameraIntrinsics(identity.agent, camera))
@@ -201,7 +200,7 @@ class Agent:
         self._frame_number += 1
         ctx = FrameContext(
             self._frame_number, frame.t_ns, dt_s, imu, images, T_m_c, config=config,
-            repeated=self._stuck_camera.repeated, shutter=self._shutter(frame.t_ns, dt_s),
+            repeated=self._stuck_camera.repeated, shutter=self._shutter.motion(frame.t_ns, dt_s),
         )  # fmt: skip
         # 3. Track the landmarks of the local map.
         submap, was_lost = self.submap, self._was_lost
@@ -220,10 +219,11 @@ class Agent:
             camera.set_measured(track, dt_s, repeated=ctx.repeated)
             self._loss.end()
             events += self._align_gravity(ctx)
-            # 6. Update depths and slants of landmarks, and search those without a depth.
+            # 6. Measure a rolling shutter; update depths and slants of landmarks, and search those without a depth.
             if self._two_view_start is not None:
                 self._two_view_start.note_depths(track.depth_m[track.inlier])
             # By images: what a fused pose differs by is in all pixels alike, and would move all depths together.
+            events += self._shutter.measure(ctx, by_images, self.submap)
             self._depth.update_landmarks(ctx, by_images)
             self._slants.update(ctx, by_images)
             self._depth.search_seeds(ctx, track)
@@ -260,25 +260,13 @@ class Agent:
 
     def _finish(self, ctx: FrameContext, outcome: FrameOutcome) -> Estimate:
         """Note how a frame ended, and report its pose."""
+        self._shutter.end_frame()
         self._was_lost = not outcome.tracked or outcome.bridged
         if not self._was_lost:
             self._track.remember(ctx)
         self._last_t_ns = ctx.t_ns
         self._placed_ns = ctx.t_ns if outcome.tracked else self._placed_ns
         return self._report.report(ctx, outcome)
-
-    def _shutter(self, t_ns: int, dt_s: float) -> RollingShutter | None:
-        """The rolling shutter's motion in a frame; None for a global shutter, and while the motion is unknown."""
-        readout_s, rectifier = self._rectifier.readout_s, self._rectifier
-        if readout_s == 0.0 or dt_s <= 0.0 or not self._camera.knows_motion:
-            self._motion_known = False
-            return None
-        twist = self._camera.motion.camera_twist(t_ns, dt_s)
-        shutter = RollingShutter(rectifier.camera, readout_s, rectifier.camera.height, rectifier.left_grid, twist)
-        if not self._motion_known and shutter.largest_px() < _STILL_PX:
-            self.map.rolled[:] = False  # the vehicle stood still when its motion was unknown
-        self._motion_known = True
-        return shutter
 
     def _align_gravity(self, ctx: FrameContext) -> list[str]:
         """Tell the base how the first submap is tilted, once that is known. Returns events."""
@@ -402,5 +390,5 @@ class Agent:
         return self._full_config.known_rig.updated(self.map.camera, right, self._camera.motion.known_imu())
 
     def motion_reports(self) -> dict[str, Any]:
-        """What was found of time offset, IMU and odometer; None for each that is not there."""
-        return self._camera.motion.reports()
+        """What was found of time offset, IMU, odometer and shutter; None for each that is not there."""
+        return {**self._camera.motion.reports(), "readout": self._shutter.report()}

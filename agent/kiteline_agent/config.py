@@ -12,7 +12,10 @@ from kiteline_agent.inertial_start_config import InertialStartConfig
 from kiteline_agent.known_rig import KnownRigConfig
 from kiteline_agent.scan_config import LocalGridConfig as LocalGridConfig
 from kiteline_agent.scan_config import ScanConfig as ScanConfig
+from kiteline_agent.tracking.readout import ReadoutConfig
 from kiteline_core.ground.config import GroundConfig
+
+_LEAST_LEVELS, _MOST_LEVELS = 2, 8  # of a pyramid: a coarse pass needs two, and the eighth of any image is a few pixels
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +39,10 @@ class PyramidConfig:
 
     levels: int = 4  # each halves the size; three detected octaves and one above for convergence
     first: int = 0  # finest level that is computed; 1: a third of the work, twice the error
+
+    def __post_init__(self) -> None:
+        if not _LEAST_LEVELS <= self.levels <= _MOST_LEVELS:
+            raise ValueError(f"levels: expected {_LEAST_LEVELS} to {_MOST_LEVELS}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -248,6 +255,7 @@ class AgentConfig:
     stereo: StereoConfig = field(default_factory=StereoConfig)
     rows: RowConfig = field(default_factory=RowConfig)
     disparities: DisparityAlignmentConfig = field(default_factory=DisparityAlignmentConfig)
+    readout: ReadoutConfig = field(default_factory=ReadoutConfig)
     known_rig: KnownRigConfig = field(default_factory=KnownRigConfig)
     align: AlignConfig = field(default_factory=AlignConfig)
     pose: PoseConfig = field(default_factory=PoseConfig)

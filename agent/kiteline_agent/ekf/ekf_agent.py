@@ -183,6 +183,6 @@ class EkfAgent:
     def motion_reports(self) -> dict[str, Any]:
         """What was found of the odometer; None for what is not there."""
         return {
-            "time_offset": None, "imu_calibration": None,
+            "time_offset": None, "imu_calibration": None, "readout": None,
             "odometer": {"scale": round(self._slam.state.scale, 4)} if self._motion.measured else None,
         }  # fmt: skip

@@ -21,6 +21,7 @@ from kiteline_agent.scans.range_error import RangeError
 from kiteline_agent.scans.scan_stage import Scanned
 from kiteline_agent.step import Identity, StepInput
 from kiteline_agent.tracking.frame_images import NO_GRID
+from kiteline_agent.tracking.readout_kernels import readout_equation
 from kiteline_core.arrays import F64, U8
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration
 from kiteline_core.geometry.cameras import CameraModel, CameraRig, Rectifier
@@ -66,6 +67,7 @@ def warm(config: AgentConfig | None = None) -> None:
         pair = [np.ascontiguousarray(np.roll(one, shift, axis=1)) for one in (image, right)]
         agent.step(StepInput(Frame(k * 50_000_000, pair[0], pair[1]), _resting(k)), k * 50_000_000)
     _warm_disparities()
+    _warm_readout()
     _warm_scans(small)
     _warm_relocalisation(vocabulary, pixels)
     _warm_monocular(image, pixels[:1200].reshape(3, 400).astype(np.float64) / 255.0)
@@ -76,6 +78,15 @@ def _warm_disparities() -> None:
     none, rho, system, point = np.zeros((0, 3)), np.zeros(0), np.empty((11, 12)), np.empty((0, 12))
     linearise_pair(np.zeros((0, 2)), rho, rho, none, np.eye(4), np.ones(5), np.zeros(5), rho, system, point)
     move_points(point, np.zeros(11), 0.0, rho)
+
+
+def _warm_readout() -> None:
+    """A frame without landmarks: the noise's camera does not turn."""
+    none, keyframe = np.zeros((0, 2)), np.zeros((1, 1))
+    readout_equation(
+        np.eye(4), np.ones(5), 1.0, NO_GRID, np.zeros(6), np.zeros(0, np.int64), none, np.zeros(0, np.uint8),
+        np.zeros((0, 2, 2)), none, np.eye(4)[None], np.zeros((1, 1, 2)), keyframe, np.zeros((1, 6)),
+    )  # fmt: skip
 
 
 def _warm_scans(rig: CameraRig) -> None:

@@ -37,7 +37,7 @@ def _exp(xi, r, t):  # type: ignore[no-untyped-def]
 
 
 @njit
-def _solve6(h, g, x):  # type: ignore[no-untyped-def]
+def solve6(h, g, x):  # type: ignore[no-untyped-def]
     """Cholesky solution of the 6x6 system h x = g, in place of h. Returns False when h is not positive definite."""
     for j in range(6):
         s = h[j, j]
@@ -191,7 +191,7 @@ def optimise_pose(  # type: ignore[no-untyped-def]
                 break
             for a in range(6):
                 h[a, a] += 1e-6
-            if not _solve6(h, g, step):
+            if not solve6(h, g, step):
                 break
             _exp(step, dr, dt)
             _apply_left(dr, dt, T_c_m)

@@ -10,6 +10,7 @@ from kiteline_agent.agent import Agent
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_agent.step import Identity, StepInput
+from kiteline_agent.tracking.readout import ReadoutConfig
 from kiteline_agent.tracking.rolling_shutter import RollingShutter
 from kiteline_core.arrays import F64
 from kiteline_core.frame import Frame, ImuBatch, OdometryBatch
@@ -70,7 +71,8 @@ def step_error_m(rolled: Rolled, readout_s: float, begin: int) -> float:
     """Error rms of the motion between frames, from frame `begin` on. readout_s: as the calibration tells it."""
     source, items = rolled
     rig = replace(source.rig, left=replace(source.rig.left, readout_s=readout_s))
-    agent = Agent(rig, source.imu, AgentConfig(), Identity(AgentId(0), 0), NoBaseChannel())
+    config = AgentConfig(readout=ReadoutConfig(on=False))
+    agent = Agent(rig, source.imu, config, Identity(AgentId(0), 0), NoBaseChannel())
     found, imu, frames, truth = [], None, 0, source.ground_truth
     for item in items:
         if isinstance(item, ImuBatch):

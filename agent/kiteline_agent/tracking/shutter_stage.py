@@ -1,0 +1,128 @@
+"""The rolling shutter of the left camera: its motion in each frame, and its read-out where no calibration says it."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from kiteline_agent.local_map import projection_kernels
+from kiteline_agent.local_map.local_map import LocalMap
+from kiteline_agent.tracking.frame_context import FrameContext
+from kiteline_agent.tracking.frame_images import NO_GRID
+from kiteline_agent.tracking.readout import ReadoutConfig, ReadoutEstimate
+from kiteline_agent.tracking.readout_kernels import readout_equation
+from kiteline_agent.tracking.rolling_shutter import RollingShutter
+from kiteline_agent.tracking.track import Track
+from kiteline_core.arrays import F64
+from kiteline_core.geometry import se3
+from kiteline_core.geometry.cameras import Rectifier
+from kiteline_core.ids import SubmapId
+
+_STILL_PX = 0.3  # by which a rolling shutter moves pixels of a vehicle that stands still, at most
+_TURNING_PX = 20.0  # px/s at the image's centre: slower turns tell nothing of a read-out
+_SETTLED_EVERY = 8  # frames of which one is looked at once the read-out has settled
+_FOUND = (
+    "rolling shutter: {:.0f} ms from the first row to the last, found in flight; readout_s: {:.3f} in the calibration "
+    "corrects it from the start"
+)
+_MAX_GAP_S = 0.2  # s between two frames whose poses tell the motion of the second
+
+
+class ShutterStage:
+    """Call `motion` before a frame is tracked, `measure` after it, and `end_frame` once its keyframe is stored."""
+
+    def __init__(
+        self,
+        local_map: LocalMap,
+        rectifier: Rectifier,
+        config: ReadoutConfig,
+        twist: Callable[[int, float], F64 | None],
+    ) -> None:
+        """twist: predicted (6,) of the camera at a stamp, and so many seconds after the last frame; None: unknown."""
+        self._map = local_map
+        self._rectifier = rectifier
+        self._twist = twist
+        self._estimated = config.on and rectifier.readout_s == 0.0
+        self._estimate = ReadoutEstimate(config, rectifier.readout_s)
+        self._motion_known = False  # in the last frame
+        self._last: tuple[int, SubmapId, F64] | None = None  # stamp, submap and T_m_c (4,4) of the last tracked frame
+        self._measured: F64 | None = None  # twist (6,) of this frame by images
+        self._keyframe = local_map.keyframe.copy()
+        self._twists = np.full((len(self._keyframe), 6), np.nan)  # of the images of keyframes
+
+    def motion(self, t_ns: int, dt_s: float) -> RollingShutter | None:
+        """The rolling shutter's motion in a frame; None for a global shutter, and while the motion is unknown."""
+        self._measured = None
+        twist = self._twist(t_ns, dt_s) if self._estimate.readout_s != 0.0 and dt_s > 0.0 else None
+        if twist is None:
+            self._motion_known = False
+            return None
+        shutter = self._shutter(self._estimate.readout_s, twist)
+        if not self._motion_known and shutter.largest_px() < _STILL_PX:
+            self._map.rolled[:] = False  # the vehicle stood still when its motion was unknown
+        self._motion_known = True
+        return shutter
+
+    def measure(self, ctx: FrameContext, track: Track, submap: SubmapId) -> list[str]:
+        """Take what a frame's pose by images tells of the read-out. Returns events."""
+        if not self._estimated:
+            return []
+        T_m_c, last = track.T_m_c, self._last
+        self._last = ctx.t_ns, submap, T_m_c
+        if last is None or last[1] != submap or (dt_s := (ctx.t_ns - last[0]) * 1e-9) > _MAX_GAP_S:
+            return []
+        # 1. How the camera moved since the last frame.
+        self._measured = twist = se3.log(se3.inverse(last[2]) @ T_m_c) / dt_s
+        still = float(np.linalg.norm(twist[3:])) * self._map.intrinsics[0] < _TURNING_PX
+        if still or (self._estimate.settled and ctx.number % _SETTLED_EVERY):
+            return []
+        # 2. How the shutter should have moved what was found, and how far that lies from where the map has it.
+        m, rows = self._map, track.rows
+        warp, parallax = np.empty((len(rows), 2, 2)), np.empty((len(rows), 2))
+        projection_kernels.views(
+            track.T_c_m, m.intrinsics, rows, m.T_m_k, m.bearing, m.rho, m.slant, warp, parallax
+        )  # fmt: skip
+        grid = NO_GRID if self._rectifier.left_grid is None else self._rectifier.left_grid
+        change_s = self._estimate.add(
+            *readout_equation(
+                track.T_c_m, m.intrinsics, float(m.camera.height), grid, twist, rows,
+                np.ascontiguousarray(track.observed[:, :2]), m.octave.take(rows), warp, parallax,
+                m.T_m_k, m.bearing, m.rho, self._twists,
+            )
+        )  # fmt: skip
+        # 3. The map's pixels lie where a frame's stamp has them, by the read-out in use.
+        if change_s == 0.0:
+            return []
+        self._move_map(change_s)
+        readout_s = self._estimate.readout_s
+        return [_FOUND.format(1e3 * readout_s, readout_s)]
+
+    def end_frame(self) -> None:
+        """Note the motion of this frame's image, if a keyframe was made of it."""
+        if self._estimated:
+            new = self._map.keyframe != self._keyframe
+            if new.any():
+                known = self._measured is not None and (self._estimate.readout_s == 0.0 or self._motion_known)
+                self._twists[new] = self._measured if known else np.nan
+                self._keyframe[new] = self._map.keyframe[new]
+
+    def report(self) -> dict[str, Any] | None:
+        """The read-out that was found, in ms, with its deviation; None if none was."""
+        if self._estimate.sigma_s is None:
+            return None
+        return {"ms": round(1e3 * self._estimate.readout_s, 1), "sigma_ms": round(1e3 * self._estimate.sigma_s, 1)}
+
+    def _move_map(self, change_s: float) -> None:
+        """Move the pixels of landmarks in their keyframes, where the motion of these is known."""
+        m, focal = self._map, self._map.intrinsics[:2]
+        for slot in np.flatnonzero(~np.isnan(self._twists[:, 0])).tolist():
+            n = m.counts[slot]
+            shift_px = self._shutter(change_s, self._twists[slot]).to_frame(m.uv[slot, :n], m.rho[slot, :n])[:, :2]
+            shift_px -= m.uv[slot, :n]
+            m.uv[slot, :n] += shift_px
+            m.bearing[slot, :n] += shift_px / focal
+            m.rolled[slot] = False
+
+    def _shutter(self, readout_s: float, twist: F64) -> RollingShutter:
+        camera = self._rectifier.camera
+        return RollingShutter(camera, readout_s, camera.height, self._rectifier.left_grid, twist)
