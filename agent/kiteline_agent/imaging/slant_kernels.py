@@ -14,6 +14,7 @@ from kiteline_agent.imaging.alignment_kernels import (
     PATCH,
     PATCH_RADIUS,
     STRIDE,
+    WARPED,
     _raw_slopes,
     dot,
     level_here,
@@ -89,7 +90,8 @@ def measure_slants(  # type: ignore[no-untyped-def]
     height, width = pyramid[0].shape
     is_raw = grid.shape[0] > 0
     reference = np.zeros((PATCH + 2, STRIDE), np.int16)
-    raw = np.zeros(LANES + STRIDE, np.uint8)
+    around = np.zeros((4, WARPED), np.uint16)
+    raw = np.zeros(2 * (PATCH + 1), np.uint64)
     across = np.zeros(LANES + STRIDE, np.int16)
     patches = np.zeros((10, LANES), np.int16)
     for r in range(PATCH):
@@ -126,7 +128,7 @@ def measure_slants(  # type: ignore[no-untyped-def]
         if x < PATCH_RADIUS or y < PATCH_RADIUS or x >= w - PATCH_RADIUS - 1 or y >= h - PATCH_RADIUS - 1:
             continue
         length = np.sqrt(e0 * e0 + e1 * e1)
-        if not length >= 1e-3 or not warp_template(templates[rows[i], 0], m00, m01, m10, m11, reference):
+        if not length >= 1e-3 or not warp_template(templates[rows[i], 0], m00, m01, m10, m11, around, reference):
             continue
         # 2. What was seen, the template, and what shift and shear would change.
         sample_patch(pyramid[level], x, y, raw, across, patches[0])
