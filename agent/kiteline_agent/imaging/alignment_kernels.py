@@ -156,6 +156,18 @@ def dot(a, b):  # type: ignore[no-untyped-def]
 
 
 @helper
+def eight_pixels(image, row, left):  # type: ignore[no-untyped-def]
+    """Pixels `left` to left + 7 of a row of an image, in one number, the first one lowest: the compiler reads it as one.
+
+    row, left: uint64, so that no index is checked for being negative.
+    """
+    eight = np.uint64(0)
+    for c in range(8):
+        eight |= np.uint64(image[row, left + np.uint64(c)]) << np.uint64(8 * c)
+    return eight
+
+
+@helper
 def sample_patch(image, x, y, raw, across, seen):  # type: ignore[no-untyped-def]
     """Sample the patch around (x, y) in 1/GREY grey levels, with (x, y) rounded to 1/128 px.
 
@@ -169,10 +181,7 @@ def sample_patch(image, x, y, raw, across, seen):  # type: ignore[no-untyped-def
     left = np.uint64(x0 - PATCH_RADIUS)
     for r in range(PATCH + 1):
         row = np.uint64(y0 + r - PATCH_RADIUS)
-        eight = np.uint64(0)
-        for c in range(8):
-            eight |= np.uint64(image[row, left + np.uint64(c)]) << np.uint64(8 * c)
-        raw[2 * r] = eight
+        raw[2 * r] = eight_pixels(image, row, left)
         raw[2 * r + 1] = np.uint64(image[row, left + np.uint64(8)]) | np.uint64(image[row, left + np.uint64(9)]) << 8
     grey = raw.view(np.uint8)
     for k in range(LANES + STRIDE - 1):

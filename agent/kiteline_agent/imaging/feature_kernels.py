@@ -2,9 +2,11 @@
 
 import numpy as np
 
+from kiteline_agent.imaging.alignment_kernels import LANES, STRIDE, dot, eight_pixels
 from kiteline_core.jit import njit
 
 DESCRIPTOR_RADIUS = 15  # px around a corner used by orientation and descriptor
+_WINDOW = 7  # px; side of the window of a corner's score
 BORDER = 18  # least distance of a corner from the image border, px of its level
 
 
@@ -14,22 +16,25 @@ def corner_scores(image, xy, score):  # type: ignore[no-untyped-def]
 
     xy: (n,2) int32 pixels at least 5 px inside. score: (n,) float64 out. The sums are exact: of integers.
     """
-    u1, u2 = np.uint64(1), np.uint64(2)
+    rows = np.zeros(2 * (_WINDOW + 3), np.uint64)  # of STRIDE pixels each
+    grey = rows.view(np.uint8)
+    inside = np.zeros(LANES, np.int16)  # the window, of the rows' columns
+    for r in range(_WINDOW):
+        for q in range(_WINDOW):
+            inside[r * STRIDE + q] = 1
+    dx, dy = np.zeros(LANES, np.int16), np.zeros(LANES, np.int16)
     for i in range(xy.shape[0]):
         left = np.uint64(xy[i, 0] - 4)
-        top = np.uint64(xy[i, 1] - 4)
-        a = np.int32(0)
-        b = np.int32(0)
-        c = np.int32(0)
-        for r in range(7):
-            y = top + np.uint64(r)
-            for q in range(7):
-                x = left + np.uint64(q)
-                dx = np.int32(image[y + u1, x + u2]) - np.int32(image[y + u1, x])
-                dy = np.int32(image[y + u2, x + u1]) - np.int32(image[y, x + u1])
-                a = np.int32(a + dx * dx)
-                b = np.int32(b + dx * dy)
-                c = np.int32(c + dy * dy)
+        for r in range(_WINDOW + 2):
+            y = np.uint64(xy[i, 1] - 4 + r)
+            rows[2 * r] = eight_pixels(image, y, left)
+            rows[2 * r + 1] = image[y, left + np.uint64(8)]
+        for k in range(_WINDOW * STRIDE):
+            j = np.uint64(k)
+            used = np.int32(inside[j])
+            dx[j] = (np.int32(grey[np.uint64(k + STRIDE + 2)]) - np.int32(grey[np.uint64(k + STRIDE)])) * used
+            dy[j] = (np.int32(grey[np.uint64(k + 2 * STRIDE + 1)]) - np.int32(grey[np.uint64(k + 1)])) * used
+        a, b, c = dot(dx, dx), dot(dx, dy), dot(dy, dy)
         # each slope is twice the derivative
         half = 0.125 * (a + c)
         apart = 0.25 * (a - c)
