@@ -157,7 +157,7 @@ def dot(a, b):  # type: ignore[no-untyped-def]
 
 @helper
 def eight_pixels(image, row, left):  # type: ignore[no-untyped-def]
-    """Pixels `left` to left + 7 of a row of an image, in one number, the first one lowest: the compiler reads it as one.
+    """Pixels `left` to left + 7 of a row of an image in one number, the first one lowest: they are read at once.
 
     row, left: uint64, so that no index is checked for being negative.
     """

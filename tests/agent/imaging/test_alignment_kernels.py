@@ -133,7 +133,9 @@ def test_patches_and_their_sums_are_those_of_plain_numpy() -> None:
     steepest = np.abs(np.diff(plain)).max()
     np.testing.assert_allclose(reference[:, : kernels.PATCH + 2] / kernels.GREY, plain, atol=0.04 + steepest / 128)
     assert not from_python(kernels.warp_template)(template, 1.5, 0.6, -0.6, 1.5, around, reference)
-    assert not from_python(kernels.warp_template)(template, 2.1, 0.0, 0.0, 1.0, around, reference)  # along one axis alone
+    assert not from_python(kernels.warp_template)(
+        template, 2.1, 0.0, 0.0, 1.0, around, reference
+    )  # along one axis alone
     assert not from_python(kernels.warp_template)(template, 1.0, 0.0, 0.0, 2.1, around, reference)
 
     patches = np.zeros((5, kernels.LANES), np.int16)
