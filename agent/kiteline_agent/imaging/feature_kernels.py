@@ -123,32 +123,41 @@ def _blur(image, x, y, across, patch):  # type: ignore[no-untyped-def]
 
 
 @njit
-def describe(image, xy, angle, pattern, descriptor):  # type: ignore[no-untyped-def]
-    """Steered binary tests on the smoothed image. xy: (n,2) int32, BORDER px inside. angle: (n,) rad.
+def steer(pattern, angle, tests):  # type: ignore[no-untyped-def]
+    """Turn the pattern of the binary tests by angles (a,) rad.
 
-    pattern: (256,4) float64, x1 y1 x2 y2 within 10 px per axis of the centre. descriptor: (n,32) uint8 out.
+    pattern: (256,4) float64, x1 y1 x2 y2 within 10 px per axis of the centre. tests: (a,2,256) int16 out, places of the
+    first and the second pixel of each test in the smoothed patch of `describe`.
+    """
+    side = 2 * DESCRIPTOR_RADIUS + 1
+    centre = DESCRIPTOR_RADIUS * (side + 1) + DESCRIPTOR_RADIUS
+    for i in range(angle.shape[0]):
+        ca = np.cos(angle[i])
+        sa = np.sin(angle[i])
+        for k in range(256):
+            for end in range(2):
+                px, py = pattern[k, 2 * end], pattern[k, 2 * end + 1]
+                x = int(np.floor(ca * px - sa * py + 0.5))
+                y = int(np.floor(sa * px + ca * py + 0.5))
+                tests[i, end, k] = centre + y * (side + 1) + x
+
+
+@njit
+def describe(image, xy, turn, tests, descriptor):  # type: ignore[no-untyped-def]
+    """Steered binary tests on the smoothed image. xy: (n,2) int32, BORDER px inside. turn: (n,) int64 into tests.
+
+    tests: see `steer`. descriptor: (n,32) uint8 out.
     """
     side = 2 * DESCRIPTOR_RADIUS + 1
     across = np.zeros((side + 6, side + 1), np.uint16)
     patch = np.empty((side, side + 1), np.uint8)
     grey = patch.reshape(-1)
-    centre = DESCRIPTOR_RADIUS * (side + 1) + DESCRIPTOR_RADIUS
-    first = np.empty(256, np.int32)
-    second = np.empty(256, np.int32)
     for i in range(xy.shape[0]):
         _blur(image, xy[i, 0], xy[i, 1], across, patch)
-        ca = np.cos(angle[i])
-        sa = np.sin(angle[i])
-        for k in range(256):
-            x1 = int(np.floor(ca * pattern[k, 0] - sa * pattern[k, 1] + 0.5))
-            y1 = int(np.floor(sa * pattern[k, 0] + ca * pattern[k, 1] + 0.5))
-            x2 = int(np.floor(ca * pattern[k, 2] - sa * pattern[k, 3] + 0.5))
-            y2 = int(np.floor(sa * pattern[k, 2] + ca * pattern[k, 3] + 0.5))
-            first[k] = centre + y1 * (side + 1) + x1
-            second[k] = centre + y2 * (side + 1) + x2
+        first, second = tests[turn[i], 0], tests[turn[i], 1]
         for byte in range(32):
             bits = 0
             for bit in range(8):
-                k = byte * 8 + bit
+                k = np.uint64(byte * 8 + bit)
                 bits |= int(grey[first[k]] < grey[second[k]]) << bit
             descriptor[i, byte] = bits
