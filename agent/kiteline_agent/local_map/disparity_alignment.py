@@ -119,11 +119,11 @@ class DisparityAlignment:
             return None
         self._frames, self._pair_t_ns = 0, t_ns
         slots = (np.bincount(rows // m.slot_size) >= _MIN_POINTS).nonzero()[0].tolist()
-        for slot in slots:
-            if self._keyframe[slot] != m.keyframe[slot]:
-                self._begin(slot)
-        parallaxes = {slot: self._parallax_of(slot, T_c_m) for slot in slots}
-        growth = {slot: now / max(float(self._parallax[slot]), _LEAST_PARALLAX) for slot, now in parallaxes.items()}
+        for k in slots:
+            if self._keyframe[k] != m.keyframe[k]:
+                self._begin(k)
+        parallaxes = {k: self._parallax_of(k, T_c_m) for k in slots}
+        growth = {k: now / max(float(self._parallax[k]), _LEAST_PARALLAX) for k, now in parallaxes.items()}
         slot = max(growth, key=lambda s: growth[s], default=None)
         if slot is None or growth[slot] < _PARALLAX_GROWTH:
             return None

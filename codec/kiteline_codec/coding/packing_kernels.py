@@ -24,7 +24,7 @@ def first_fault(values: I64, low: I64, high: I64, increasing: bool) -> int:
     if increasing:
         for j in range(1, n):
             if values[0, j] <= values[0, j - 1]:
-                return c
+                return int(c)
     return -1
 
 
