@@ -19,6 +19,7 @@ TEMPLATE_RADIUS = 10  # a template is 21x21 px: fits a 9x9 patch rotated by 45 d
 TEMPLATE = 2 * TEMPLATE_RADIUS + 1
 STRIDE = 16  # of a patch's rows: 9 pixels, padded to full vectors
 LANES = PATCH * STRIDE
+WARPED = (PATCH + 2) * STRIDE  # lanes of a warped template: a patch and a pixel around it
 GREY = 16  # steps per grey level of integer patches
 CURVED = (PATCH_RADIUS + 1) / (6.0 * PATCH_RADIUS)  # mean of c^2 / 2 over a patch, over the square of its radius
 TEMPLATE_LEVELS = 3  # octave of the corner, and two coarser ones for convergence
@@ -90,10 +91,11 @@ def cut_templates(pyramid, uv, octave, templates):  # type: ignore[no-untyped-de
 
 
 @helper
-def warp_template(template, w00, w01, w10, w11, reference):  # type: ignore[no-untyped-def]
+def warp_template(template, w00, w01, w10, w11, around, reference):  # type: ignore[no-untyped-def]
     """Sample the warped template. Returns False if the warp exceeds it.
 
-    template: (21,21) uint8. reference: (11,STRIDE) int16 in 1/GREY grey levels, out. In 1/128 px.
+    template: (21,21) uint8. around: (4, WARPED) uint16, for what is read before it is interpolated: pairs of pixels
+    above and below each place, and the place. reference: (11,STRIDE) int16 in 1/GREY grey levels, out. In 1/128 px.
     """
     n = PATCH + 2
     reach = (PATCH_RADIUS + 1.0) * (abs(w00) + abs(w01))
@@ -103,21 +105,31 @@ def warp_template(template, w00, w01, w10, w11, reference):  # type: ignore[no-u
     half = PATCH_RADIUS + 1
     step_x = int(w00 * 65536.0)
     step_y = int(w10 * 65536.0)
+    grey = template.reshape(-1)
+    above, below, along, down = around[0], around[1], around[2], around[3]
     for r in range(n):
         x = int((TEMPLATE_RADIUS - half * w00 + (r - half) * w01) * 65536.0) + 256
         y = int((TEMPLATE_RADIUS - half * w10 + (r - half) * w11) * 65536.0) + 256
         for c in range(n):
-            x0 = np.uint64(x >> 16)
-            y0 = np.uint64(y >> 16)
-            fx = (x >> 9) & 127
-            fy = (y >> 9) & 127
-            a = int(template[y0, x0])
-            b = int(template[y0 + np.uint64(1), x0])
-            top = (a << 7) + fx * (int(template[y0, x0 + np.uint64(1)]) - a)
-            bottom = (b << 7) + fx * (int(template[y0 + np.uint64(1), x0 + np.uint64(1)]) - b)
-            reference[r, c] = ((top << 7) + fy * (bottom - top) + 512) >> 10
+            j = np.uint64(r * STRIDE + c)
+            at = np.uint64((y >> 16) * TEMPLATE + (x >> 16))
+            above[j] = np.uint16(grey[at]) | np.uint16(grey[at + np.uint64(1)]) << 8
+            at += np.uint64(TEMPLATE)
+            below[j] = np.uint16(grey[at]) | np.uint16(grey[at + np.uint64(1)]) << 8
+            along[j] = x >> 9
+            down[j] = y >> 9
             x += step_x
             y += step_y
+    out = reference.reshape(-1)
+    for k in range(WARPED):
+        j = np.uint64(k)
+        fx = np.int32(along[j] & 127)
+        fy = np.int32(down[j] & 127)
+        a = np.int32(above[j] & 255)
+        b = np.int32(below[j] & 255)
+        top = np.int32((a << 7) + fx * (np.int32(above[j] >> 8) - a))
+        bottom = np.int32((b << 7) + fx * (np.int32(below[j] >> 8) - b))
+        out[j] = np.int32((top << 7) + fy * (bottom - top) + 512) >> 10
     return True
 
 
@@ -144,24 +156,38 @@ def dot(a, b):  # type: ignore[no-untyped-def]
 
 
 @helper
+def eight_pixels(image, row, left):  # type: ignore[no-untyped-def]
+    """Pixels `left` to left + 7 of a row of an image in one number, the first one lowest: they are read at once.
+
+    row, left: uint64, so that no index is checked for being negative.
+    """
+    eight = np.uint64(0)
+    for c in range(8):
+        eight |= np.uint64(image[row, left + np.uint64(c)]) << np.uint64(8 * c)
+    return eight
+
+
+@helper
 def sample_patch(image, x, y, raw, across, seen):  # type: ignore[no-untyped-def]
     """Sample the patch around (x, y) in 1/GREY grey levels, with (x, y) rounded to 1/128 px.
 
-    raw: (PATCH + 1, STRIDE) uint8. across: as many int16, for the rows interpolated along x. seen: (LANES,) int16, out.
-    Padding columns are undefined.
+    raw: (2 * PATCH + 2,) uint64, for rows of STRIDE pixels, the first one lowest. across: (LANES + STRIDE,) int16, for
+    the rows interpolated along x. seen: (LANES,) int16, out. Padding columns are undefined.
     """
     x0 = int(x)
     y0 = int(y)
     fx = np.int32((x - x0) * 128.0 + 0.5)
     fy = np.int32((y - y0) * 128.0 + 0.5)
+    left = np.uint64(x0 - PATCH_RADIUS)
     for r in range(PATCH + 1):
         row = np.uint64(y0 + r - PATCH_RADIUS)
-        for c in range(PATCH + 1):
-            raw[r * STRIDE + c] = image[row, np.uint64(x0 + c - PATCH_RADIUS)]
+        raw[2 * r] = eight_pixels(image, row, left)
+        raw[2 * r + 1] = np.uint64(image[row, left + np.uint64(8)]) | np.uint64(image[row, left + np.uint64(9)]) << 8
+    grey = raw.view(np.uint8)
     for k in range(LANES + STRIDE - 1):
         j = np.uint64(k)
-        a = np.int32(raw[j])
-        across[j] = np.int16((a << 7) + fx * (np.int32(raw[np.uint64(k + 1)]) - a))
+        a = np.int32(grey[j])
+        across[j] = np.int16((a << 7) + fx * (np.int32(grey[np.uint64(k + 1)]) - a))
     for k in range(LANES - 1):
         j = np.uint64(k)
         a = np.int32(across[j])
@@ -279,7 +305,8 @@ def align(  # type: ignore[no-untyped-def]
     height, width = pyramid[0].shape
     is_raw = grid.shape[0] > 0
     reference = np.zeros((PATCH + 2, STRIDE), np.int16)
-    raw = np.zeros(LANES + STRIDE, np.uint8)
+    around = np.zeros((4, WARPED), np.uint16)
+    raw = np.zeros(2 * (PATCH + 1), np.uint64)
     across = np.zeros(LANES + STRIDE, np.int16)
     patches = np.zeros((5, LANES), np.int16)
     for r in range(PATCH):
@@ -314,7 +341,7 @@ def align(  # type: ignore[no-untyped-def]
                 part = 1.0 / (ux * vy - uy * vx)
                 xu, xv, yu, yv = vy * part, -uy * part, -vx * part, ux * part
                 m00, m01, m10, m11 = through_lens(m00, m01, m10, m11, xu, xv, yu, yv)
-            if not warp_template(templates[rows[i], j], m00, m01, m10, m11, reference):
+            if not warp_template(templates[rows[i], j], m00, m01, m10, m11, around, reference):
                 continue
             template_gradients(reference, patches)
             px, py, score, ok = _align_level(

@@ -2,7 +2,15 @@
 
 import numpy as np
 
-from kiteline_agent.imaging.alignment_kernels import GREY, PATCH, PATCH_RADIUS, STRIDE, TEMPLATE_LEVELS, warp_template
+from kiteline_agent.imaging.alignment_kernels import (
+    GREY,
+    PATCH,
+    PATCH_RADIUS,
+    STRIDE,
+    TEMPLATE_LEVELS,
+    WARPED,
+    warp_template,
+)
 from kiteline_agent.imaging.rectification_kernels import ROOM, SIDE, _rectify_patch
 from kiteline_core.jit import njit
 
@@ -20,6 +28,7 @@ def search_segments(  # type: ignore[no-untyped-def]
     uv: (n,2) float64 level-0 px out. found: (n,) int8 out: 1 found, 0 nothing alike, -1 not sure which, or out of view.
     """
     levels = len(pyramid)
+    around = np.zeros((4, WARPED), np.uint16)
     reference = np.empty((PATCH + 2, STRIDE), np.int16)
     t0 = np.empty((PATCH, PATCH))
     score = np.empty(max_steps + 1)
@@ -48,6 +57,7 @@ def search_segments(  # type: ignore[no-untyped-def]
             -warp[i, 0, 1] * ratio,
             -warp[i, 1, 0] * ratio,
             warp[i, 0, 0] * ratio,
+            around,
             reference,
         )
         if not inside:

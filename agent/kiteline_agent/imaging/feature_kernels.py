@@ -2,9 +2,11 @@
 
 import numpy as np
 
+from kiteline_agent.imaging.alignment_kernels import LANES, STRIDE, dot, eight_pixels
 from kiteline_core.jit import njit
 
 DESCRIPTOR_RADIUS = 15  # px around a corner used by orientation and descriptor
+_WINDOW = 7  # px; side of the window of a corner's score
 BORDER = 18  # least distance of a corner from the image border, px of its level
 
 
@@ -14,22 +16,25 @@ def corner_scores(image, xy, score):  # type: ignore[no-untyped-def]
 
     xy: (n,2) int32 pixels at least 5 px inside. score: (n,) float64 out. The sums are exact: of integers.
     """
-    u1, u2 = np.uint64(1), np.uint64(2)
+    rows = np.zeros(2 * (_WINDOW + 3), np.uint64)  # of STRIDE pixels each
+    grey = rows.view(np.uint8)
+    inside = np.zeros(LANES, np.int16)  # the window, of the rows' columns
+    for r in range(_WINDOW):
+        for q in range(_WINDOW):
+            inside[r * STRIDE + q] = 1
+    dx, dy = np.zeros(LANES, np.int16), np.zeros(LANES, np.int16)
     for i in range(xy.shape[0]):
         left = np.uint64(xy[i, 0] - 4)
-        top = np.uint64(xy[i, 1] - 4)
-        a = np.int32(0)
-        b = np.int32(0)
-        c = np.int32(0)
-        for r in range(7):
-            y = top + np.uint64(r)
-            for q in range(7):
-                x = left + np.uint64(q)
-                dx = np.int32(image[y + u1, x + u2]) - np.int32(image[y + u1, x])
-                dy = np.int32(image[y + u2, x + u1]) - np.int32(image[y, x + u1])
-                a = np.int32(a + dx * dx)
-                b = np.int32(b + dx * dy)
-                c = np.int32(c + dy * dy)
+        for r in range(_WINDOW + 2):
+            y = np.uint64(xy[i, 1] - 4 + r)
+            rows[2 * r] = eight_pixels(image, y, left)
+            rows[2 * r + 1] = image[y, left + np.uint64(8)]
+        for k in range(_WINDOW * STRIDE):
+            j = np.uint64(k)
+            used = np.int32(inside[j])
+            dx[j] = (np.int32(grey[np.uint64(k + STRIDE + 2)]) - np.int32(grey[np.uint64(k + STRIDE)])) * used
+            dy[j] = (np.int32(grey[np.uint64(k + 2 * STRIDE + 1)]) - np.int32(grey[np.uint64(k + 1)])) * used
+        a, b, c = dot(dx, dx), dot(dx, dy), dot(dy, dy)
         # each slope is twice the derivative
         half = 0.125 * (a + c)
         apart = 0.25 * (a - c)
@@ -118,32 +123,41 @@ def _blur(image, x, y, across, patch):  # type: ignore[no-untyped-def]
 
 
 @njit
-def describe(image, xy, angle, pattern, descriptor):  # type: ignore[no-untyped-def]
-    """Steered binary tests on the smoothed image. xy: (n,2) int32, BORDER px inside. angle: (n,) rad.
+def steer(pattern, angle, tests):  # type: ignore[no-untyped-def]
+    """Turn the pattern of the binary tests by angles (a,) rad.
 
-    pattern: (256,4) float64, x1 y1 x2 y2 within 10 px per axis of the centre. descriptor: (n,32) uint8 out.
+    pattern: (256,4) float64, x1 y1 x2 y2 within 10 px per axis of the centre. tests: (a,2,256) int16 out, places of the
+    first and the second pixel of each test in the smoothed patch of `describe`.
+    """
+    side = 2 * DESCRIPTOR_RADIUS + 1
+    centre = DESCRIPTOR_RADIUS * (side + 1) + DESCRIPTOR_RADIUS
+    for i in range(angle.shape[0]):
+        ca = np.cos(angle[i])
+        sa = np.sin(angle[i])
+        for k in range(256):
+            for end in range(2):
+                px, py = pattern[k, 2 * end], pattern[k, 2 * end + 1]
+                x = int(np.floor(ca * px - sa * py + 0.5))
+                y = int(np.floor(sa * px + ca * py + 0.5))
+                tests[i, end, k] = centre + y * (side + 1) + x
+
+
+@njit
+def describe(image, xy, turn, tests, descriptor):  # type: ignore[no-untyped-def]
+    """Steered binary tests on the smoothed image. xy: (n,2) int32, BORDER px inside. turn: (n,) int64 into tests.
+
+    tests: see `steer`. descriptor: (n,32) uint8 out.
     """
     side = 2 * DESCRIPTOR_RADIUS + 1
     across = np.zeros((side + 6, side + 1), np.uint16)
     patch = np.empty((side, side + 1), np.uint8)
     grey = patch.reshape(-1)
-    centre = DESCRIPTOR_RADIUS * (side + 1) + DESCRIPTOR_RADIUS
-    first = np.empty(256, np.int32)
-    second = np.empty(256, np.int32)
     for i in range(xy.shape[0]):
         _blur(image, xy[i, 0], xy[i, 1], across, patch)
-        ca = np.cos(angle[i])
-        sa = np.sin(angle[i])
-        for k in range(256):
-            x1 = int(np.floor(ca * pattern[k, 0] - sa * pattern[k, 1] + 0.5))
-            y1 = int(np.floor(sa * pattern[k, 0] + ca * pattern[k, 1] + 0.5))
-            x2 = int(np.floor(ca * pattern[k, 2] - sa * pattern[k, 3] + 0.5))
-            y2 = int(np.floor(sa * pattern[k, 2] + ca * pattern[k, 3] + 0.5))
-            first[k] = centre + y1 * (side + 1) + x1
-            second[k] = centre + y2 * (side + 1) + x2
+        first, second = tests[turn[i], 0], tests[turn[i], 1]
         for byte in range(32):
             bits = 0
             for bit in range(8):
-                k = byte * 8 + bit
+                k = np.uint64(byte * 8 + bit)
                 bits |= int(grey[first[k]] < grey[second[k]]) << bit
             descriptor[i, byte] = bits

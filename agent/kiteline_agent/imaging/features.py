@@ -2,13 +2,14 @@
 
 import math
 from dataclasses import dataclass
+from functools import cache
 
 import cv2
 import numpy as np
 
 from kiteline_agent.imaging import feature_kernels as kernels
 from kiteline_agent.imaging.corner_kernels import fast_corners
-from kiteline_core.arrays import F64, U8
+from kiteline_core.arrays import F64, I16, U8
 
 Pyramid = tuple[U8, ...]
 
@@ -33,6 +34,14 @@ def _pattern() -> F64:
 
 
 PATTERN = _pattern()
+
+
+@cache
+def _steered_tests() -> I16:
+    """The tests at each of 256 angles, see `feature_kernels.steer`."""
+    tests = np.empty((256, 2, len(PATTERN)), np.int16)
+    kernels.steer(PATTERN, np.arange(256) * (np.pi / 128.0), tests)
+    return tests
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,6 +153,6 @@ def describe(pyramid: Pyramid, uv: F64, octave: U8) -> tuple[U8, U8]:
         kernels.orientations(pyramid[level], xy, angle)
         code = np.round(angle * (128.0 / np.pi)).astype(np.int64) & 255
         bits = np.empty((len(rows), 32), np.uint8)
-        kernels.describe(pyramid[level], xy, code * (np.pi / 128.0), PATTERN, bits)
+        kernels.describe(pyramid[level], xy, code, _steered_tests(), bits)
         angle_code[rows], descriptor[rows] = code.astype(np.uint8), bits
     return angle_code, descriptor

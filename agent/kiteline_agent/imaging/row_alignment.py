@@ -60,6 +60,7 @@ class RowAlignment:
     def __init__(self, rectifier: Rectifier, config: RowConfig) -> None:
         self._rectifier = rectifier
         self._config = config
+        self.estimate_px: F64 = np.zeros(TERMS)  # the offset as measured so far, applied or not
         self._forget()
         self._at = np.zeros((1, TERMS))  # terms at the last keyframe's points
         self._taken_px: F64 = np.zeros(TERMS)  # see take_change
@@ -73,7 +74,12 @@ class RowAlignment:
         self.applied_px: F64 = np.zeros(TERMS)  # the offset, as factors of `terms` at pixels of the right image
 
     def _forget(self) -> None:
-        self._information, self._vector = np.diag(np.full(TERMS, _PRIOR_PX**-2.0)), np.zeros(TERMS)
+        self._know(np.diag(np.full(TERMS, _PRIOR_PX**-2.0)), np.zeros(TERMS))
+
+    def _know(self, information: F64, vector: F64) -> None:
+        """Set the information (5,5) about the offset, and its product (5,) with the estimate."""
+        self._information, self._vector = information, vector
+        self.estimate_px = np.asarray(np.linalg.solve(information, vector), np.float64)
 
     def add(
         self, left: tuple[U8, ...], right: tuple[U8, ...], uv: F64,
@@ -98,15 +104,19 @@ class RowAlignment:
         total = offset[found] + at @ self.applied_px
         sigma = config.sigma_px * (1 << octave[found]).astype(np.float64)
         weight: F64 = np.ones(len(total), np.float64)
-        for _ in range(_ROUNDS):
-            scaled = at * (weight / sigma**2)[:, None]
-            information, vector = self._information + scaled.T @ at, self._vector + scaled.T @ total
-            residual = np.abs(total - at @ np.linalg.solve(information, vector)) / sigma
+        for _ in range(_ROUNDS - 1):
+            residual = np.abs(total - at @ np.linalg.solve(*self._with(at, total, weight / sigma**2))) / sigma
             weight = 1.0 / np.maximum(residual, 1.0) ** 2  # a point on an occluding edge counts little
-        self._information, self._vector, self._at = information, vector, at
+        self._know(*self._with(at, total, weight / sigma**2))
+        self._at = at
         self._measured = self.known = True
         self._weigh()
         return count
+
+    def _with(self, at: F64, total: F64, weight: F64) -> tuple[F64, F64]:
+        """Information and vector with offsets (n,) px at points whose terms are (n,5), of weights (n,) 1/px^2."""
+        scaled = at * weight[:, None]
+        return self._information + scaled.T @ at, self._vector + scaled.T @ total
 
     def at(self, uv: F64) -> F64:
         """By how much (n,) px the right image is read lower, at pixels (n,2) of it."""
@@ -132,10 +142,8 @@ class RowAlignment:
         """
         estimate = self.estimate_px
         change = estimate - self.applied_px
-        at = self._at
-        rms = float(np.sqrt(np.mean((at @ change) ** 2)))
-        sigma = float(np.sqrt(np.mean(np.einsum("ni,in->n", at, np.linalg.solve(self._information, at.T)))))
-        if not self._rough and (rms < _MIN_CHANGE_PX or rms < _MIN_SIGNIFICANCE * sigma):
+        rms = float(np.sqrt(np.mean((self._at @ change) ** 2)))
+        if not self._rough and (rms < _MIN_CHANGE_PX or rms < _MIN_SIGNIFICANCE * self._sigma_px()):
             return 0.0
         self._read_at(estimate)
         said = f"rows of the right image are {estimate[0]:+.2f} px off in the middle"
@@ -143,23 +151,23 @@ class RowAlignment:
         self._rough = False
         return rms
 
+    def _sigma_px(self) -> float:
+        """Standard deviation of the estimate, rms over the last points."""
+        at = self._at
+        return float(np.sqrt(np.mean(np.einsum("ni,in->n", at, np.linalg.solve(self._information, at.T)))))
+
     @property
     def read(self) -> bool:
         """True if the right image is read at its rows."""
         return bool(self.applied_px.any())
-
-    @property
-    def estimate_px(self) -> F64:
-        """The offset (5,) as measured so far, applied or not."""
-        return np.asarray(np.linalg.solve(self._information, self._vector), np.float64)
 
     def begin_with(self, rows_px: F64, *, read: bool) -> None:
         """Begin with the offset (5,) that an earlier flight measured. read: it read the right image there.
 
         Disparities that were calibrated with the rows as they came would not fit others.
         """
-        self._information = np.diag(np.full(TERMS, _KNOWN_PX**-2.0))
-        self._vector = self._information @ rows_px
+        information = np.diag(np.full(TERMS, _KNOWN_PX**-2.0))
+        self._know(information, information @ rows_px)
         self._taken_px = rows_px
         self.known = True
         self._weigh()

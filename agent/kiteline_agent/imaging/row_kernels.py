@@ -13,25 +13,16 @@ LEAST_PIVOT = 100.0  # sum of squared gradients across the weaker direction: les
 
 
 @njit
-def _dot(a, b):  # type: ignore[no-untyped-def]
-    total = 0.0
+def _dots(a, b, c, d):  # type: ignore[no-untyped-def]
+    """Sums of products of a patch with itself and with three others: in one loop none waits for another."""
+    aa, ab, ac, ad = 0.0, 0.0, 0.0, 0.0
     for r in range(SIDE):
-        for c in range(SIDE):
-            total += a[r, c] * b[r, c]
-    return total
-
-
-@njit
-def _centre(a):  # type: ignore[no-untyped-def]
-    """Subtract the mean."""
-    total = 0.0
-    for r in range(SIDE):
-        for c in range(SIDE):
-            total += a[r, c]
-    mean = total / (SIDE * SIDE)
-    for r in range(SIDE):
-        for c in range(SIDE):
-            a[r, c] -= mean
+        for k in range(SIDE):
+            aa += a[r, k] * a[r, k]
+            ab += a[r, k] * b[r, k]
+            ac += a[r, k] * c[r, k]
+            ad += a[r, k] * d[r, k]
+    return aa, ab, ac, ad
 
 
 @njit
@@ -59,23 +50,33 @@ def _cut(image, x, y, patch, gu, gv):  # type: ignore[no-untyped-def]
             wide[r, c] = (
                 w00 * image[a, b] + w01 * image[a, b + 1] + w10 * image[a + 1, b] + w11 * image[a + 1, b + 1]
             )  # fmt: skip
+    mean, mean_u, mean_v = 0.0, 0.0, 0.0
     for r in range(SIDE):
         for c in range(SIDE):
             patch[r, c] = wide[r + 1, c + 1]
             gu[r, c] = 0.5 * (wide[r + 1, c + 2] - wide[r + 1, c])
             gv[r, c] = 0.5 * (wide[r + 2, c + 1] - wide[r, c + 1])
-    _centre(patch)
-    _centre(gu)
-    _centre(gv)
-    tt = _dot(patch, patch) + 1e-9
-    _take_off(gu, _dot(patch, gu) / tt, patch)
-    _take_off(gv, _dot(patch, gv) / tt, patch)
+            mean += patch[r, c]
+            mean_u += gu[r, c]
+            mean_v += gv[r, c]
+    mean, mean_u, mean_v = mean / (SIDE * SIDE), mean_u / (SIDE * SIDE), mean_v / (SIDE * SIDE)
+    for r in range(SIDE):
+        for c in range(SIDE):
+            patch[r, c] -= mean
+            gu[r, c] -= mean_u
+            gv[r, c] -= mean_v
+    tt, _, tu, tv = _dots(patch, patch, gu, gv)
+    tt += 1e-9
+    _take_off(gu, tu / tt, patch)
+    _take_off(gv, tv / tt, patch)
     return tt
 
 
 @njit
 def _sample(image, grid, scale, x, y, out):  # type: ignore[no-untyped-def]
-    """Patch of the right image around rectified (x, y) of a level; False outside. Distortion is affine over it."""
+    """Patch of the right image around rectified (x, y) of a level, zero-mean; False outside. Distortion is affine over
+    it.
+    """
     h, w = image.shape
     u, v, uu, uv, vu, vv = x, y, 1.0, 0.0, 0.0, 1.0
     if grid.shape[0] > 0:
@@ -90,6 +91,7 @@ def _sample(image, grid, scale, x, y, out):  # type: ignore[no-untyped-def]
     room = 1.5 * RADIUS + 2.0
     if u < room or v < room or u > w - 1.0 - room or v > h - 1.0 - room:
         return False
+    mean = 0.0
     for r in range(SIDE):
         for c in range(SIDE):
             du, dv = c - RADIUS, r - RADIUS
@@ -99,6 +101,11 @@ def _sample(image, grid, scale, x, y, out):  # type: ignore[no-untyped-def]
             top = image[a, b] * (1.0 - fx) + image[a, b + 1] * fx
             bottom = image[a + 1, b] * (1.0 - fx) + image[a + 1, b + 1] * fx
             out[r, c] = top + fy * (bottom - top)
+            mean += out[r, c]
+    mean = mean / (SIDE * SIDE)
+    for r in range(SIDE):
+        for c in range(SIDE):
+            out[r, c] -= mean
     return True
 
 
@@ -125,7 +132,8 @@ def measure_rows(  # type: ignore[no-untyped-def]
         if x < RADIUS + 1 or y < RADIUS + 1 or x >= w - RADIUS - 3 or y >= h - RADIUS - 3:
             continue
         tt = _cut(left[level], x, y, patch, gu, gv)
-        huu, huv, hvv = _dot(gu, gu), _dot(gu, gv), _dot(gv, gv)
+        huu, huv, _, _ = _dots(gu, gv, gv, gv)
+        hvv, _, _, _ = _dots(gv, gv, gv, gv)
         pivot = hvv - huv * huv / max(huu, 1e-9)
         if pivot < LEAST_PIVOT or huu < LEAST_PIVOT:
             continue
@@ -133,12 +141,12 @@ def measure_rows(  # type: ignore[no-untyped-def]
         for _ in range(iterations):
             if not _sample(right[level], grid, s, xr, yr, other):
                 break
-            _centre(other)
-            gain = _dot(other, patch) / tt
-            ncc = gain * np.sqrt(tt / max(_dot(other, other), 1e-9))
+            square, along, bu, bv = _dots(other, patch, gu, gv)
+            gain = along / tt
+            ncc = gain * np.sqrt(tt / max(square, 1e-9))
             if gain < 0.1:
                 break
-            bu, bv = -_dot(other, gu) / gain, -_dot(other, gv) / gain
+            bu, bv = -bu / gain, -bv / gain
             dv = (bv - huv / huu * bu) / pivot
             du = (bu - huv * dv) / huu
             if abs(du) < CONVERGED_PX and abs(dv) < CONVERGED_PX:

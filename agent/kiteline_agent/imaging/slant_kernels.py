@@ -14,6 +14,7 @@ from kiteline_agent.imaging.alignment_kernels import (
     PATCH,
     PATCH_RADIUS,
     STRIDE,
+    WARPED,
     _raw_slopes,
     dot,
     level_here,
@@ -25,6 +26,7 @@ from kiteline_agent.imaging.alignment_kernels import (
 )
 from kiteline_core.jit import njit
 
+_TINY = 1e-12  # of information: nothing
 _NUISANCES = 4  # constant, template, shift along x and y: eliminated before the shear
 _DIRECTION_BITS = 8  # of a direction's components
 _SHORTER_BITS = 2  # by which shear images are shortened: sums of their squares fit into 31 bits
@@ -88,7 +90,8 @@ def measure_slants(  # type: ignore[no-untyped-def]
     height, width = pyramid[0].shape
     is_raw = grid.shape[0] > 0
     reference = np.zeros((PATCH + 2, STRIDE), np.int16)
-    raw = np.zeros(LANES + STRIDE, np.uint8)
+    around = np.zeros((4, WARPED), np.uint16)
+    raw = np.zeros(2 * (PATCH + 1), np.uint64)
     across = np.zeros(LANES + STRIDE, np.int16)
     patches = np.zeros((10, LANES), np.int16)
     for r in range(PATCH):
@@ -125,7 +128,7 @@ def measure_slants(  # type: ignore[no-untyped-def]
         if x < PATCH_RADIUS or y < PATCH_RADIUS or x >= w - PATCH_RADIUS - 1 or y >= h - PATCH_RADIUS - 1:
             continue
         length = np.sqrt(e0 * e0 + e1 * e1)
-        if not length >= 1e-3 or not warp_template(templates[rows[i], 0], m00, m01, m10, m11, reference):
+        if not length >= 1e-3 or not warp_template(templates[rows[i], 0], m00, m01, m10, m11, around, reference):
             continue
         # 2. What was seen, the template, and what shift and shear would change.
         sample_patch(pyramid[level], x, y, raw, across, patches[0])
@@ -155,3 +158,35 @@ def measure_slants(  # type: ignore[no-untyped-def]
         equations[i, 2] = (j01 * k01 + j11 * k11) / variance
         equations[i, 3] = (j00 * g0 + j10 * g1) / variance
         equations[i, 4] = (j01 * g0 + j11 * g1) / variance
+
+
+@njit
+def fuse_slants(  # type: ignore[no-untyped-def]
+    rows, octave, equations, most_forgotten, prior, focal, most_change, known, slant
+):
+    """Take over measurements of landmarks: the most probable slants after them.
+
+    rows: (n,) int64, all different, into known and slant. octave: (n,) uint8, of the templates. equations: (n,5), see
+    `measure_slants`. most_forgotten: share of what was known that is forgotten, at most. prior: information about each
+    component. focal: px, of the template's image. most_change: of the inverse depth, from the middle of a patch to its
+    edge. known: (N,5) information (xx, xy, yy) on slants, and its product with them (x, y). slant: (N,2). Both in and
+    out.
+    """
+    for i in range(rows.shape[0]):
+        row = rows[i]
+        # 1. What is told of the slant itself, not of its error.
+        xx, xy, yy = equations[i, 0], equations[i, 1], equations[i, 2]
+        sx, sy = slant[row, 0], slant[row, 1]
+        bx, by = equations[i, 3] + xx * sx + xy * sy, equations[i, 4] + xy * sx + yy * sy
+        # 2. No more is forgotten than is told: where a vehicle hovers nothing is, and its disparities need the slants.
+        share = (xx + yy) / max(known[row, 0] + known[row, 2], xx + yy + _TINY)
+        kept = 1.0 - min(most_forgotten, share)
+        xx, xy, yy = kept * known[row, 0] + xx, kept * known[row, 1] + xy, kept * known[row, 2] + yy
+        bx, by = kept * known[row, 3] + bx, kept * known[row, 4] + by
+        known[row, 0], known[row, 1], known[row, 2], known[row, 3], known[row, 4] = xx, xy, yy, bx, by
+        # 3. The most probable slant, no steeper than an edge.
+        xx, yy = xx + prior, yy + prior
+        det = xx * yy - xy * xy
+        steepest = most_change / (float(PATCH_RADIUS << octave[i]) / focal)
+        slant[row, 0] = min(max((yy * bx - xy * by) / det, -steepest), steepest)
+        slant[row, 1] = min(max((xx * by - xy * bx) / det, -steepest), steepest)

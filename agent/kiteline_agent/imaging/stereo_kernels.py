@@ -21,10 +21,6 @@ def _row_costs(patch, image, y, first, mean, columns, total, cost):  # type: ign
     negative ones), so that they are vectorised.
     """
     n = cost.shape[0]
-    for k in range(n):
-        j = np.uint64(k)
-        total[j] = 0
-        cost[j] = 0
     for k in range(n + SIDE - 1):
         columns[np.uint64(k)] = 0
     for r in range(SIDE):
@@ -32,22 +28,22 @@ def _row_costs(patch, image, y, first, mean, columns, total, cost):  # type: ign
         for k in range(n + SIDE - 1):
             j = np.uint64(k)
             columns[j] += np.int32(line[j])
-    for c in range(SIDE):
-        sums = columns[c : c + n]
-        for k in range(n):
-            j = np.uint64(k)
-            total[j] += sums[j]
     for k in range(n):
         j = np.uint64(k)
-        total[j] = mean - total[j] // (SIDE * SIDE)
+        t = np.int32(0)
+        for c in range(SIDE):
+            t = np.int32(t + columns[np.uint64(k + c)])
+        total[j] = mean - t // (SIDE * SIDE)
+        cost[j] = 0
     for r in range(SIDE):
         line = image[y + r - RADIUS, first : first + n + SIDE - 1]
-        for c in range(SIDE):
-            shifted = line[c : c + n]
-            here = np.int32(patch[r, c])
-            for k in range(n):
-                j = np.uint64(k)
-                cost[j] += np.int32(abs(np.int32(here - shifted[j] - total[j])))
+        here = patch[r]
+        for k in range(n):
+            j = np.uint64(k)
+            t = cost[j]
+            for c in range(SIDE):
+                t = np.int32(t + abs(np.int32(here[np.uint64(c)] - line[np.uint64(k + c)] - total[j])))
+            cost[j] = t
 
 
 @njit

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from kiteline_agent.config import KeyframeConfig
+from kiteline_agent.imaging.feature_kernels import occupy
 from kiteline_agent.tracking.track import Track
 from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
@@ -100,7 +101,6 @@ def coverage(uv: F64, camera: RectifiedCamera) -> float:
     side_px = round(math.sqrt(camera.width * camera.height / _COVER_CELLS))
     columns = -(-camera.width // side_px)
     rows = -(-camera.height // side_px)
-    column, row = (uv / side_px).astype(np.int64).T
     covered = np.zeros((rows, columns), np.bool_)
-    covered[row, column] = True
+    occupy(np.ascontiguousarray(uv, np.float64), float(side_px), covered)
     return float(np.count_nonzero(covered) / covered.size)

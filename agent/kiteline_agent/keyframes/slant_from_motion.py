@@ -8,8 +8,7 @@ import numpy as np
 
 from kiteline_agent.config import SlantConfig
 from kiteline_agent.governor.cost_model import Work
-from kiteline_agent.imaging.alignment_kernels import PATCH_RADIUS
-from kiteline_agent.imaging.slant_kernels import measure_slants
+from kiteline_agent.imaging.slant_kernels import fuse_slants, measure_slants
 from kiteline_agent.local_map import projection_kernels
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.tracking.frame_context import FrameContext
@@ -19,7 +18,6 @@ from kiteline_core.arrays import F64, I64
 _LEAST_GREY = 2.0  # grey levels; deviation of a pixel: noise, and what interpolation costs
 _LONGEST_S = 0.15  # s between frames; of slower cameras a landmark is seen too few times, too differently
 _INFLATION = 16.0  # factor on variances: pixels of a patch share errors of the lens and of blur, all those of the pose
-_TINY = 1e-12  # of information: nothing
 _MOST_CHANGE = 0.5  # of the inverse depth, from the middle of a patch to its edge: steeper surfaces are edges
 
 
@@ -58,21 +56,8 @@ class SlantFromMotion:
 
     def _fuse(self, rows: I64, equations: F64, config: SlantConfig) -> None:
         """Take over measurements (n,5) of rows (n,), see `measure_slants`: the most probable slants after them."""
-        m, sigma = self._map, config.sigma
-        slant, known = m.slant.reshape(-1, 2), m.slant_equations.reshape(-1, 5)
-        # 1. What is told of the slant itself, not of its error.
-        xx, xy, yy, bx, by = equations.T
-        sx, sy = slant.take(rows, 0).T
-        told = np.column_stack([xx, xy, yy, bx + xx * sx + xy * sy, by + xy * sx + yy * sy])
-        # 2. No more is forgotten than is told: where a vehicle hovers nothing is, and its disparities need the slants.
-        before = known.take(rows, 0)
-        share = (xx + yy) / np.maximum(before[:, 0] + before[:, 2], xx + yy + _TINY)
-        forgotten = np.minimum(max(1.0 - config.memory, 0.0), share)
-        known[rows] = total = (1.0 - forgotten)[:, None] * before + told
-        # 3. The most probable slant, no steeper than an edge.
-        xx, xy, yy, bx, by = total.T
-        xx, yy = xx + sigma**-2, yy + sigma**-2
-        found = np.column_stack([yy * bx - xy * by, xx * by - xy * bx]) / (xx * yy - xy**2)[:, None]
-        patch = PATCH_RADIUS * np.ldexp(1.0, m.octave.take(rows).astype(np.int32)) / m.camera.fx
-        steepest = _MOST_CHANGE / patch[:, None]
-        slant[rows] = np.clip(found, -steepest, steepest)
+        m, most_forgotten, prior = self._map, max(1.0 - config.memory, 0.0), config.sigma**-2
+        known, slant = m.slant_equations.reshape(-1, 5), m.slant.reshape(-1, 2)
+        fuse_slants(
+            rows, m.octave.take(rows), equations, most_forgotten, prior, m.camera.fx, _MOST_CHANGE, known, slant
+        )

@@ -16,7 +16,7 @@ import numpy as np
 from kiteline_agent.config import DisparityAlignmentConfig
 from kiteline_agent.local_map import disparity_kernels as kernels
 from kiteline_agent.local_map.local_map import LocalMap
-from kiteline_agent.local_map.offset_evidence import log_evidence, probability
+from kiteline_agent.local_map.offset_evidence import Prior, probability
 from kiteline_core.arrays import F64, I64
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.disparity_offset import GOOD_PX, TERMS, none, terms
@@ -45,6 +45,7 @@ _FORWARD_GOOD_KEYFRAMES = 3  # the same of a good calibration's offset, which is
 _PAIR_EVERY_S = 0.18  # s between two pairs, at most: slow cameras, and frames that the governor skips
 _PARALLAX_GROWTH = 1.2  # of the parallax between two pairs of the same keyframe
 _WORN_SHARE = 0.2  # probability of a worn rig before the flight
+_DIAGONAL = np.diag_indices(kernels.UNKNOWNS)
 _SURE = 0.95  # probability of a worn rig above which the offset is applied
 
 
@@ -69,16 +70,16 @@ class DisparityAlignment:
         self._share = np.ones(slots)
         self._evicted_sure_h, self._evicted_sure_b = np.zeros((TERMS, TERMS)), np.zeros(TERMS)
         self._refuted = False  # earlier flights were of another rig; the map still has their offset
-        self._prior = np.diag(np.array([_PRIOR_PX, *[_PRIOR_SLOPE_RAD * camera.fx] * (TERMS - 1)]) ** -2.0)
-        self._bent = self._prior / _BENT**2
+        self._prior = Prior(np.diag(np.array([_PRIOR_PX, *[_PRIOR_SLOPE_RAD * camera.fx] * (TERMS - 1)]) ** -2.0))
+        self._bent = Prior(self._prior.information / _BENT**2)
         x, y = np.meshgrid(np.linspace(0.0, camera.width, 7), np.linspace(0.0, camera.height, 5))
         self._grid = terms(np.stack([(x.ravel() - camera.cx) / camera.fx, (y.ravel() - camera.cy) / camera.fy], 1))
         # A good calibration is as good at the edges of a wide view.
-        self._good = np.diag((np.maximum(np.abs(self._grid).max(axis=0), 1.0) / GOOD_PX) ** 2)
+        self._good = Prior(np.diag((np.maximum(np.abs(self._grid).max(axis=0), 1.0) / GOOD_PX) ** 2))
         self._frames = 0  # since the last one that could make a pair
         self._pair_t_ns: int | None = None  # of that one
         self.pairs = 0  # compared so far
-        self._estimate, self.cov = none(), np.linalg.inv(self._prior)
+        self._estimate, self.cov = none(), np.linalg.inv(self._prior.information)
         # If the rig is not worn: what was expected of it, its most probable offset, and the information about that.
         self.expected_px, self._good_estimate, self._good_h = none(), none(), np.zeros((TERMS, TERMS))
         self._prior_log_odds = math.log(_WORN_SHARE / (1.0 - _WORN_SHARE))  # of a worn rig
@@ -117,15 +118,16 @@ class DisparityAlignment:
         if self._frames < config.every and t_ns - self._pair_t_ns < _PAIR_EVERY_S * 1e9:
             return None
         self._frames, self._pair_t_ns = 0, t_ns
-        slots, counts = np.unique(rows // m.slot_size, return_counts=True)
-        for slot in slots[counts >= _MIN_POINTS].tolist():
-            if self._keyframe[slot] != m.keyframe[slot]:
-                self._begin(slot)
-        ratios = {slot: self._parallax_ratio(slot, T_c_m) for slot in slots[counts >= _MIN_POINTS].tolist()}
-        slot = max(ratios, key=lambda s: ratios[s], default=None)
-        if slot is None or ratios[slot] < _PARALLAX_GROWTH:
+        slots = (np.bincount(rows // m.slot_size) >= _MIN_POINTS).nonzero()[0].tolist()
+        for k in slots:
+            if self._keyframe[k] != m.keyframe[k]:
+                self._begin(k)
+        parallaxes = {k: self._parallax_of(k, T_c_m) for k in slots}
+        growth = {k: now / max(float(self._parallax[k]), _LEAST_PARALLAX) for k, now in parallaxes.items()}
+        slot = max(growth, key=lambda s: growth[s], default=None)
+        if slot is None or growth[slot] < _PARALLAX_GROWTH:
             return None
-        if self._add_pair(slot, T_c_m, rows, observed):
+        if self._add_pair(slot, T_c_m, rows, observed, parallaxes[slot]):
             self._solve()
             change = self._apply()
             self.expected_cov = self._expected_cov()
@@ -206,11 +208,7 @@ class DisparityAlignment:
         usable = self._map.usable[slot]
         return float(np.linalg.norm(T[:3, 3]) * median(self._map.rho[slot, usable])) if usable.any() else 0.0
 
-    def _parallax_ratio(self, slot: int, T_c_m: F64) -> float:
-        """Parallax to a keyframe over that of its last pair."""
-        return self._parallax_of(slot, T_c_m) / max(float(self._parallax[slot]), _LEAST_PARALLAX)
-
-    def _add_pair(self, slot: int, T_c_m: F64, rows: I64, observed: F64) -> bool:
+    def _add_pair(self, slot: int, T_c_m: F64, rows: I64, observed: F64, parallax: float) -> bool:
         """Compare a frame with a keyframe. True if the pair has more information than earlier ones of that keyframe."""
         config, m = self._config, self._map
         at = np.flatnonzero(rows // m.slot_size == slot)
@@ -223,21 +221,21 @@ class DisparityAlignment:
             chosen = np.linspace(0, len(at) - 1, config.points).astype(np.int64)
             at, index = at[chosen], index[chosen]
         self.pairs += 1
-        self._parallax[slot] = self._parallax_of(slot, T_c_m)
+        self._parallax[slot] = parallax
         seen = observed[at].copy()
         has = seen[:, 2] >= 0.0
         seen[has, 2] += m.offset_px(seen[has, :2])
         uv, disparity = m.uv[slot, index], m.disparity[slot, index]
         sigma = config.sigma_px * (1 << m.octave[rows[at]]).astype(np.float64)
-        T, offset = T_c_m @ m.T_m_k[slot], self._estimate.copy()
+        T, offset, prior = T_c_m @ m.T_m_k[slot], self._estimate.copy(), self._prior.information
         rho = np.maximum((disparity - terms(m.bearing[slot, index]) @ offset) / m.camera.bf, _LEAST_RHO)
         system, point = np.empty((kernels.UNKNOWNS, kernels.UNKNOWNS + 1)), np.empty((len(at), kernels.UNKNOWNS + 1))
         for _ in range(_ITERATIONS):
             kernels.linearise_pair(uv, disparity, sigma, seen, T, m.intrinsics, offset, rho, system, point)
             h, b = system[:, :-1].copy(), system[:, -1].copy()
-            h[6:, 6:] += self._prior
-            b[6:] -= self._prior @ offset
-            h[np.diag_indices(kernels.UNKNOWNS)] += 1e-9
+            h[6:, 6:] += prior
+            b[6:] -= prior @ offset
+            h[_DIAGONAL] += 1e-9
             step: F64 = np.asarray(np.linalg.solve(h, b), np.float64)
             kernels.move_points(point, step, _LEAST_RHO, rho)
             X = se3.exp(np.concatenate([np.zeros(3), step[3:6]]))
@@ -249,7 +247,7 @@ class DisparityAlignment:
         scale = _INFLATION * max(square, 1.0)
         information = (system[6:, 6:-1] - to_pose[:TERMS] @ system[:6, 6:-1]) / scale
         side = (system[6:, -1] - to_pose[:TERMS] @ system[:6, -1]) / scale + information @ offset
-        score = -float(np.trace(self._grid @ np.linalg.solve(information + self._prior, self._grid.T)))
+        score = -float(np.trace(self._grid @ np.linalg.solve(information + prior, self._grid.T)))
         if not np.isfinite(score) or (self._score[slot] != 0.0 and score <= self._score[slot]):
             return False
         self._score[slot], self._pair_h[slot], self._pair_b[slot] = score, information, side
@@ -262,7 +260,6 @@ class DisparityAlignment:
 
         What earlier flights found is dropped if the flight is likelier without it: the rig was repaired.
         """
-        good = self._good
         h, b = self._evicted_h + self._pair_h.sum(0), self._evicted_b + self._pair_b.sum(0)
         own = self._own_share(_FORWARD_GOOD_KEYFRAMES)
         self._solve_good(own * h, own * b)
@@ -272,24 +269,25 @@ class DisparityAlignment:
             self._prior = self._bent
         log_odds = self._prior_log_odds
         if self._earlier_h.any() and self._moves_sideways():
-            worn, usual = log_evidence(h, b, self._prior), log_evidence(h, b, good)
+            worn, usual = self._prior.log_evidence(h, b), self._good.log_evidence(h, b)
             unknown = np.logaddexp(log_odds + worn, usual) - np.logaddexp(log_odds, 0.0)
-            if unknown - log_evidence(h, b, self._prior + self._earlier_h, self._earlier_b) > _REFUTED:
+            earlier = Prior(self._prior.information + self._earlier_h, self._earlier_b)
+            if unknown - earlier.log_evidence(h, b) > _REFUTED:
                 self._earlier_h, self._earlier_b = np.zeros_like(self._earlier_h), none()
                 self._refuted, self.applied = True, False
                 self._events.append("disparities are not those of the rig file: estimated anew")
         share = self._believed_share()
         h, b = share * h + self._earlier_h, share * b + self._earlier_b
-        self.cov = np.linalg.inv(h + self._prior)
+        self.cov = np.linalg.inv(h + self._prior.information)
         self._estimate = self.cov @ b
-        log_odds += log_evidence(h, b, self._prior) - log_evidence(h, b, good)
+        log_odds += self._prior.log_evidence(h, b) - self._good.log_evidence(h, b)
         self._log_odds = float(log_odds)
         self.worn = probability(self._log_odds)
         self._set_rig_worn()
 
     def _solve_good(self, h: F64, b: F64) -> None:
         """Estimate the offset if the calibration is good: about the expected one, from information h (5,5), b (5,)."""
-        self._good_estimate = self.expected_px + np.linalg.solve(h + self._good, b - h @ self.expected_px)
+        self._good_estimate = self.expected_px + np.linalg.solve(h + self._good.information, b - h @ self.expected_px)
         self._good_h = h
 
     def _is_sure(self) -> bool:
@@ -302,7 +300,7 @@ class DisparityAlignment:
         share = self._own_share(_FORWARD_KEYFRAMES) * self._believed_share()
         h, b = self._sure()
         h, b = share * h + self._earlier_h, share * b + self._earlier_b
-        odds = self._prior_log_odds + log_evidence(h, b, self._prior) - log_evidence(h, b, self._good)
+        odds = self._prior_log_odds + self._prior.log_evidence(h, b) - self._good.log_evidence(h, b)
         return probability(odds + rows) >= _SURE
 
     def _sure(self) -> tuple[F64, F64]:
@@ -312,9 +310,11 @@ class DisparityAlignment:
 
     def _is_bent(self) -> bool:
         """True if an offset beyond wear is likelier: the mount was bent by up to a degree or two."""
+        if not self._moves_sideways():
+            return False
         h, b = self._sure()
-        gain = log_evidence(h, b, self._bent) - log_evidence(h, b, self._prior)
-        return self._moves_sideways() and gain + _BENT_LOG_ODDS > 0.0
+        gain = self._bent.log_evidence(h, b) - self._prior.log_evidence(h, b)
+        return gain + _BENT_LOG_ODDS > 0.0
 
     def _own_share(self, most: int) -> float:
         """Share of the pairs' information, if in forward motion no more than so many keyframes tell on their own."""

@@ -12,11 +12,20 @@ def probability(log_odds: float) -> float:
     return 1.0 / (1.0 + math.exp(-min(max(log_odds, -50.0), 50.0)))
 
 
-def log_evidence(h: F64, b: F64, prior: F64, side: F64 | None = None) -> float:
-    """Logarithm, up to a constant of the data, of the likelihood of data with information h (5,5) and its side b (5,).
+class Prior:
+    """A hypothesis about an offset (n,), normally distributed before the data.
 
-    prior: (5,5) information; side: (5,) of it, prior @ mean; None: about zero.
+    information: (n,n) before the data. side: (n,) of it, information @ mean; None: about zero.
     """
-    side = np.zeros(len(b)) if side is None else side
-    fit = float((b + side) @ np.linalg.solve(h + prior, b + side) - side @ np.linalg.solve(prior, side))
-    return 0.5 * (fit + float(np.linalg.slogdet(prior)[1]) - float(np.linalg.slogdet(h + prior)[1]))
+
+    def __init__(self, information: F64, side: F64 | None = None) -> None:
+        self.information = information
+        self._log_det = float(np.linalg.slogdet(information)[1])
+        self._side = np.zeros(len(information)) if side is None else side
+        self._fit = 0.0 if side is None else float(side @ np.linalg.solve(information, side))
+
+    def log_evidence(self, h: F64, b: F64) -> float:
+        """Logarithm, up to a constant of the data, of the likelihood of data with information h (n,n), side b (n,)."""
+        after, side = h + self.information, b + self._side
+        fit = float(side @ np.linalg.solve(after, side)) - self._fit
+        return 0.5 * (fit + self._log_det - float(np.linalg.slogdet(after)[1]))

@@ -157,23 +157,26 @@ def disparity_slopes(T_c_m, camera, rows, T_m_k, bearing, rho, slant, limit, slo
 
 
 @njit
-def select(order, uv, cell_px, limit, per_cell, cells, chosen):  # type: ignore[no-untyped-def]
+def select(order, first, uv, cell_px, limit, per_cell, cells, chosen):  # type: ignore[no-untyped-def]
     """Take candidates in `order`, at most per_cell a cell and `limit` in all. cells: (rows, columns) int32, in and out.
 
-    chosen: (limit,) int64 out. Returns how many were chosen.
+    first: (n,) bool, those that are taken before the others. chosen: (limit,) int64 out. Returns how many were chosen.
     """
     n = 0
-    for j in range(order.shape[0]):
-        if n >= limit:
-            break
-        i = order[j]
-        r = int(uv[i, 1] / cell_px)
-        c = int(uv[i, 0] / cell_px)
-        if r < 0 or c < 0 or r >= cells.shape[0] or c >= cells.shape[1] or cells[r, c] >= per_cell:
-            continue
-        cells[r, c] += 1
-        chosen[n] = i
-        n += 1
+    for others in range(2):
+        for j in range(order.shape[0]):
+            i = order[j]
+            if n >= limit:
+                return n
+            if first[i] == (others == 1):
+                continue
+            r = int(uv[i, 1] / cell_px)
+            c = int(uv[i, 0] / cell_px)
+            if r < 0 or c < 0 or r >= cells.shape[0] or c >= cells.shape[1] or cells[r, c] >= per_cell:
+                continue
+            cells[r, c] += 1
+            chosen[n] = i
+            n += 1
     return n
 
 

@@ -68,12 +68,12 @@ class RightImage:
         grid = self._rectifier.right_grid
         wanted = disparity >= 0.0
         offset = np.zeros(len(uv)) if self._offset_px is None else self._offset_px(uv)
-        disparity[wanted] = np.maximum(disparity[wanted] + offset[wanted], 0.0)
+        np.maximum(disparity + offset, 0.0, out=disparity, where=wanted)
         stereo_kernels.refine_rows(
             left, left_grid, self.raw(), NO_GRID if grid is None else grid, uv, octave, sure, slopes,
             _ITERATIONS, search_px, _MIN_NCC, disparity, found,
         )  # fmt: skip
-        disparity[wanted] = np.maximum(disparity[wanted] - offset[wanted], 0.0)
+        np.maximum(disparity - offset, 0.0, out=disparity, where=wanted)
 
     def raw(self) -> Pyramid:
         """Pyramid of the image as it came."""

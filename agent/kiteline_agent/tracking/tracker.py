@@ -105,16 +105,13 @@ class Tracker:
 
     def _choose(self, candidates: Candidates, frame_number: int, limit: int, per_cell: int, cell_px: int) -> I64:
         """Candidates spread over image cells: landmarks of the last frame first, then those of least uncertainty."""
-        rows = candidates.rows
-        recent = frame_number - self._map.last_hit.take(rows) <= 1
-        sigma = self._map.sigma_rho.take(rows)
+        recent = self._map.last_hit.take(candidates.rows) >= frame_number - 1
+        sigma = self._map.sigma_rho.take(candidates.rows)
         order = sigma.argsort(kind="stable")  # candidates come in order of rows, which decides between equals
-        seen_last = recent[order]
-        order = np.concatenate((order[seen_last], order[~seen_last]))
         camera = self._map.camera
         cells = np.zeros((-(-camera.height // cell_px), -(-camera.width // cell_px)), np.int32)
         chosen = np.empty(limit, np.int64)
-        n = projection_kernels.select(order, candidates.uv, float(cell_px), limit, per_cell, cells, chosen)
+        n = projection_kernels.select(order, recent, candidates.uv, float(cell_px), limit, per_cell, cells, chosen)
         return chosen[:n]
 
     def _measure(

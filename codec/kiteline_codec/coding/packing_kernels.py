@@ -11,12 +11,20 @@ _MAX_SHIFT = 42
 
 
 @njit
-def first_outside(values: I64, low: I64, high: I64) -> int:
-    """The first of the columns (c, n) with a number outside low..high (c,); -1 if there is none."""
-    for i in range(values.shape[0]):
-        for j in range(values.shape[1]):
+def first_fault(values: I64, low: I64, high: I64, increasing: bool) -> int:
+    """The first of the columns (c, n) with a number outside low..high (c,); -1 if there is none.
+
+    increasing: whether c is returned where, all being inside, numbers do not increase along the first column.
+    """
+    c, n = values.shape
+    for i in range(c):
+        for j in range(n):
             if values[i, j] < low[i] or values[i, j] > high[i]:
                 return i
+    if increasing:
+        for j in range(1, n):
+            if values[0, j] <= values[0, j - 1]:
+                return int(c)
     return -1
 
 

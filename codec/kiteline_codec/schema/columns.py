@@ -8,7 +8,7 @@ import numpy as np
 
 from kiteline_codec.coding import quantise
 from kiteline_codec.coding.packing import Reader, WireError, Writer
-from kiteline_codec.coding.packing_kernels import first_outside
+from kiteline_codec.coding.packing_kernels import first_fault
 from kiteline_codec.schema.record import MAX_KEYFRAME_ID
 from kiteline_core.arrays import I64
 from kiteline_core.ids import KEYPOINT_BITS, MAX_KEYPOINTS
@@ -96,13 +96,13 @@ class Columns:
 
     def _fault(self, codes: I64) -> str:
         """The reason why codes (columns, n) are invalid; "" when they are valid."""
-        i = first_outside(codes, self._low, self._high)
-        if i >= 0:
-            found = f"{codes[i].min()}..{codes[i].max()}"
-            return f"{self._column_names[i]} is {found}, expected {self._low[i]}..{self._high[i]}"
-        if self._increasing and codes.shape[1] > 1 and (codes[0, 1:] <= codes[0, :-1]).any():
+        i = first_fault(codes, self._low, self._high, self._increasing)
+        if i < 0:
+            return ""
+        if i == len(codes):
             return "indices must increase"
-        return ""
+        found = f"{codes[i].min()}..{codes[i].max()}"
+        return f"{self._column_names[i]} is {found}, expected {self._low[i]}..{self._high[i]}"
 
 
 def write_landmarks(out: Writer, landmark: I64) -> None:
@@ -142,7 +142,7 @@ def read_landmark_table(source: Reader, n: int) -> tuple[list[int], I64, I64]:
             raise WireError("keyframes of landmarks must increase and fit an id")
         keyframes.append(last)
     table = source.columns(2, n)
-    if first_outside(table, _LEAST, np.array([len(keyframes) - 1, MAX_KEYPOINTS - 1], np.int64)) >= 0:
+    if first_fault(table, _LEAST, np.array([len(keyframes) - 1, MAX_KEYPOINTS - 1], np.int64), False) >= 0:
         raise WireError("a landmark id is out of range")
     return keyframes, table[0], table[1]
 

@@ -126,14 +126,17 @@ def test_patches_and_their_sums_are_those_of_plain_numpy() -> None:
     template = np.ascontiguousarray(image[100:121, 130:151])
     w = np.array([[1.1, -0.2], [0.15, 0.9]])
     reference = np.zeros((kernels.PATCH + 2, kernels.STRIDE), np.int16)
-    assert from_python(kernels.warp_template)(template, *w.ravel(), reference)
+    around = np.zeros((4, kernels.WARPED), np.uint16)
+    assert from_python(kernels.warp_template)(template, *w.ravel(), around, reference)
     dx, dy = np.meshgrid(np.arange(-5.0, 6.0), np.arange(-5.0, 6.0))
     plain = bilinear(template, 10 + w[0, 0] * dx + w[0, 1] * dy, 10 + w[1, 0] * dx + w[1, 1] * dy)
     steepest = np.abs(np.diff(plain)).max()
     np.testing.assert_allclose(reference[:, : kernels.PATCH + 2] / kernels.GREY, plain, atol=0.04 + steepest / 128)
-    assert not from_python(kernels.warp_template)(template, 1.5, 0.6, -0.6, 1.5, reference)
-    assert not from_python(kernels.warp_template)(template, 2.1, 0.0, 0.0, 1.0, reference)  # along one axis alone
-    assert not from_python(kernels.warp_template)(template, 1.0, 0.0, 0.0, 2.1, reference)
+    assert not from_python(kernels.warp_template)(template, 1.5, 0.6, -0.6, 1.5, around, reference)
+    assert not from_python(kernels.warp_template)(
+        template, 2.1, 0.0, 0.0, 1.0, around, reference
+    )  # along one axis alone
+    assert not from_python(kernels.warp_template)(template, 1.0, 0.0, 0.0, 2.1, around, reference)
 
     patches = np.zeros((5, kernels.LANES), np.int16)
     inside = np.zeros((kernels.PATCH, kernels.STRIDE), np.bool_)
@@ -153,7 +156,7 @@ def test_patches_and_their_sums_are_those_of_plain_numpy() -> None:
         == (grey[1:-1, 1:-1] * (grey[1:-1, 2:] - grey[1:-1, :-2])).sum()
     )
 
-    raw, across = np.zeros(kernels.LANES + kernels.STRIDE, np.uint8), np.zeros(kernels.LANES + kernels.STRIDE, np.int16)
+    raw, across = np.zeros(2 * (kernels.PATCH + 1), np.uint64), np.zeros(kernels.LANES + kernels.STRIDE, np.int16)
     for x, y in ((100.0, 90.0), (47.31, 60.78), (4.0, 4.99), (314.9, 234.9)):
         from_python(kernels.sample_patch)(image, x, y, raw, across, patches[0])
         dx, dy = np.meshgrid(np.arange(-4.0, 5.0), np.arange(-4.0, 5.0))

@@ -118,7 +118,9 @@ def test_describe_is_the_plain_description() -> None:
     xy = np.array([[18, 70], [200, 210], [381, 381]], np.int32)  # as near to the border as may be
     angle = np.array([0.0, 1.1, -2.0])
     out = np.empty((3, 32), np.uint8)
-    kernels.describe(image, xy, angle, features.PATTERN, out)
+    tests = np.empty((3, 2, 256), np.int16)
+    kernels.steer(features.PATTERN, angle, tests)
+    kernels.describe(image, xy, np.arange(3), tests, out)
     smooth = cv2.GaussianBlur(image, (7, 7), 2.0)
     for k in range(3):
         c, s = np.cos(angle[k]), np.sin(angle[k])

@@ -211,3 +211,28 @@ def test_contrast_and_focal_lengths_change_equations_as_they_change_shears() -> 
         1.0, longer,
     )  # fmt: skip
     np.testing.assert_allclose(longer, dim * [1.0, 0.5, 0.25, 1.0, 0.5], rtol=1e-9)
+
+
+@pytest.mark.parametrize("most_forgotten", [0.0, 0.3])
+def test_measurements_are_fused_as_written_plainly(most_forgotten: float) -> None:
+    rng = np.random.default_rng(5)
+    rows, octave = rng.permutation(40)[:25], rng.integers(0, 3, 25).astype(np.uint8)
+    root, error = rng.normal(0.0, 1.0, (25, 2, 2)), rng.normal(0.0, 0.5, (25, 2))
+    information = root @ root.transpose(0, 2, 1)
+    product = np.einsum("nij,nj->ni", information, error)
+    equations = np.column_stack([information[:, 0, 0], information[:, 0, 1], information[:, 1, 1], product])
+    equations[0] = 0.0  # nothing was measured
+    known, slant, prior = np.abs(rng.normal(1.0, 0.3, (40, 5))), rng.normal(0.0, 0.3, (40, 2)), 0.25
+    known[:, 1] *= 0.1
+    expected_known, expected = known.copy(), slant.copy()
+    for row, cut, (xx, xy, yy, *side) in zip(rows, octave, equations, strict=True):
+        matrix, before = np.array([[xx, xy], [xy, yy]]), expected_known[row]
+        told = np.array([xx, xy, yy, *(side + matrix @ expected[row])])
+        forgotten = min(most_forgotten, (xx + yy) / max(before[0] + before[2], xx + yy + 1e-12))
+        expected_known[row] = total = (1.0 - forgotten) * before + told
+        solution = np.linalg.solve(total[[0, 1, 1, 2]].reshape(2, 2) + prior * np.eye(2), total[3:])
+        steepest = 0.5 * F / (PATCH_RADIUS * 2.0**cut)
+        expected[row] = np.clip(solution, -steepest, steepest)
+    slant_kernels.fuse_slants(rows, octave, equations, most_forgotten, prior, F, 0.5, known, slant)
+    np.testing.assert_allclose(known, expected_known, rtol=1e-12)
+    np.testing.assert_allclose(slant, expected, rtol=1e-9)

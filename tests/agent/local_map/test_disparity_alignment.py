@@ -53,8 +53,8 @@ def test_an_offset_beyond_any_wear_is_found_as_well(seed: int) -> None:
     flight.fly(80), worn.fly(80)
     left = off_px(BENT - flight.map.disparity_offset)
     assert left < 0.06 * off_px(BENT)
-    assert np.trace(np.linalg.inv(flight.alignment._prior)) == pytest.approx(64.0 * wear)
-    assert np.trace(np.linalg.inv(worn.alignment._prior)) == pytest.approx(wear)  # wear keeps its own prior
+    assert np.trace(np.linalg.inv(flight.alignment._prior.information)) == pytest.approx(64.0 * wear)
+    assert np.trace(np.linalg.inv(worn.alignment._prior.information)) == pytest.approx(wear)  # wear keeps its own prior
 
 
 def test_frames_that_are_skipped_do_not_make_pairs_rarer() -> None:
@@ -275,7 +275,8 @@ def test_a_good_calibration_s_offset_is_the_posterior_about_the_expected_one() -
     h, told, expected = half @ half.T, rng.normal(0.0, 0.1, TERMS), rng.normal(0.0, 0.1, TERMS)
     alignment.expected_px = expected
     alignment._solve_good(h, h @ told)
-    posterior = np.linalg.solve(h + alignment._good, h @ told + alignment._good @ expected)
+    good = alignment._good.information
+    posterior = np.linalg.solve(h + good, h @ told + good @ expected)
     np.testing.assert_allclose(alignment._good_estimate, posterior, atol=1e-9)
     alignment._solve_good(np.zeros_like(h), np.zeros(TERMS))
     np.testing.assert_allclose(alignment._good_estimate, expected)

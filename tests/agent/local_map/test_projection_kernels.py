@@ -1,6 +1,7 @@
 """How surfaces around landmarks are seen: warps, parallaxes and slopes of disparities, against differences."""
 
 import numpy as np
+import pytest
 
 from kiteline_agent.local_map import projection_kernels as kernels
 from kiteline_core.arrays import F64
@@ -91,3 +92,20 @@ def test_slopes_of_disparities_are_their_differences() -> None:
         scene.T_c_m, CAMERA, np.arange(12), scene.T_m_k, scene.bearing, scene.rho, scene.slant, 0.001, slopes
     )  # fmt: skip
     assert np.abs(slopes).max() <= 0.001
+
+
+@pytest.mark.parametrize("limit", [5, 60])
+def test_candidates_are_spread_over_cells_those_of_the_last_frame_first(limit: int) -> None:
+    rng = np.random.default_rng(4)
+    order, first, uv = rng.permutation(60), rng.random(60) < 0.4, rng.uniform(-10.0, 110.0, (60, 2))
+    cells, chosen = np.zeros((3, 3), np.int32), np.empty(limit, np.int64)
+    n = kernels.select(order, first, uv, 35.0, limit, 2, cells, chosen)
+    expected: list[int] = []
+    held = dict.fromkeys(np.ndindex(3, 3), 0)
+    for i in [*order[first[order]], *order[~first[order]]]:
+        at = int(uv[i, 1] / 35.0), int(uv[i, 0] / 35.0)
+        if held.get(at, 2) < 2 and len(expected) < limit:
+            held[at] += 1
+            expected.append(int(i))
+    assert chosen[:n].tolist() == expected
+    assert cells.tolist() == [[held[r, c] for c in range(3)] for r in range(3)]

@@ -147,12 +147,14 @@ def test_ranges_are_sets(steps: list[tuple[bool, int, int]]) -> None:
         assert all(x[1] < y[0] for x, y in pairwise(got))
 
 
-@given(st.integers(0, 1000), st.integers(0, 5))
-def test_the_first_column_outside_its_limits(seed: int, n: int) -> None:
+@given(st.integers(0, 1000), st.integers(0, 5), st.booleans())
+def test_the_first_column_with_a_fault(seed: int, n: int, increasing: bool) -> None:
     rng = np.random.default_rng(seed)
     values, low, high = rng.integers(-3, 4, (3, n)), rng.integers(-3, 0, 3), rng.integers(0, 4, 3)
     wrong = np.flatnonzero(((values < low[:, None]) | (values > high[:, None])).any(axis=1))
-    assert packing_kernels.first_outside(values, low, high) == (wrong[0] if len(wrong) else -1)
+    falls = increasing and (np.diff(values[0]) <= 0).any()
+    expected = wrong[0] if len(wrong) else 3 if falls else -1
+    assert packing_kernels.first_fault(values, low, high, increasing) == expected
 
 
 MOST = 895
