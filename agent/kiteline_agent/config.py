@@ -12,7 +12,6 @@ from kiteline_agent.inertial_start_config import InertialStartConfig
 from kiteline_agent.known_rig import KnownRigConfig
 from kiteline_agent.scan_config import LocalGridConfig as LocalGridConfig
 from kiteline_agent.scan_config import ScanConfig as ScanConfig
-from kiteline_agent.tracking.readout import ReadoutConfig
 from kiteline_core.ground.config import GroundConfig
 
 _LEAST_LEVELS, _MOST_LEVELS = 2, 8  # of a pyramid: a coarse pass needs two, and the eighth of any image is a few pixels
@@ -43,6 +42,13 @@ class PyramidConfig:
     def __post_init__(self) -> None:
         if not _LEAST_LEVELS <= self.levels <= _MOST_LEVELS:
             raise ValueError(f"levels: expected {_LEAST_LEVELS} to {_MOST_LEVELS}")
+
+
+@dataclass(frozen=True, slots=True)
+class ReadoutConfig:
+    """Read-out of a rolling shutter of which the calibration says nothing, found in flight."""
+
+    on: bool = True  # false: a camera without a calibrated read-out has a global shutter
 
 
 @dataclass(frozen=True, slots=True)

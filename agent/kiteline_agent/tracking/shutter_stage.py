@@ -5,11 +5,12 @@ from typing import Any
 
 import numpy as np
 
+from kiteline_agent.config import ReadoutConfig
 from kiteline_agent.local_map import projection_kernels
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_agent.tracking.frame_images import NO_GRID
-from kiteline_agent.tracking.readout import ReadoutConfig, ReadoutEstimate
+from kiteline_agent.tracking.readout import ReadoutEstimate
 from kiteline_agent.tracking.readout_kernels import readout_equation
 from kiteline_agent.tracking.rolling_shutter import RollingShutter
 from kiteline_agent.tracking.track import Track
@@ -43,7 +44,7 @@ class ShutterStage:
         self._rectifier = rectifier
         self._twist = twist
         self._estimated = config.on and rectifier.readout_s == 0.0
-        self._estimate = ReadoutEstimate(config, rectifier.readout_s)
+        self._estimate = ReadoutEstimate(rectifier.readout_s)
         self._motion_known = False  # in the last frame
         self._last: tuple[int, SubmapId, F64] | None = None  # stamp, submap and T_m_c (4,4) of the last tracked frame
         self._measured: F64 | None = None  # twist (6,) of this frame by images

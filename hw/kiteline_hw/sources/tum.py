@@ -20,11 +20,13 @@ from kiteline_hw.sources.text_files import listed_file, read_rows, read_tum_pose
 DEPTH_SCALE = 5000.0  # stored units a metre, as the data set's page says
 _MOST_BACKWARD = 0.1  # share of stamps before that of the line above, beyond which they are no times of the images
 
-# Intrinsics that the data set's page gives for its three cameras, 640x480.
+# Intrinsics of the three cameras as the data set's page gives them, 640x480. Two are Kinects, whose colour camera
+# has a rolling shutter (docs/decisions/rolling-shutter.md); nothing was measured of the third, an Xtion.
+_KINECT_READOUT_S = 0.027
 FREIBURG = {
-    "1": (517.3, 516.5, 318.6, 255.3, (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
-    "2": (520.9, 521.0, 325.1, 249.7, (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
-    "3": (535.4, 539.2, 320.1, 247.6, ()),
+    "1": (517.3, 516.5, 318.6, 255.3, (0.2624, -0.9531, -0.0054, 0.0026, 1.1633), _KINECT_READOUT_S),
+    "2": (520.9, 521.0, 325.1, 249.7, (0.2312, -0.7849, -0.0033, -0.0001, 0.9172), _KINECT_READOUT_S),
+    "3": (535.4, 539.2, 320.1, 247.6, (), 0.0),
 }
 
 
@@ -105,8 +107,8 @@ def _read_calibration(folder: Path, colour: Stamped, given: FileCalibration | No
             f"{folder}: no calibration: expected camera.yaml (fx, fy, cx, cy, width, height, depth_scale), or a folder "
             "named after freiburg1, freiburg2 or freiburg3 with images of 640x480 px"
         )
-    fx, fy, cx, cy, d = FREIBURG[named.group(1)]
-    return CameraModel(640, 480, fx, fy, cx, cy, Lens.RADTAN if d else Lens.NONE, d), DEPTH_SCALE
+    fx, fy, cx, cy, d, readout_s = FREIBURG[named.group(1)]
+    return CameraModel(640, 480, fx, fy, cx, cy, Lens.RADTAN if d else Lens.NONE, d, readout_s), DEPTH_SCALE
 
 
 def _checked(scale: float, path: Path) -> float:

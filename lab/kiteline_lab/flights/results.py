@@ -11,6 +11,7 @@ from kiteline_agent.step import Estimate
 from kiteline_core.arrays import F64
 from kiteline_core.frame import Trajectory
 from kiteline_core.geometry.cameras import Rectifier
+from kiteline_core.wording import counted
 from kiteline_hw.logs.mcap_log import LogReader
 from kiteline_hw.ports import FrameSource, SourceError
 from kiteline_lab.evaluation import metrics
@@ -21,10 +22,6 @@ from kiteline_lab.flights.plan import FlightPlan
 from kiteline_lab.flights.refined_path import refined_path
 from kiteline_lab.plots.plot import Line, can_plot, plot_trajectories
 
-_OTHER_UNIT = (
-    "agent {}: {} poses are in another unit of length than those at the flight's end: they are in its files, and left "
-    "out of accuracy and plot"
-)
 _MOST_PLACED = 0.95  # share of live poses in w: a few more come before the base's first answer
 
 
@@ -44,9 +41,7 @@ def write_results(out: Path, plan: FlightPlan, outcome: FlightOutcome) -> Report
             write_tum(out / f"agent{k}" / "live.tum", _live(estimates))
             write_tum(out / f"agent{k}" / "odometry.tum", _odometry(estimates))
         judged = in_unit_of_end(estimates, mine)
-        if len(judged) < len(estimates):
-            left_out = sum(e.tracked for e in estimates) - sum(e.tracked for e in judged)
-            report["notes"].append(_OTHER_UNIT.format(k, left_out))
+        report["notes"] += left_out_notes(k, estimates, judged)
         live, odometry = _live(judged), _odometry(judged)
         mine["accuracy"] = {
             "live": _accuracy(live, truth, alignment),
@@ -88,6 +83,15 @@ def in_unit_of_end(estimates: Sequence[Estimate], agent: Report) -> Sequence[Est
     own = set(agent.get("own_unit_submaps", []))
     ends_in_own = agent.get("scale") == "own"
     return [e for e in estimates if (e.submap in own) == ends_in_own] if own else estimates
+
+
+def left_out_notes(agent: int, estimates: Sequence[Estimate], judged: Sequence[Estimate]) -> list[str]:
+    """A note of the poses that are not among those judged; none if these are no poses, as before the first map."""
+    left_out = sum(e.tracked for e in estimates) - sum(e.tracked for e in judged)
+    if left_out == 0:
+        return []
+    poses = counted(left_out, "pose")
+    return [f"agent {agent}: {poses} in another unit of length than those at the end: left out of accuracy and plot"]
 
 
 def read_estimates(log: Path) -> list[Estimate]:

@@ -11,7 +11,7 @@ from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_agent.local_map.projection_kernels import views
 from kiteline_agent.step import Identity, StepInput
 from kiteline_agent.tracking.frame_images import NO_GRID
-from kiteline_agent.tracking.readout import ReadoutConfig, ReadoutEstimate
+from kiteline_agent.tracking.readout import BLOCK_SIGMA_S, MOST_S, ReadoutEstimate
 from kiteline_agent.tracking.readout_kernels import readout_equation, row_shift
 from kiteline_agent.tracking.rolling_shutter import RollingShutter
 from kiteline_core.arrays import F64
@@ -96,7 +96,7 @@ def test_without_the_motion_of_keyframes_nothing_is_told() -> None:
 
 def changes(estimate: ReadoutEstimate, true_s: float, scatter_s: float, blocks: int) -> list[float]:
     """What the estimate changes while blocks scatter about the true read-out."""
-    rng, information = RNG(5), 1.0 / ReadoutConfig().block_sigma_s ** 2
+    rng, information = RNG(5), BLOCK_SIGMA_S**-2
     out = []
     for _ in range(blocks):
         off = true_s - estimate.readout_s + rng.normal(0.0, scatter_s)
@@ -106,7 +106,7 @@ def changes(estimate: ReadoutEstimate, true_s: float, scatter_s: float, blocks: 
 
 
 def test_a_rolling_shutter_is_found_and_then_refined() -> None:
-    estimate = ReadoutEstimate(ReadoutConfig(), 0.0)
+    estimate = ReadoutEstimate(0.0)
     found = changes(estimate, 0.02, 0.003, 40)
     assert sum(found) == pytest.approx(estimate.readout_s)
     assert estimate.readout_s == pytest.approx(0.02, abs=0.003)
@@ -116,15 +116,15 @@ def test_a_rolling_shutter_is_found_and_then_refined() -> None:
 
 @pytest.mark.parametrize(("bias_s", "scatter_s"), [(0.0, 0.004), (0.002, 0.001), (-0.003, 0.012)])
 def test_errors_of_a_global_shutter_s_lens_are_no_read_out(bias_s: float, scatter_s: float) -> None:
-    estimate = ReadoutEstimate(ReadoutConfig(), 0.0)
+    estimate = ReadoutEstimate(0.0)
     assert changes(estimate, bias_s, scatter_s, 100) == []
     assert estimate.sigma_s is None
 
 
 def test_a_read_out_is_no_longer_than_between_two_images() -> None:
-    estimate = ReadoutEstimate(ReadoutConfig(), 0.0)
+    estimate = ReadoutEstimate(0.0)
     changes(estimate, 0.5, 0.001, 40)
-    assert estimate.readout_s == ReadoutConfig().most_s
+    assert estimate.readout_s == MOST_S
 
 
 @pytest.fixture(scope="module")

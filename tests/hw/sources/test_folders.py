@@ -340,6 +340,10 @@ def test_tum_defaults_by_name_else_an_error(tmp_path: Path) -> None:
         put(root / "rgb" / f"{name}.png", picture(0, (480, 640)))
     source = open_source(str(root))
     assert source.rig.left.fx == 535.4 and [f.t_ns for f in read(source)[0]] == [1_500_000_000, 1_600_000_000]
+    assert source.rig.left.readout_s == 0.0
+    for kinect in ("rgbd_dataset_freiburg1_rpy", "fr2_desk"):
+        root = root.rename(tmp_path / kinect)
+        assert open_source(str(root)).rig.left.readout_s == 0.027
     root.rename(tmp_path / "office")
     with pytest.raises(SourceError, match=r"no calibration: expected camera\.yaml"):
         open_source(str(tmp_path / "office"))

@@ -169,6 +169,17 @@ def test_what_cannot_be_read_says_what_helps(tmp_path: Path) -> None:
     for path in (ros1, ros1.parent):
         with pytest.raises(SourceError, match=r"ROS 1.*rosbags-convert --src flight\.bag"):
             open_source(str(path))
+    for name, head in (
+        ("a.mp4", b"\0\0\0\x18ftypmp42"),
+        ("b.avi", b"RIFF\x10\0\0\0AVI LIST"),
+        ("c.mkv", b"\x1aE\xdf\xa3\x01"),
+    ):
+        video = tmp_path / name[0] / name
+        video.parent.mkdir()
+        video.write_bytes(head + bytes(50))
+        for path in (video, video.parent):
+            with pytest.raises(SourceError, match=rf"a video.*ffmpeg -i {name}.*images:'images/\*\.png\?fps=20'"):
+                open_source(str(path))
     whole = tmp_path / "packed" / "flight_0.db3.zstd"
     whole.parent.mkdir()
     whole.write_bytes(zstandard.compress(b"SQLite format 3\0"))

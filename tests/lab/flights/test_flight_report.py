@@ -17,7 +17,7 @@ from kiteline_lab.flights.flight_report import statistic, table, without_timing,
 from kiteline_lab.flights.fly import fly
 from kiteline_lab.flights.plan import Options
 from kiteline_lab.flights.refined_path import refined_path
-from kiteline_lab.flights.results import in_unit_of_end, live_line
+from kiteline_lab.flights.results import in_unit_of_end, left_out_notes, live_line
 
 
 @dataclass(frozen=True)
@@ -208,6 +208,9 @@ def test_poses_in_another_unit_than_at_the_end_are_not_judged() -> None:
     assert [e.t_ns for e in in_unit_of_end(flown, own)] == [0, 1, 2, 6, 7]
     assert in_unit_of_end(flown, {"scale": "metric", "own_unit_submaps": []}) is flown
     assert in_unit_of_end(flown, {}) is flown
+    (note,) = left_out_notes(3, flown, in_unit_of_end(flown, metric))
+    assert note.startswith("agent 3: 3 poses in another unit of length")
+    assert left_out_notes(0, flown, flown[2:]) == [], "frames before the first map, which have no pose"
 
 
 @dataclass(frozen=True)
