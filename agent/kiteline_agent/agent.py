@@ -3,6 +3,7 @@
 Agent._process is the algorithm of one frame; its numbered steps are those of ARCHITECTURE.md.
 """
 
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -35,6 +36,7 @@ from kiteline_agent.relocalisation.relocaliser import Relocaliser
 from kiteline_agent.scans.local_grid import LOST_S, LocalGrid, Surroundings
 from kiteline_agent.scans.scan_stage import ScanStage
 from kiteline_agent.step import Estimate, Identity, PredictedPose, StepInput, StepOutput
+from kiteline_agent.tracking.fixed_parts_stage import FixedPartsStage
 from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_agent.tracking.frame_images import frame_images
 from kiteline_agent.tracking.map_anchor import MapAnchor
@@ -83,6 +85,7 @@ class Agent:
         self._camera = CameraState(rig, imu, config, identity, self.map)
         tracker = Tracker(self.map, self.work)
         self._stuck_camera = StuckCamera(camera)
+        self._fixed_parts = FixedPartsStage(self.map, config.fixed_parts, config.detector)
         self._relocaliser = Relocaliser(
             self.map, tracker, config, vocabulary, self.map_cache,
             partial(self._camera.is_consistent, relocalised=True), self.work,
@@ -210,6 +213,7 @@ class Agent:
             # 4. Not tracked: dead reckoning, relocalisation, or a new submap.
             outcome = self._loss.handle(ctx, stuck=stuck, was_lost=was_lost)
             self._forget_scans(ctx, outcome)
+            self._fixed_parts.interrupt()
         else:
             # 5. Fuse the pose with IMU and odometer.
             self.work.fused = int(camera.motion.tracker is not None)
@@ -233,6 +237,7 @@ class Agent:
                 events += said
                 if moved:
                     self._corrections.move_on_board(self.submap, T_o_m)
+            events += self._leave_out_fixed(ctx, by_images)
             # 7. Make a keyframe if the policy needs one.
             events += self._keyframes.add_if_needed(ctx, track)
             events += self._scan(ctx)
@@ -288,6 +293,19 @@ class Agent:
         self._channel.put(self._camera.first_aligned(alignment))
         self._corrections.set_upright(alignment)
         return [f"submap tilted by {np.degrees(self._camera.gravity.tilt_rad):.1f} degrees"]
+
+    def _leave_out_fixed(self, ctx: FrameContext, track: Track) -> list[str]:
+        """Leave out what stands still in the image while the camera turns. Returns events."""
+        pose = self._camera.pose
+        if self._fixed_parts.step(ctx, track, pose.T_o_m @ pose.T_m_c):
+            full, now = (
+                replace(config, detector=replace(config.detector, covered=self._fixed_parts.covered))
+                for config in (self._full_config, self._config)
+            )
+            self._full_config, self._config = full, now
+            if self._scans is not None:
+                self._scans.cover(now.detector.covered_parts)
+        return self._fixed_parts.take_events(ctx.t_ns)
 
     def _scan(self, ctx: FrameContext) -> list[str]:
         """Continue a scan of ground and obstacles; draw a finished one into the local grid. Returns events."""
@@ -402,5 +420,5 @@ class Agent:
         return self._full_config.known_rig.updated(self.map.camera, right, self._camera.motion.known_imu())
 
     def motion_reports(self) -> dict[str, Any]:
-        """What was found of time offset, IMU and odometer; None for each that is not there."""
-        return self._camera.motion.reports()
+        """What was found of time offset, IMU and odometer (None for each that is not there), and of fixed parts."""
+        return {**self._camera.motion.reports(), "fixed_parts": list(self._fixed_parts.named)}

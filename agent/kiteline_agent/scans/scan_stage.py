@@ -115,6 +115,10 @@ class ScanStage:
         bf, at_scan = local_map.camera.bf, self._segmenter.camera.bf
         self._error = RangeError.of_noise(bf, self._segmenter.surface_sigma_px * bf / at_scan)
 
+    def cover(self, parts: F64) -> None:
+        """Leave out these parts (n,4) of the image from now on."""
+        self._covered = self._covered_slices(parts)
+
     def range_error(self, cov_px: F64 | None) -> RangeError:
         """What is known of errors of ranges: the same object until more is known.
 
