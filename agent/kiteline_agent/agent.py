@@ -3,7 +3,6 @@
 Agent._process is the algorithm of one frame; its numbered steps are those of ARCHITECTURE.md.
 """
 
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -46,7 +45,7 @@ from kiteline_agent.tracking.track import Track
 from kiteline_agent.tracking.tracker import Tracker
 from kiteline_codec.channel import RecordChannel
 from kiteline_codec.schema import CameraIntrinsics, GridTile, Record
-from kiteline_core.arrays import F64
+from kiteline_core.arrays import F64, Bool
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration, joined
 from kiteline_core.geometry.cameras import CameraRig, Rectifier
 from kiteline_core.ids import SubmapId
@@ -298,13 +297,9 @@ class Agent:
         """Leave out what stands still in the image while the camera turns. Returns events."""
         pose = self._camera.pose
         if self._fixed_parts.step(ctx, track, pose.T_o_m @ pose.T_m_c):
-            full, now = (
-                replace(config, detector=replace(config.detector, covered=self._fixed_parts.covered))
-                for config in (self._full_config, self._config)
-            )
-            self._full_config, self._config = full, now
+            self._full_config, self._config = map(self._fixed_parts.applied, (self._full_config, self._config))
             if self._scans is not None:
-                self._scans.cover(now.detector.covered_parts)
+                self._scans.cover(*self._fixed_parts.for_scans())
         return self._fixed_parts.take_events(ctx.t_ns)
 
     def _scan(self, ctx: FrameContext) -> list[str]:
@@ -393,6 +388,11 @@ class Agent:
     def left_out(self) -> int:
         """Frames that were left out, as they were not newer than those before."""
         return self._order.left_out
+
+    @property
+    def fixed_cells(self) -> Bool:
+        """Cells (rows, columns) of the left image that are left out, since they show what moves with the camera."""
+        return self._fixed_parts.cells
 
     @property
     def metric(self) -> bool:

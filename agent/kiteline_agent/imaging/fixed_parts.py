@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_core.arrays import F32, F64, I64, U8, Bool
+from kiteline_core.arrays import F64, I64, U8, Bool
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import RectifiedCamera
 
@@ -82,7 +82,8 @@ class FixedParts:
 
         half: (h,w) rectified left image at half size. T_o_c: (4,4) camera. depths_m: (n,) of what it sees.
         """
-        before, now = self._before, _Look(t_ns, T_o_c.copy(), *cv2.spatialGradient(half))
+        x, y = (np.asarray(part, np.int16) for part in cv2.spatialGradient(half))
+        before, now = self._before, _Look(t_ns, T_o_c.copy(), x, y)
         if before is None or not len(depths_m) or self._turned_px(before, T_o_c) < _MOVED_PX:
             self._before = now
             return False
@@ -101,11 +102,11 @@ class FixedParts:
         size_a, size_b = np.hypot(*a), np.hypot(*b)
         edge, moved = self._free & (size_a > _EDGE), self._moved_px(at, T_c_b, nearest_m, a / np.maximum(size_a, 1.0))
         tells = edge & (moved > _MOVED_PX)
-        if np.count_nonzero(tells) < _TELLING * max(np.count_nonzero(edge), 1):
+        if int(np.count_nonzero(tells)) < max(_TELLING * int(np.count_nonzero(edge)), 1):
             return None
         alike = tells & ((a * b).sum(axis=0) > _ALIKE * size_a * size_b)
         alike &= (size_b * _RATIO > size_a) & (size_b < size_a * _RATIO)
-        if np.count_nonzero(alike) > _FROZEN * np.count_nonzero(tells):
+        if int(np.count_nonzero(alike)) > _FROZEN * int(np.count_nonzero(tells)):
             return False
         tells |= self._fixed & ~edge  # what stood there is gone
         self._seen[tells] = _MEMORY * self._seen[tells] + 1.0

@@ -244,9 +244,8 @@ class LocalMap:
     def drop_within(self, cells: Bool, cell_px: int) -> None:
         """Drop the landmarks whose own keyframe shows them in these cells (rows, columns) of the image, for good."""
         row, column = (np.minimum(self.uv[..., k] // cell_px, cells.shape[1 - k] - 1).astype(np.int64) for k in (1, 0))
-        gone = cells[row, column] & (np.arange(self.slot_size) < self.counts[:, None])
-        self.usable[gone] = self.seed[gone] = False
-        self.removed[gone] = True
+        gone = cells[row, column]
+        self.usable[gone], self.seed[gone], self.removed[gone] = False, False, True
 
     # records of the base
 

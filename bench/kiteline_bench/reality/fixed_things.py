@@ -8,10 +8,17 @@ import numpy as np
 
 from kiteline_bench.harness.recording import Item, Recording
 from kiteline_core.arrays import F64, U8
+from kiteline_core.geometry.cameras import CameraRig, Rectifier
 
 _BASELINE_SHIFT = 0.12  # of a leg between the two images of a pair, in image widths: half a metre away or nearer
 _FOCUS = 0.004  # blur of parts of the vehicle, in image widths
+_LEGS = (
+    ((0.08, 1.0), (0.19, 0.72), (0.215, 0.72), (0.14, 1.0)),
+    ((0.92, 1.0), (0.83, 0.70), (0.805, 0.70), (0.86, 1.0)),
+)  # corners in shares of the image
+_MARKS = (((-30, 0), (-10, 0)), ((10, 0), (30, 0)), ((0, 10), (0, 25)), ((-90, 0), (-70, 0)), ((70, 0), (90, 0)))
 _VEHICLE_GREY = 22.0
+_SEEN, _CELL_PX = 0.1, 32  # opacity of what is to be found; px of a cell
 _DROPS, _DROP_SIZES = 20, (0.006, 0.03)  # radii in image widths
 
 Overlay = Callable[[U8, int, bool], U8]  # (image, number of the frame, whether it is the right one) -> image
@@ -74,6 +81,21 @@ def drops(image: U8, k: int, right: bool) -> U8:
 
 OVERLAYS: dict[str, Overlay] = {"text": text, "vehicle": vehicle, "drops": drops}
 
+
+def covered_share(rig: CameraRig, kind: str, cells: tuple[int, ...]) -> F64:
+    """Share (rows, columns) of each cell of 32 px of the rectified left image that such a thing covers."""
+    shape = rig.left.height, rig.left.width
+    if kind == "text":
+        plain = np.full(shape, 128, np.uint8)
+        shown = text(plain, 0, False) != plain
+    else:
+        shown = (_vehicle_mask(shape, False) if kind == "vehicle" else _drop_masks(shape, False)[0]) > _SEEN
+    covered = Rectifier(rig).left(np.where(shown, 255, 0).astype(np.uint8)) / 255.0
+    rows, columns = (np.arange(0, size, _CELL_PX) for size in shape)
+    share = np.add.reduceat(np.add.reduceat(covered, rows, 0), columns, 1) / _CELL_PX**2
+    return np.asarray(share[: cells[0], : cells[1]])
+
+
 _masks: dict[tuple[str, tuple[int, ...], bool], tuple[F64, F64]] = {}
 
 
@@ -83,10 +105,7 @@ def _vehicle_mask(shape: tuple[int, ...], right: bool) -> F64:
         h, w = shape
         mask = np.zeros(shape, np.uint8)
         shift = -_BASELINE_SHIFT if right else 0.0
-        for leg in (
-            ((0.08, 1.0), (0.19, 0.72), (0.215, 0.72), (0.14, 1.0)),
-            ((0.92, 1.0), (0.83, 0.70), (0.805, 0.70), (0.86, 1.0)),
-        ):
+        for leg in _LEGS:
             corners = np.array([((x + shift) * w, y * h) for x, y in leg])
             cv2.fillPoly(mask, [np.round(corners).astype(np.int32)], 255)
         for x in (0.02, 1.0):
