@@ -21,6 +21,7 @@ _EDGE = 64.0  # least strength of an edge, 8 grey levels a pixel: weaker ones ar
 _MOVED_PX = 8.0  # px by which an edge of the surroundings has moved across itself: four of the half image
 _ALIKE, _RATIO = 0.9, 1.7  # cosine of the directions and ratio of the strengths of an edge that is where it was
 _TELLING = 0.2  # share of the edges that tell; with fewer the older frame waits for more motion
+_EAGER, _CALM = 24, 4.0  # looks that tell, after which looks are so many times rarer while nothing is found
 _LONGEST_S = 3.0  # s between the two frames: then a new pair begins
 _FROZEN = 0.5  # share of the edges that are where they were: the image is an old one, or the pose is wrong
 _MEMORY = 0.92  # share of what is known of a block that a pair leaves
@@ -34,7 +35,7 @@ class FixedPartsConfig:
     """Parts of the image that stand still while the camera turns."""
 
     on: bool = True  # False: only what `detector.covered` names is left out
-    every_s: float = 0.3  # s between two looks, at least: each takes half a millisecond
+    every_s: float = 0.3  # s between two looks at first, at least: each takes a quarter of a millisecond
 
 
 @dataclass(slots=True)
@@ -60,6 +61,7 @@ class FixedParts:
         rows, columns = (-(-blocks // _CELL) for blocks in self._shape)
         self.cells: Bool = np.zeros((rows, columns), np.bool_)
         self._before: _Look | None = None
+        self._told = 0  # looks that told
         free = np.ones(self._shape, np.bool_)
         for left, top, right, bottom in covered * ([camera.width, camera.height] * 2) / (2.0 * _BLOCK):
             free[int(top) : math.ceil(bottom), int(left) : math.ceil(right)] = False
@@ -75,7 +77,8 @@ class FixedParts:
         if before is None:
             return self._config.on
         age_s = (t_ns - before.t_ns) * 1e-9
-        return age_s >= self._config.every_s and (self._turned_px(before, T_o_c) >= _MOVED_PX or age_s > _LONGEST_S)
+        every_s = self._config.every_s * (1.0 if self._told < _EAGER or self._fixed.any() else _CALM)
+        return age_s >= every_s and (self._turned_px(before, T_o_c) >= _MOVED_PX or age_s > _LONGEST_S)
 
     def look(self, t_ns: int, half: U8, T_o_c: F64, depths_m: F64) -> bool:
         """Compare the edges of a frame with those of an earlier one. True if other cells stand still now.
@@ -109,6 +112,7 @@ class FixedParts:
         if int(np.count_nonzero(alike)) > _FROZEN * int(np.count_nonzero(tells)):
             return False
         tells |= self._fixed & ~edge  # what stood there is gone
+        self._told += 1
         self._seen[tells] = _MEMORY * self._seen[tells] + 1.0
         self._same[tells] = _MEMORY * self._same[tells] + alike[tells]
         share = np.where(self._fixed, _RELEASED, _SHARE)
@@ -118,11 +122,12 @@ class FixedParts:
     def _strongest(self, look: _Look) -> I64:
         """Index (n,) of the strongest edge's pixel in each block."""
         (rows, columns), width = self._shape, look.x.shape[1]
-        strength = np.abs(look.x) + np.abs(look.y)
-        blocks = strength[: rows * _BLOCK, : columns * _BLOCK].reshape(rows, _BLOCK, columns, _BLOCK)
-        best = blocks.transpose(0, 2, 1, 3).reshape(rows * columns, _BLOCK * _BLOCK).argmax(axis=1)
-        row, column = np.divmod(np.arange(rows * columns), columns)
-        return np.asarray((row * _BLOCK + best // _BLOCK) * width + column * _BLOCK + best % _BLOCK)
+        strength = (np.abs(look.x) + np.abs(look.y))[: rows * _BLOCK, : columns * _BLOCK]
+        row, column = (part.ravel() for part in np.indices(self._shape))
+        highest = strength.reshape(rows, _BLOCK, -1).max(axis=1)  # of the rows of blocks, by column
+        x = column * _BLOCK + highest.reshape(rows, columns, _BLOCK).argmax(axis=2).ravel()
+        y = row * _BLOCK + strength.reshape(rows, _BLOCK, -1)[row, :, x].argmax(axis=1)
+        return np.asarray(y * width + x)
 
     def _moved_px(self, at: I64, T_c_b: F64, nearest_m: float, across: F64) -> F64:
         """px by which surroundings at pixels (n,) have moved along unit vectors (2,n), at least, at any depth."""
