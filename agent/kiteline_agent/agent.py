@@ -35,16 +35,17 @@ from kiteline_agent.relocalisation.relocaliser import Relocaliser
 from kiteline_agent.scans.local_grid import LOST_S, LocalGrid, Surroundings
 from kiteline_agent.scans.scan_stage import ScanStage
 from kiteline_agent.step import Estimate, Identity, PredictedPose, StepInput, StepOutput
+from kiteline_agent.tracking.fixed_parts_stage import FixedPartsStage
 from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_agent.tracking.frame_images import frame_images
 from kiteline_agent.tracking.map_anchor import MapAnchor
-from kiteline_agent.tracking.shutter_stage import ShutterStage
+from kiteline_agent.tracking.shutter.shutter_stage import ShutterStage
 from kiteline_agent.tracking.stuck_camera import StuckCamera
 from kiteline_agent.tracking.track import Track
 from kiteline_agent.tracking.tracker import Tracker
 from kiteline_codec.channel import RecordChannel
 from kiteline_codec.schema import CameraIntrinsics, GridTile, Record
-from kiteline_core.arrays import F64
+from kiteline_core.arrays import F64, Bool
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration, joined
 from kiteline_core.geometry.cameras import CameraRig, Rectifier
 from kiteline_core.ids import SubmapId
@@ -83,6 +84,7 @@ class Agent:
         tracker = Tracker(self.map, self.work)
         self._shutter = ShutterStage(self.map, self._rectifier, config.readout, self._camera.known_twist)
         self._stuck_camera = StuckCamera(camera)
+        self._fixed_parts = FixedPartsStage(self.map, config.fixed_parts, config.detector)
         self._relocaliser = Relocaliser(
             self.map, tracker, config, vocabulary, self.map_cache,
             partial(self._camera.is_consistent, relocalised=True), self.work,
@@ -209,6 +211,7 @@ class Agent:
             # 4. Not tracked: dead reckoning, relocalisation, or a new submap.
             outcome = self._loss.handle(ctx, stuck=stuck, was_lost=was_lost)
             self._forget_scans(ctx, outcome)
+            self._fixed_parts.interrupt()
         else:
             # 5. Fuse the pose with IMU and odometer.
             self.work.fused = int(camera.motion.tracker is not None)
@@ -233,6 +236,7 @@ class Agent:
                 events += said
                 if moved:
                     self._corrections.move_on_board(self.submap, T_o_m)
+            events += self._leave_out_fixed(ctx, by_images)
             # 7. Make a keyframe if the policy needs one.
             events += self._keyframes.add_if_needed(ctx, track)
             events += self._scan(ctx)
@@ -276,6 +280,15 @@ class Agent:
         self._channel.put(self._camera.first_aligned(alignment))
         self._corrections.set_upright(alignment)
         return [f"submap tilted by {np.degrees(self._camera.gravity.tilt_rad):.1f} degrees"]
+
+    def _leave_out_fixed(self, ctx: FrameContext, track: Track) -> list[str]:
+        """Leave out what stands still in the image while the camera turns. Returns events."""
+        pose = self._camera.pose
+        if self._fixed_parts.step(ctx, track, pose.T_o_m @ pose.T_m_c):
+            self._full_config, self._config = map(self._fixed_parts.applied, (self._full_config, self._config))
+            if self._scans is not None:
+                self._scans.cover(*self._fixed_parts.for_scans())
+        return self._fixed_parts.take_events(ctx.t_ns)
 
     def _scan(self, ctx: FrameContext) -> list[str]:
         """Continue a scan of ground and obstacles; draw a finished one into the local grid. Returns events."""
@@ -365,6 +378,11 @@ class Agent:
         return self._order.left_out
 
     @property
+    def fixed_cells(self) -> Bool:
+        """Cells (rows, columns) of the left image that are left out, since they show what moves with the camera."""
+        return self._fixed_parts.cells
+
+    @property
     def metric(self) -> bool:
         """True if lengths in the active submap are metres; a monocular camera alone measures in a unit of its own."""
         return self._camera.motion.metric
@@ -390,5 +408,6 @@ class Agent:
         return self._full_config.known_rig.updated(self.map.camera, right, self._camera.motion.known_imu())
 
     def motion_reports(self) -> dict[str, Any]:
-        """What was found of time offset, IMU, odometer and shutter; None for each that is not there."""
-        return {**self._camera.motion.reports(), "readout": self._shutter.report()}
+        """What was found of time offset, IMU, odometer and shutter (None: nothing), and of parts of the image."""
+        found = {"readout": self._shutter.report(), "fixed_parts": list(self._fixed_parts.named)}
+        return {**self._camera.motion.reports(), **found}

@@ -6,6 +6,7 @@ from typing import ClassVar, Literal
 from kiteline_agent.controller_imu_config import ControllerImuConfig
 from kiteline_agent.ekf_config import EkfConfig
 from kiteline_agent.imaging.features import DetectorConfig
+from kiteline_agent.imaging.fixed_parts import FixedPartsConfig
 from kiteline_agent.imaging.row_alignment import RowConfig
 from kiteline_agent.inertial.inertial_config import InertialConfig
 from kiteline_agent.inertial_start_config import InertialStartConfig
@@ -258,6 +259,7 @@ class AgentConfig:
 
     pyramid: PyramidConfig = field(default_factory=PyramidConfig)
     detector: DetectorConfig = field(default_factory=DetectorConfig)
+    fixed_parts: FixedPartsConfig = field(default_factory=FixedPartsConfig)
     stereo: StereoConfig = field(default_factory=StereoConfig)
     rows: RowConfig = field(default_factory=RowConfig)
     disparities: DisparityAlignmentConfig = field(default_factory=DisparityAlignmentConfig)

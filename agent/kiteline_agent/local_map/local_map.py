@@ -241,6 +241,12 @@ class LocalMap:
         self.keyframe[slots] = NO_KEYFRAME
         self.counts[slots] = 0
 
+    def drop_within(self, cells: Bool, cell_px: int) -> None:
+        """Drop the landmarks whose own keyframe shows them in these cells (rows, columns) of the image, for good."""
+        row, column = (np.minimum(self.uv[..., k] // cell_px, cells.shape[1 - k] - 1).astype(np.int64) for k in (1, 0))
+        gone = cells[row, column]
+        self.usable[gone], self.seed[gone], self.removed[gone] = False, False, True
+
     # records of the base
 
     def set_pose(self, record: KeyframePose) -> bool:

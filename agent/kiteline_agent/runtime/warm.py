@@ -21,7 +21,7 @@ from kiteline_agent.scans.range_error import RangeError
 from kiteline_agent.scans.scan_stage import Scanned
 from kiteline_agent.step import Identity, StepInput
 from kiteline_agent.tracking.frame_images import NO_GRID
-from kiteline_agent.tracking.readout_kernels import readout_equation
+from kiteline_agent.tracking.shutter.readout_kernels import readout_equation
 from kiteline_core.arrays import F64, U8
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration
 from kiteline_core.geometry.cameras import CameraModel, CameraRig, Rectifier

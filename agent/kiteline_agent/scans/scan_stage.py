@@ -21,7 +21,7 @@ from kiteline_agent.scans.sent_images import SentImages
 from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_codec.channel import RecordChannel
 from kiteline_codec.schema import KeyframeScan, ScanImages
-from kiteline_core.arrays import F32, F64, U8
+from kiteline_core.arrays import F32, F64, U8, Bool
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import Rectifier
 from kiteline_core.ground.column_scan import ColumnScan
@@ -101,6 +101,7 @@ class ScanStage:
         self._segmenter = GroundSegmenter(self._view.camera, ground)
         self._stripes = DisparityStripes(self._segmenter.camera, ground) if local_map.camera.stereo else None
         self._covered = self._covered_slices(covered)
+        self._covered_right: Bool | None = None  # (h,w) of a disparity image
         self._raw: tuple[U8, U8] | None = None  # images of the scan that was begun, until they are matched
         self._begun: _Begun | None = None
         self._last_T_o_c: F64 | None = None  # of the newest scan of another view
@@ -114,6 +115,25 @@ class ScanStage:
         self._stretch = 0  # of the flight: counts losses after which the odometry frame lies elsewhere
         bf, at_scan = local_map.camera.bf, self._segmenter.camera.bf
         self._error = RangeError.of_noise(bf, self._segmenter.surface_sigma_px * bf / at_scan)
+
+    def cover(self, left: F64, right: F64) -> None:
+        """Leave out these parts (n,4) of the left image from now on, and what is matched with those of the right."""
+        self._covered = self._covered_slices(left)
+        seen = self._segmenter.camera
+        self._covered_right = np.zeros((seen.height, seen.width), np.bool_) if len(right) else None
+        for part in self._covered_slices(right):
+            assert self._covered_right is not None
+            self._covered_right[part] = True
+
+    def _without_covered(self, disparity: F32) -> None:
+        """Write 0 where a disparity image (h,w) shows covered parts."""
+        for part in self._covered:
+            disparity[part] = 0.0
+        if self._covered_right is not None:
+            rows, columns = np.nonzero(disparity > 0.0)
+            there = np.maximum(np.round(columns - disparity[rows, columns]).astype(np.int64), 0)
+            hidden = self._covered_right[rows, there]
+            disparity[rows[hidden], columns[hidden]] = 0.0
 
     def range_error(self, cov_px: F64 | None) -> RangeError:
         """What is known of errors of ranges: the same object until more is known.
@@ -255,8 +275,7 @@ class ScanStage:
 
     def _finish(self, begun: _Begun, disparity: F32) -> Scanned:
         segmenter, stereo = self._segmenter, self._stripes is not None
-        for part in self._covered:
-            disparity[part] = 0.0
+        self._without_covered(disparity)
         seen = segmenter.segment(
             disparity, self._stripes.pair if self._stripes is not None else None, begun.up_c,
             self._map.disparity_offset * (segmenter.camera.bf / self._map.camera.bf) if stereo else None,

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.tracking.frame_images import FrameImages
-from kiteline_agent.tracking.rolling_shutter import RollingShutter
+from kiteline_agent.tracking.shutter.rolling_shutter import RollingShutter
 from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuBatch
 from kiteline_core.geometry import se3

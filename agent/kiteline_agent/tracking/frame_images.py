@@ -128,6 +128,10 @@ class FrameImages:
         """Level 1 of the left image as it came."""
         return self.sampled[1]
 
+    def half(self) -> U8:
+        """Level 1 of the rectified left image."""
+        return self.sampled[1] if self.rectifier is None else self._halves(self.rectifier)[0]
+
     def _halves(self, rectifier: Rectifier) -> Pyramid:
         """Level 1 of the raw pyramid, rectified, and its coarser levels."""
         if self._coarse is None:

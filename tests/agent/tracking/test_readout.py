@@ -11,9 +11,9 @@ from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_agent.local_map.projection_kernels import views
 from kiteline_agent.step import Identity, StepInput
 from kiteline_agent.tracking.frame_images import NO_GRID
-from kiteline_agent.tracking.readout import BLOCK_SIGMA_S, MOST_S, ReadoutEstimate
-from kiteline_agent.tracking.readout_kernels import readout_equation, row_shift
-from kiteline_agent.tracking.rolling_shutter import RollingShutter
+from kiteline_agent.tracking.shutter.readout import BLOCK_SIGMA_S, MOST_S, ReadoutEstimate
+from kiteline_agent.tracking.shutter.readout_kernels import readout_equation, row_shift
+from kiteline_agent.tracking.shutter.rolling_shutter import RollingShutter
 from kiteline_core.arrays import F64
 from kiteline_core.frame import Frame
 from kiteline_core.geometry import se3, tum

@@ -10,7 +10,7 @@ from kiteline_agent.agent import Agent
 from kiteline_agent.config import AgentConfig, ReadoutConfig
 from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_agent.step import Identity, StepInput
-from kiteline_agent.tracking.rolling_shutter import RollingShutter
+from kiteline_agent.tracking.shutter.rolling_shutter import RollingShutter
 from kiteline_core.arrays import F64
 from kiteline_core.frame import Frame, ImuBatch, OdometryBatch
 from kiteline_core.geometry import se3

@@ -10,9 +10,9 @@ from kiteline_agent.local_map import projection_kernels
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_agent.tracking.frame_images import NO_GRID
-from kiteline_agent.tracking.readout import ReadoutEstimate
-from kiteline_agent.tracking.readout_kernels import readout_equation
-from kiteline_agent.tracking.rolling_shutter import RollingShutter
+from kiteline_agent.tracking.shutter.readout import ReadoutEstimate
+from kiteline_agent.tracking.shutter.readout_kernels import readout_equation
+from kiteline_agent.tracking.shutter.rolling_shutter import RollingShutter
 from kiteline_agent.tracking.track import Track
 from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
