@@ -3,6 +3,9 @@
 from dataclasses import dataclass
 from typing import ClassVar
 
+_MOST_DISPARITIES = 128  # px: a third of the narrowest half-size images
+_COLUMNS = 8, 100  # least and most: a record holds 128, with those of the wider view
+
 
 @dataclass(frozen=True, slots=True)
 class GroundConfig:
@@ -21,3 +24,9 @@ class GroundConfig:
     columns: int = 64  # of a scan over the field of view: 1.3 degrees each, 0.1 m at 5 m; 80 to 110 bytes in all
     bands_m: tuple[float, ...] = (0.1, 0.5, 1.2, 2.0)  # m above ground between which obstacles count: foot, table, head
     slab_m: float = 0.2  # m above and below the camera within which the line of sight must be clear: a small drone
+
+    def __post_init__(self) -> None:
+        if self.disparities % 16 or not 0 < self.disparities <= _MOST_DISPARITIES:
+            raise ValueError(f"disparities: expected a multiple of 16, at most {_MOST_DISPARITIES}")
+        if not _COLUMNS[0] <= self.columns <= _COLUMNS[1]:
+            raise ValueError(f"columns: expected {_COLUMNS[0]} to {_COLUMNS[1]}")

@@ -112,6 +112,18 @@ def test_each_switch_can_be_turned_over_in_a_file(tmp_path: Path) -> None:
         assert command.main(["--check", str(file)]) == 0
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        "[agent.pyramid]\nlevels = 1", "[agent.pyramid]\nlevels = 40", "[agent.ground]\ndisparities = 40",
+        "[agent.ground]\ndisparities = 480", "[agent.ground]\ncolumns = 1", "[agent.ground]\ncolumns = 640",
+    ],
+)  # fmt: skip
+def test_numbers_with_which_no_frame_can_be_processed_are_refused(text: str) -> None:
+    (problem,) = command.check(text)
+    assert "expected" in problem.text
+
+
 def test_reasons_do_not_repeat_the_unit_and_name_values_as_toml_has_them() -> None:
     options = [o for s in sections() for o in s.options]
     assert [o for o in options if o.unit and o.reason.startswith(f"{o.unit} ")] == []
