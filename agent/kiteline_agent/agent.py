@@ -84,7 +84,7 @@ class Agent:
         tracker = Tracker(self.map, self.work)
         self._shutter = ShutterStage(self.map, self._rectifier, config.readout, self._camera.known_twist)
         self._stuck_camera = StuckCamera(camera)
-        self._fixed_parts = FixedPartsStage(self.map, config.fixed_parts, config.detector)
+        self._fixed_parts = FixedPartsStage(self.map, self._rectifier, config.fixed_parts, config.detector)
         self._relocaliser = Relocaliser(
             self.map, tracker, config, vocabulary, self.map_cache,
             partial(self._camera.is_consistent, relocalised=True), self.work,

@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kiteline_core.arrays import F64, I64, U8, Bool
+from kiteline_core.arrays import F32, F64, I64, U8, Bool
 from kiteline_core.geometry import se3
-from kiteline_core.geometry.cameras import RectifiedCamera
+from kiteline_core.geometry.cameras import GRID_STEP, RectifiedCamera
 
 _BLOCK, _CELL = 8, 2  # pixels of the half image in a block, and blocks in a cell: 16 and 32 px of the whole one
 CELL_PX = 2 * _BLOCK * _CELL
@@ -28,6 +28,7 @@ _FROZEN = 0.5  # share of the edges that are where they were: the image is an ol
 _MEMORY = 0.92  # share of what is known of a block that a pair leaves
 _LEAST = 4.5  # weight of the pairs that tell of a block, six: two seconds of turning
 _SHARE, _RELEASED = 0.5, 0.25  # share in which its edge was where it was; below the second one it shows surroundings
+_BORDER_PX = 2.0  # px of the raw image's border that interpolation reaches
 _MOST = 0.5  # share of all cells: where more stand still, something else is wrong
 
 
@@ -51,8 +52,11 @@ class _Look:
 class FixedParts:
     """Call `look` with frames that have a pose and are due; `cells` tells what stands still."""
 
-    def __init__(self, camera: RectifiedCamera, config: FixedPartsConfig, covered: F64) -> None:
-        """covered: (n,4) left, top, right, bottom of parts that are left out anyway, in shares of the image."""
+    def __init__(self, camera: RectifiedCamera, config: FixedPartsConfig, covered: F64, grid: F32 | None) -> None:
+        """covered: (n,4) left, top, right, bottom of parts that are left out anyway, in shares of the image.
+
+        grid: (gh,gw,2) raw pixels of every GRID_STEP-th one; None if the image needs no rectification.
+        """
         self._camera = camera
         self._config = config
         self._shape = camera.height // 2 // _BLOCK, camera.width // 2 // _BLOCK
@@ -65,6 +69,8 @@ class FixedParts:
         free = np.ones(self._shape, np.bool_)
         for left, top, right, bottom in covered * ([camera.width, camera.height] * 2) / (2.0 * _BLOCK):
             free[int(top) : math.ceil(bottom), int(left) : math.ceil(right)] = False
+        if grid is not None:
+            free &= _shown(grid, self._shape, np.array([camera.width, camera.height]))
         self._free = free.ravel()
 
     def interrupt(self) -> None:
@@ -152,3 +158,11 @@ class FixedParts:
             return False
         self.cells = cells
         return True
+
+
+def _shown(grid: F32, shape: tuple[int, int], size: I64) -> Bool:
+    """Blocks (rows, columns) that lie in the raw image, with those around: at its end, rectification makes an edge."""
+    inside = np.asarray(((grid > _BORDER_PX) & (grid < size - 1.0 - _BORDER_PX)).all(axis=2), np.uint8)
+    step = 2 * _BLOCK // GRID_STEP  # points of the grid in a block
+    whole = cv2.erode(inside, np.ones((3 * step, 3 * step), np.uint8), borderType=cv2.BORDER_REPLICATE)
+    return np.asarray(whole[step // 2 :: step, step // 2 :: step][: shape[0], : shape[1]] == 1)

@@ -12,6 +12,7 @@ from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_agent.tracking.track import Track
 from kiteline_core.arrays import F64, Bool
+from kiteline_core.geometry.cameras import Rectifier
 
 _AGAIN_S, _GROWN = 3.0, 1.3  # s from the first find, or the last event, to the next one; factor of growth since
 _NAMED = 8  # parts that an event names, the largest ones
@@ -26,12 +27,15 @@ class FixedPartsStage:
     named: the same in a few rectangles with a margin, as the last event named it.
     """
 
-    def __init__(self, local_map: LocalMap, config: FixedPartsConfig, detector: DetectorConfig) -> None:
+    def __init__(
+        self, local_map: LocalMap, rectifier: Rectifier, config: FixedPartsConfig, detector: DetectorConfig
+    ) -> None:  # fmt: skip
         self._map = local_map
         self._size = np.array([local_map.camera.width, local_map.camera.height], np.float64)
         self._by_user = detector.covered
-        self._parts = FixedParts(local_map.camera, config, detector.covered_parts)
-        self._right = FixedParts(local_map.camera, config, _NOTHING) if local_map.camera.stereo else None
+        camera, left, right = local_map.camera, rectifier.left_grid, rectifier.right_grid
+        self._parts = FixedParts(camera, config, detector.covered_parts, left)
+        self._right = FixedParts(camera, config, _NOTHING, right) if camera.stereo else None
         self.covered = detector.covered
         self.named: tuple[float, ...] = ()
         self._since_ns: int | None = None  # of the first find or the last event

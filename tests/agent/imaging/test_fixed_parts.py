@@ -7,7 +7,7 @@ import pytest
 from kiteline_agent.imaging.fixed_parts import CELL_PX, FixedParts, FixedPartsConfig
 from kiteline_core.arrays import F64, U8, Bool
 from kiteline_core.geometry import se3
-from kiteline_core.geometry.cameras import RectifiedCamera
+from kiteline_core.geometry.cameras import GRID_STEP, RectifiedCamera
 
 W, H, F, N = 384, 256, 250.0, 60
 CAMERA = RectifiedCamera(W, H, F, F, 0.5 * W, 0.5 * H, 0.1, True, np.eye(4))
@@ -61,7 +61,7 @@ def cells_of_leg() -> Bool:
 
 
 def test_a_leg_is_found_while_the_camera_turns_and_given_back_when_it_is_gone() -> None:
-    parts, world = FixedParts(CAMERA, FixedPartsConfig(), NOTHING), scenery()
+    parts, world = FixedParts(CAMERA, FixedPartsConfig(), NOTHING, None), scenery()
     found_at = None
     for k in range(N):
         look(parts, k, with_leg(seen(world, turned(k))), turned(k))
@@ -76,13 +76,13 @@ def test_a_leg_is_found_while_the_camera_turns_and_given_back_when_it_is_gone() 
 
 def test_what_is_named_is_not_looked_for() -> None:
     named = np.array([[LEG[0] / W, LEG[1] / H, (LEG[2] + 1) / W, 1.0]])
-    parts, world = FixedParts(CAMERA, FixedPartsConfig(), named), scenery()
+    parts, world = FixedParts(CAMERA, FixedPartsConfig(), named, None), scenery()
     assert not any(look(parts, k, with_leg(seen(world, turned(k))), turned(k)) for k in range(N))
 
 
 @pytest.mark.parametrize("case", ["surroundings", "hover", "old image", "stripes along the motion", "no turn"])
 def test_nothing_is_found_where_nothing_tells(case: str) -> None:
-    parts, world = FixedParts(CAMERA, FixedPartsConfig(), NOTHING), scenery(stripes=case.startswith("stripes"))
+    parts, world = FixedParts(CAMERA, FixedPartsConfig(), NOTHING, None), scenery(stripes=case.startswith("stripes"))
     for k in range(N):
         T_o_c = turned(k, pitch=0.0) if case.startswith("stripes") else turned(k)
         image = seen(world, T_o_c)
@@ -100,7 +100,7 @@ def test_nothing_is_found_where_nothing_tells(case: str) -> None:
 
 def test_a_near_scene_that_may_have_stood_still_tells_nothing() -> None:
     """The camera turns to one side and moves to the other: what is at some depth stays where it is."""
-    parts, world = FixedParts(CAMERA, FixedPartsConfig(), NOTHING), scenery()
+    parts, world = FixedParts(CAMERA, FixedPartsConfig(), NOTHING, None), scenery()
     for k in range(N):
         angle, still = 0.2 * np.sin(0.3 * k), seen(world, np.eye(4))
         T_o_c = se3.from_rt(se3.so3_exp(np.array([0.0, angle, 0.0])), np.array([-5.0 * np.tan(angle), 0.0, 0.0]))
@@ -109,4 +109,21 @@ def test_a_near_scene_that_may_have_stood_still_tells_nothing() -> None:
 
 
 def test_it_can_be_switched_off() -> None:
-    assert not FixedParts(CAMERA, FixedPartsConfig(on=False), NOTHING).is_due(0, np.eye(4))
+    assert not FixedParts(CAMERA, FixedPartsConfig(on=False), NOTHING, None).is_due(0, np.eye(4))
+
+
+def test_the_edge_where_rectification_leaves_the_raw_image_is_no_part() -> None:
+    """A wide lens: left of 40 px there is no raw image, and the rectified one repeats its border."""
+    columns, rows = (side // GRID_STEP + 1 for side in (W, H))
+    grid = np.stack(np.meshgrid(GRID_STEP * np.arange(columns) - 40.0, GRID_STEP * np.arange(rows) + 0.0), axis=-1)
+    world = scenery()
+    found = {}
+    for name, told in (("with", grid.astype(np.float32)), ("without", None)):
+        parts = FixedParts(CAMERA, FixedPartsConfig(), NOTHING, told)
+        for k in range(N):
+            image = seen(world, turned(k))
+            image[:, :40] = np.where(np.arange(H)[:, None] // 16 % 2, 20, 230)
+            look(parts, k, image, turned(k))
+        found[name] = parts.cells
+    assert found["without"][:, 0].any()
+    assert not found["with"].any()
