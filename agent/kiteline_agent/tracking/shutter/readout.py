@@ -26,6 +26,7 @@ class ReadoutEstimate:
         self.sigma_s: float | None = None  # of a read-out that was found; None: none was
         self._information = self._gradient = 0.0
         self._blocks: list[float] = []  # s by which the read-out in use is too short
+        self._used = 0  # blocks behind the read-out in use
 
     @property
     def settled(self) -> bool:
@@ -53,9 +54,11 @@ class ReadoutEstimate:
         found = self.sigma_s is not None
         if abs(mean) < sigma_s * (_REFINED if found else _SIGNIFICANCE):
             return 0.0
-        readout_s = min(max(self.readout_s + mean, -MOST_S), MOST_S)
+        weight = len(blocks) / (len(blocks) + self._used)  # what was found before counts, too
+        readout_s = min(max(self.readout_s + weight * mean, -MOST_S), MOST_S)
         if not found and abs(readout_s) < _LEAST_S:
             return 0.0
         change, self.readout_s, self.sigma_s = readout_s - self.readout_s, readout_s, sigma_s
+        self._used += len(blocks)
         self._blocks.clear()
         return change

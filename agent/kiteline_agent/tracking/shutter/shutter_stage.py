@@ -26,6 +26,7 @@ _FOUND = (
     "rolling shutter: {:.0f} ms from the first row to the last, found in flight; readout_s: {:.3f} in the calibration "
     "corrects it from the start"
 )
+_TOLD_S = 0.002  # s by which a read-out has changed until that is said again
 _MAX_GAP_S = 0.2  # s between two frames whose poses tell the motion of the second
 
 
@@ -45,6 +46,7 @@ class ShutterStage:
         self._twist = twist
         self._estimated = config.on and rectifier.readout_s == 0.0
         self._estimate = ReadoutEstimate(rectifier.readout_s)
+        self._told_s = 0.0  # the read-out that the last event said
         self._motion_known = False  # in the last frame
         self._last: tuple[int, SubmapId, F64] | None = None  # stamp, submap and T_m_c (4,4) of the last tracked frame
         self._measured: F64 | None = None  # twist (6,) of this frame by images
@@ -96,6 +98,9 @@ class ShutterStage:
             return []
         self._move_map(change_s)
         readout_s = self._estimate.readout_s
+        if abs(readout_s - self._told_s) < _TOLD_S:
+            return []
+        self._told_s = readout_s
         return [_FOUND.format(1e3 * readout_s, readout_s)]
 
     def end_frame(self) -> None:
