@@ -21,7 +21,8 @@ _EDGE = 64.0  # least strength of an edge, 8 grey levels a pixel: weaker ones ar
 _MOVED_PX = 8.0  # px by which an edge of the surroundings has moved across itself: four of the half image
 _ALIKE, _RATIO = 0.9, 1.7  # cosine of the directions and ratio of the strengths of an edge that is where it was
 _TELLING = 0.2  # share of the edges that tell; with fewer the older frame waits for more motion
-_EAGER, _CALM = 24, 4.0  # looks that tell, after which looks are so many times rarer while nothing is found
+_EAGER, _CALM = 24, 5.0  # looks after which they are so many times rarer while nothing is found
+_CHANCE = 3  # cells that surroundings may have by chance
 _EVERY_S = 0.3  # s between two looks at first, at least: each takes a quarter of a millisecond
 _LONGEST_S = 3.0  # s between the two frames: then a new pair begins
 _FROZEN = 0.5  # share of the edges that are where they were: the image is an old one, or the pose is wrong
@@ -65,7 +66,7 @@ class FixedParts:
         rows, columns = (-(-blocks // _CELL) for blocks in self._shape)
         self.cells: Bool = np.zeros((rows, columns), np.bool_)
         self._before: _Look | None = None
-        self._told = 0  # looks that told
+        self._looks = 0
         free = np.ones(self._shape, np.bool_)
         for left, top, right, bottom in covered * ([camera.width, camera.height] * 2) / (2.0 * _BLOCK):
             free[int(top) : math.ceil(bottom), int(left) : math.ceil(right)] = False
@@ -83,7 +84,7 @@ class FixedParts:
         if before is None:
             return self._config.on
         age_s = (t_ns - before.t_ns) * 1e-9
-        every_s = _EVERY_S * (1.0 if self._told < _EAGER or self._fixed.any() else _CALM)
+        every_s = _EVERY_S * (1.0 if self._looks < _EAGER or int(self.cells.sum()) > _CHANCE else _CALM)
         return age_s >= every_s and (self._turned_px(before, T_o_c) >= _MOVED_PX or age_s > _LONGEST_S)
 
     def look(self, t_ns: int, half: U8, T_o_c: F64, depths_m: F64) -> bool:
@@ -91,6 +92,7 @@ class FixedParts:
 
         half: (h,w) rectified left image at half size. T_o_c: (4,4) camera. depths_m: (n,) of what it sees.
         """
+        self._looks += 1
         x, y = (np.asarray(part, np.int16) for part in cv2.spatialGradient(half))
         before, now = self._before, _Look(t_ns, T_o_c.copy(), x, y)
         if before is None or not len(depths_m) or self._turned_px(before, T_o_c) < _MOVED_PX:
@@ -118,7 +120,6 @@ class FixedParts:
         if int(np.count_nonzero(alike)) > _FROZEN * int(np.count_nonzero(tells)):
             return False
         tells |= self._fixed & ~edge  # what stood there is gone
-        self._told += 1
         self._seen[tells] = _MEMORY * self._seen[tells] + 1.0
         self._same[tells] = _MEMORY * self._same[tells] + alike[tells]
         share = np.where(self._fixed, _RELEASED, _SHARE)
