@@ -223,10 +223,10 @@ class Agent:
             self._loss.end()
             events += self._align_gravity(ctx)
             # 6. Measure a rolling shutter; update depths and slants of landmarks, and search those without a depth.
+            events += self._shutter.measure(ctx, by_images, self.submap)
             if self._two_view_start is not None:
                 self._two_view_start.note_depths(track.depth_m[track.inlier])
             # By images: what a fused pose differs by is in all pixels alike, and would move all depths together.
-            events += self._shutter.measure(ctx, by_images, self.submap)
             self._depth.update_landmarks(ctx, by_images)
             self._slants.update(ctx, by_images)
             self._depth.search_seeds(ctx, track)
