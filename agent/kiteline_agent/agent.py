@@ -82,7 +82,9 @@ class Agent:
         self._effort = FULL
         self._camera = CameraState(rig, imu, config, identity, self.map)
         tracker = Tracker(self.map, self.work)
-        self._shutter = ShutterStage(self.map, self._rectifier, config.readout, self._camera.known_twist)
+        self._shutter = ShutterStage(
+            self.map, self._rectifier, config.readout, self._camera.known_twist, config.known_rig.readout_of(camera)
+        )
         self._stuck_camera = StuckCamera(camera)
         self._fixed_parts = FixedPartsStage(self.map, self._rectifier, config.fixed_parts, config.detector)
         self._relocaliser = Relocaliser(
@@ -403,9 +405,10 @@ class Agent:
         return bool(known.camera) and not known.is_of(self.map.camera)
 
     def known_rig(self) -> KnownRigConfig | None:
-        """What is known of right camera and IMU, for the next flight; None before anything was measured."""
+        """What is known of cameras and IMU, for the next flight; None before anything was measured."""
         right = None if self.right_camera is None else self.right_camera.known()
-        return self._full_config.known_rig.updated(self.map.camera, right, self._camera.motion.known_imu())
+        imu, readout_s = self._camera.motion.known_imu(), self._shutter.known_s()
+        return self._full_config.known_rig.updated(self.map.camera, right, imu, readout_s)
 
     def motion_reports(self) -> dict[str, Any]:
         """What was found of time offset, IMU, odometer and shutter (None: nothing), and of parts of the image."""

@@ -13,6 +13,7 @@ from kiteline_core.geometry.cameras import VIRTUAL_BASELINE_M, RectifiedCamera
 _CAMERA_NUMBERS = 7
 _SAME = 1e-6  # relative; machines round differently
 _MAX_PX = 8.0  # of a number that the link can carry
+_MAX_READOUT_S = 0.2  # longer than any camera takes
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,10 +26,16 @@ class KnownRigConfig:
     rows_read: bool = False  # disparities were measured in a right image that was read there
     disparity_px: tuple[float, ...] = ()  # px; factors of 1, x, y, x^2, x y by which disparities are too large
     disparity_sigma_px: float = 0.0  # px; standard deviation, rms over the image; 0: disparity_px is a start, not known
+    readout_s: tuple[
+        float, ...
+    ] = ()  # s from a rolling shutter's first row to the last, and its deviation; (): not found
     imu: KnownImuConfig = field(default_factory=KnownImuConfig)
 
     def __post_init__(self) -> None:
-        sizes = {"camera": _CAMERA_NUMBERS, "T_b_c": 16, "rows_px": ROW_TERMS, "disparity_px": disparity_offset.TERMS}
+        sizes = {
+            "camera": _CAMERA_NUMBERS, "T_b_c": 16, "rows_px": ROW_TERMS, "disparity_px": disparity_offset.TERMS,
+            "readout_s": 2,
+        }  # fmt: skip
         for name, size in sizes.items():
             values = getattr(self, name)
             if values and (len(values) != size or not np.isfinite(values).all()):
@@ -37,6 +44,8 @@ class KnownRigConfig:
             raise ValueError(f"rows_px and disparity_px are px: expected at most {_MAX_PX:g}")
         if not 0.0 <= self.disparity_sigma_px <= _MAX_PX:
             raise ValueError(f"disparity_sigma_px is {self.disparity_sigma_px:g}: expected px from 0 to {_MAX_PX:g}")
+        if any(abs(v) > _MAX_READOUT_S for v in self.readout_s) or any(sigma <= 0.0 for sigma in self.readout_s[1:]):
+            raise ValueError(f"readout_s is s, and a deviation above 0: expected at most {_MAX_READOUT_S:g}")
 
     def is_of(self, camera: RectifiedCamera) -> bool:
         """True if it was found with the calibration that gives this rectified camera."""
@@ -47,15 +56,17 @@ class KnownRigConfig:
         return self.is_of(camera) and bool(self.T_b_c) and np.allclose(self.T_b_c, camera.T_b_c.ravel(), atol=_SAME)
 
     def updated(
-        self, camera: RectifiedCamera, right: "KnownRigConfig | None", imu: KnownImuConfig | None
-    ) -> "KnownRigConfig | None":
-        """This, with what a flight found of the right camera and the IMU; None if that is nothing."""
-        if right is None and imu is None:
+        self, camera: RectifiedCamera, right: "KnownRigConfig | None", imu: KnownImuConfig | None,
+        readout_s: tuple[float, ...] = (),
+    ) -> "KnownRigConfig | None":  # fmt: skip
+        """This, with what a flight found of right camera, IMU and shutter (as `readout_s`); None if that is nothing."""
+        if right is None and imu is None and not readout_s:
             return None
         if right is None:
             right = self if self.is_of(camera) else KnownRigConfig(numbers_of(camera))
             right = replace(right, T_b_c=_extrinsics_of(camera))  # with which the IMU was compared
-        return replace(right, imu=imu or (self.imu if self.knows_imu_of(camera) else KnownImuConfig()))
+        imu = imu or (self.imu if self.knows_imu_of(camera) else KnownImuConfig())
+        return replace(right, imu=imu, readout_s=readout_s or self.readout_of(camera))
 
     def rectified(self) -> RectifiedCamera | None:
         """The rectified camera; None if nothing is known. One camera has no right one."""
@@ -65,6 +76,10 @@ class KnownRigConfig:
         T_b_c = np.array(self.T_b_c).reshape(4, 4) if self.T_b_c else np.eye(4)
         stereo = bool(self.rows_px) or baseline_m != VIRTUAL_BASELINE_M
         return RectifiedCamera(round(width), round(height), fx, fy, cx, cy, baseline_m, stereo, T_b_c)
+
+    def readout_of(self, camera: RectifiedCamera) -> tuple[float, ...]:
+        """The read-out that was found with this camera's calibration, as `readout_s`."""
+        return self.readout_s if self.is_of(camera) else ()
 
     @property
     def rows(self) -> F64:

@@ -13,9 +13,9 @@ from kiteline_hw.durable_files import write_atomically
 _TABLE = "known_rig"
 _HEAD = """\
 # What kiteline found of a rig beyond its calibration; written by `kiteline agent --rig` and `kiteline rig export`.
-# rows_px: by how much the right image is too low; disparity_px: by how much disparities are too large; imu: the time
-# offset and the axes of its sensors, with deviations. Delete this file after repairs. It is not used with another
-# calibration.
+# rows_px: by how much the right image is too low; disparity_px: by how much disparities are too large; readout_s: from
+# a rolling shutter's first row to the last; imu: the time offset and the axes of its sensors, with deviations. Delete
+# this file after repairs. It is not used with another calibration.
 """
 
 

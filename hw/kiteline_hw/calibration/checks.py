@@ -80,10 +80,11 @@ def doubts(camera: CameraModel, name: str) -> list[str]:
 
 
 def checked_readout(readout_s: float, where: str) -> float:
-    """The read-out of a rolling shutter in s, 0 for a global one."""
-    if not 0.0 <= readout_s < LONGEST_READOUT_S:
+    """The read-out of a rolling shutter in s, 0 for a global one, below 0 for rows that are read from the bottom up."""
+    if not abs(readout_s) < LONGEST_READOUT_S:
         raise SourceError(
-            f"{where}: a read-out of {readout_s:g} s: expected readout_s or line_delay in s, 0 for a global shutter"
+            f"{where}: a read-out of {readout_s:g} s: expected readout_s or line_delay in s, 0 for a global shutter, "
+            "below 0 if the image is turned upside down after it is read"
         )
     return readout_s
 

@@ -78,6 +78,7 @@ class KnownCameras:
         self.calibrated: set[AgentId] = set()
         self.sigma_px: dict[AgentId, float] = {}  # of disparity_px, where the rig is not a good calibration's
         self.imu = KnownImuConfig()  # of a rig file
+        self.readout_s: tuple[float, ...] = ()  # of a rig file, as KnownRigConfig has it
 
     @classmethod
     def of_base(cls, mapper: Mapper) -> "KnownCameras":
@@ -104,7 +105,7 @@ class KnownCameras:
             out.rows_read.update([agent] if known.rows_read else [])
             if known.disparity_sigma_px > 0.0:
                 out.sigma_px[agent] = known.disparity_sigma_px
-            out.imu = known.imu
+            out.imu, out.readout_s = known.imu, known.readout_s
         return out
 
     def offset_px(self, agent: AgentId) -> F64:
@@ -113,7 +114,13 @@ class KnownCameras:
 
     def rig(self, agent: AgentId) -> CameraRig:
         """An agent's rectified pair as it was found."""
-        return found_rig(self.cameras[agent], self.offset_px(agent), self.rows_px.get(agent))
+        rig = found_rig(self.cameras[agent], self.offset_px(agent), self.rows_px.get(agent))
+        if not self.readout_s:
+            return rig
+        left = dataclasses.replace(rig.left, readout_s=self.readout_s[0])
+        return dataclasses.replace(
+            rig, left=left, right=rig.right and dataclasses.replace(rig.right, readout_s=left.readout_s)
+        )
 
 
 def opened(path: Path) -> KnownCameras:
@@ -142,14 +149,18 @@ def summary(known: KnownCameras) -> dict[str, Any]:
             "disparity_sigma_px": known.sigma_px.get(agent),
             "calibrated": agent in known.calibrated or agent in known.sigma_px,
             "right_camera_turned_deg": np.degrees(turned).tolist(),
+            "readout_s": list(known.readout_s),
             "imu": {name: list(values) for name, values in dataclasses.asdict(known.imu).items()},
         }
     return out
 
 
-def _imu_lines(imu: dict[str, Any]) -> list[str]:
-    """What is known of an IMU, beside the deviations of a sensor whose axes are unknown."""
-    lines = []
+def _shutter_and_imu_lines(rig: dict[str, Any]) -> list[str]:
+    """What is known of shutter and IMU, beside the deviations of a sensor whose axes are unknown."""
+    imu, lines = rig["imu"], []
+    if rig["readout_s"]:
+        lines.append("  rolling shutter: {:.1f} ms from the first row to the last (deviation {:.1f} ms)".format(
+            *(1000.0 * v for v in rig["readout_s"])))  # fmt: skip
     if imu["offset_s"]:
         lines.append("  camera stamps + {:.2f} ms are the IMU's time (deviation {:.2f} ms)".format(
             *(1000.0 * v for v in imu["offset_s"])))  # fmt: skip
@@ -172,7 +183,7 @@ def table(rigs: dict[str, Any]) -> str:
         width, height = rig["size_px"]
         lines.append(f"agent {agent}: {width}x{height} px, focal length {rig['focal_px'][0]:.2f} px (rectified)")
         if rig["baseline_m"] is None:
-            lines += ["  no right camera", *_imu_lines(rig["imu"])]
+            lines += ["  no right camera", *_shutter_and_imu_lines(rig)]
             continue
         offset = " ".join(f"{c:+.3f}" for c in rig["disparity_offset_px"])
         turned = " ".join(f"{a:+.4f}" for a in rig["right_camera_turned_deg"])
@@ -183,7 +194,7 @@ def table(rigs: dict[str, Any]) -> str:
             rows = " ".join(f"{c:+.3f}" for c in rig["rows_px"])
             lines.append(f"  rows of the right image too low by {rows} px of 1, x, y, x y, y^2")
         lines.append(f"  like a right camera turned by {turned} degrees about x, y, z")
-        lines += _imu_lines(rig["imu"])
+        lines += _shutter_and_imu_lines(rig)
     return "\n".join(lines)
 
 
@@ -202,14 +213,14 @@ def exported(known: KnownCameras, agent: int | None, kind: str) -> dict[str, str
     if camera is None:
         raise RigError(f"no agent {chosen}: expected one of {', '.join(str(int(a)) for a in sorted(cameras))}")
     if kind == "kiteline" and not camera.stereo:
-        one_camera = KnownRigConfig().updated(camera, None, known.imu)
+        one_camera = KnownRigConfig().updated(camera, None, known.imu, known.readout_s)
         assert one_camera is not None
         return {"rig.toml": rig_file.text_of(one_camera)}
     if kind == "kiteline":
         rows = known.rows_px.get(chosen, np.zeros(row_alignment.TERMS))
         read = chosen in known.rows_read
         found = known_rig(camera, rows, known.offset_px(chosen), known.sigma_px.get(chosen), rows_read=read)
-        return {"rig.toml": rig_file.text_of(dataclasses.replace(found, imu=known.imu))}
+        return {"rig.toml": rig_file.text_of(dataclasses.replace(found, imu=known.imu, readout_s=known.readout_s))}
     rig = known.rig(chosen)
     pair = [(rig.left, rig.T_b_c)]
     if camera.stereo and rig.right is not None and rig.T_c_r is not None:
@@ -221,6 +232,8 @@ def exported(known: KnownCameras, agent: int | None, kind: str) -> dict[str, str
         lines += [f"cam{k}:", "  camera_model: pinhole", f"  intrinsics: {_four(model)}", "  distortion_model: radtan",
                   "  distortion_coeffs: [0.0, 0.0, 0.0, 0.0]", f"  resolution: [{model.width}, {model.height}]",
                   f"  rostopic: /cam{k}/image_rect", "  T_cam_imu:", *_rows(se3.inverse(T_b_c))]  # fmt: skip
+        if model.readout_s:
+            lines.append(f"  line_delay: {model.readout_s / model.height!r}")
         if known.imu.offset_s:
             lines.append(f"  timeshift_cam_imu: {known.imu.offset_s[0]!r}")
         if k:
@@ -238,11 +251,13 @@ def _rows(T: F64) -> list[str]:
 
 def _euroc(model: CameraModel, T_b_c: F64) -> str:
     data = ", ".join(repr(float(v)) for v in T_b_c.ravel())
+    readout = f"readout_s: {model.readout_s!r}\n" if model.readout_s else ""
     return (
         "sensor_type: camera\n"
         f"T_BS:\n  cols: 4\n  rows: 4\n  data: [{data}]\n"
         f"rate_hz: 20\nresolution: [{model.width}, {model.height}]\ncamera_model: pinhole\nintrinsics: {_four(model)}\n"
         "distortion_model: radial-tangential\ndistortion_coefficients: [0.0, 0.0, 0.0, 0.0]\n"
+        f"{readout}"
     )
 
 

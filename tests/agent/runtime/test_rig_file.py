@@ -24,7 +24,7 @@ from kiteline_core import config as configuration
 from kiteline_core.config import ConfigError
 from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry import se3
-from kiteline_core.geometry.cameras import CameraModel, CameraRig, Lens, RectifiedCamera, Rectifier
+from kiteline_core.geometry.cameras import VIRTUAL_BASELINE_M, CameraModel, CameraRig, Lens, RectifiedCamera, Rectifier
 from kiteline_core.ids import AgentId
 
 LEFT = CameraModel(640, 400, 420.0, 421.0, 318.0, 203.0, Lens.RADTAN, (-0.25, 0.06, 0.0, 0.0))
@@ -113,6 +113,27 @@ def test_without_knowledge_or_with_another_calibration_nothing_changes() -> None
         assert agent.known_rig() is None  # nothing was measured yet
     agent, _ = flown(known_rig(CAMERA, ROWS, DISPARITY, rows_read=True), CameraRig(LEFT, None, np.eye(4), None))
     assert agent.known_rig() is None
+
+
+def test_an_agent_begins_with_the_read_out_of_its_rolling_shutter() -> None:
+    known = replace(known_rig(CAMERA, ROWS, DISPARITY, rows_read=True), readout_s=(0.0231, 0.0006))
+    agent, _ = flown(known)
+    assert agent.motion_reports()["readout"] == {"ms": 23.1, "sigma_ms": 0.6}
+    kept = agent.known_rig()
+    assert kept is not None and kept.readout_s == known.readout_s
+    told = replace(RIG, left=replace(LEFT, readout_s=0.01))  # the calibration says it: that is used
+    agent, _ = flown(known, told)
+    assert agent.motion_reports()["readout"] is None
+    moved, _ = flown(replace(known, camera=(*known.camera[:2], 400.0, *known.camera[3:])))
+    assert moved.motion_reports()["readout"] is None
+
+
+def test_the_read_out_of_one_camera_without_imu_is_kept() -> None:
+    one = replace(CAMERA, baseline_m=VIRTUAL_BASELINE_M, stereo=False)
+    known = KnownRigConfig().updated(one, None, None, (-0.02, 0.001))
+    assert known is not None and known.is_of(one) and known.readout_of(CAMERA) == ()
+    assert known.updated(one, None, None, (-0.021, 0.0005)).readout_s == (-0.021, 0.0005)
+    assert known.updated(one, None, IMU).readout_s == known.readout_s
 
 
 def test_the_file_is_replaced_as_a_whole(tmp_path: Path) -> None:

@@ -121,6 +121,19 @@ def test_errors_of_a_global_shutter_s_lens_are_no_read_out(bias_s: float, scatte
     assert estimate.sigma_s is None
 
 
+def test_a_read_out_of_an_earlier_flight_is_where_the_next_one_begins() -> None:
+    estimate = ReadoutEstimate(0.02, 0.0005)
+    assert changes(estimate, 0.021, 0.002, 40) == []  # it agrees
+    assert (estimate.readout_s, estimate.sigma_s) == (0.02, 0.0005)
+    assert estimate.settled
+
+
+def test_a_read_out_of_an_earlier_flight_that_is_refuted_no_longer_counts() -> None:
+    estimate = ReadoutEstimate(0.02, 0.0005)
+    first, *_ = changes(estimate, 0.01, 0.001, 8)
+    assert first == pytest.approx(-0.01, abs=0.002)
+
+
 def test_a_read_out_is_no_longer_than_between_two_images() -> None:
     estimate = ReadoutEstimate(0.0)
     changes(estimate, 0.5, 0.001, 40)

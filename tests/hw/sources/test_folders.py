@@ -84,7 +84,10 @@ def euroc(
     return root
 
 
-@pytest.mark.parametrize(("text", "readout_s"), [("readout_s: 0.02", 0.02), ("line_delay: 0.0005", 0.024), ("", 0.0)])
+@pytest.mark.parametrize(
+    ("text", "readout_s"),
+    [("readout_s: 0.02", 0.02), ("line_delay: 0.0005", 0.024), ("readout_s: -0.02", -0.02), ("", 0.0)],
+)
 def test_the_read_out_of_a_rolling_shutter_is_part_of_the_calibration(
     tmp_path: Path, text: str, readout_s: float
 ) -> None:

@@ -174,6 +174,20 @@ def test_a_rig_file_of_one_camera_has_no_right_one(tmp_path: Path, capsys: pytes
     assert exported(cameras, None, "kiteline")["rig.toml"] == text
 
 
+def test_the_read_out_of_a_rig_file_is_shown_and_exported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    known = replace(known_rig(CAMERA, np.zeros(5), OFFSET, rows_read=False), readout_s=(0.0231, 0.0006))
+    (tmp_path / "rig.toml").write_text(rig_file.text_of(known))
+    assert main(["show", str(tmp_path / "rig.toml")]) == 0
+    said = "rolling shutter: 23.1 ms from the first row to the last (deviation 0.6 ms)"
+    assert said in capsys.readouterr().out
+    cameras = KnownCameras.of_file(rig_file.load(str(tmp_path / "rig.toml")))
+    chain = yaml.safe_load(exported(cameras, None, "kalibr")["camchain-imucam.yaml"])
+    assert [chain[name]["line_delay"] * CAMERA.height for name in ("cam0", "cam1")] == pytest.approx([0.0231] * 2)
+    for text in exported(cameras, None, "euroc").values():
+        assert yaml.safe_load(text)["readout_s"] == 0.0231
+    assert "readout_s = [0.0231, 0.0006]" in exported(cameras, None, "kiteline")["rig.toml"]
+
+
 def test_what_knows_no_camera_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "rig.toml").write_text(rig_file.text_of(KnownRigConfig()))
     assert main(["show", str(tmp_path / "rig.toml")]) == 0

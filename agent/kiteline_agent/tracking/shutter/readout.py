@@ -20,13 +20,15 @@ _LEAST_S = 0.003  # s: a global shutter, for all that it matters
 class ReadoutEstimate:
     """Sums equations, and says by how much the read-out in use is to change."""
 
-    def __init__(self, readout_s: float) -> None:
-        """readout_s: in use."""
+    def __init__(self, readout_s: float, sigma_s: float | None = None) -> None:
+        """readout_s: in use. sigma_s: its deviation, if an earlier flight found it."""
         self.readout_s = readout_s
-        self.sigma_s: float | None = None  # of a read-out that was found; None: none was
+        self.sigma_s = sigma_s  # of a read-out that was found; None: none was
+        self._of_earlier_flight = sigma_s is not None
         self._information = self._gradient = 0.0
         self._blocks: list[float] = []  # s by which the read-out in use is too short
-        self._used = 0  # blocks behind the read-out in use
+        # blocks behind the read-out in use
+        self._used = 0 if sigma_s is None else min(round((_SCATTER_S / sigma_s) ** 2), _KEPT_BLOCKS)
 
     @property
     def settled(self) -> bool:
@@ -54,11 +56,14 @@ class ReadoutEstimate:
         found = self.sigma_s is not None
         if abs(mean) < sigma_s * (_REFINED if found else _SIGNIFICANCE):
             return 0.0
+        if self._of_earlier_flight and abs(mean) > max(_SIGNIFICANCE * sigma_s, _LEAST_S):
+            self._used = 0  # refuted: the camera runs in another mode
         weight = len(blocks) / (len(blocks) + self._used)  # what was found before counts, too
         readout_s = min(max(self.readout_s + weight * mean, -MOST_S), MOST_S)
         if not found and abs(readout_s) < _LEAST_S:
             return 0.0
         change, self.readout_s, self.sigma_s = readout_s - self.readout_s, readout_s, sigma_s
         self._used += len(blocks)
+        self._of_earlier_flight = False
         self._blocks.clear()
         return change

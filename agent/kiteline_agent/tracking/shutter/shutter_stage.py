@@ -23,8 +23,8 @@ _STILL_PX = 0.3  # by which a rolling shutter moves pixels of a vehicle that sta
 _TURNING_PX = 20.0  # px/s at the image's centre: slower turns tell nothing of a read-out
 _SETTLED_EVERY = 8  # frames of which one is looked at once the read-out has settled
 _FOUND = (
-    "rolling shutter: {:.0f} ms from the first row to the last, found in flight; readout_s: {:.3f} in the calibration "
-    "corrects it from the start"
+    "rolling shutter: {:.0f} ms from the first row to the last, found in flight; a rig file, or readout_s: {:.3f} in "
+    "the calibration, corrects it from the start"
 )
 _TOLD_S = 0.002  # s by which a read-out has changed until that is said again
 _MAX_GAP_S = 0.2  # s between two frames whose poses tell the motion of the second
@@ -39,14 +39,20 @@ class ShutterStage:
         rectifier: Rectifier,
         config: ReadoutConfig,
         twist: Callable[[int, float], F64 | None],
+        known_s: tuple[float, ...] = (),
     ) -> None:
-        """twist: predicted (6,) of the camera at a stamp, and so many seconds after the last frame; None: unknown."""
+        """twist: predicted (6,) of the camera at a stamp, and so many seconds after the last frame; None: unknown.
+
+        known_s: read-out that an earlier flight found, and its deviation; (): none.
+        """
         self._map = local_map
         self._rectifier = rectifier
         self._twist = twist
         self._estimated = config.on and rectifier.readout_s == 0.0
-        self._estimate = ReadoutEstimate(rectifier.readout_s)
-        self._told_s = 0.0  # the read-out that the last event said
+        self._estimate = (
+            ReadoutEstimate(*known_s) if self._estimated and known_s else ReadoutEstimate(rectifier.readout_s)
+        )
+        self._told_s = self._estimate.readout_s  # that the last event said
         self._motion_known = False  # in the last frame
         self._last: tuple[int, SubmapId, F64] | None = None  # stamp, submap and T_m_c (4,4) of the last tracked frame
         self._measured: F64 | None = None  # twist (6,) of this frame by images
@@ -117,6 +123,11 @@ class ShutterStage:
         if self._estimate.sigma_s is None:
             return None
         return {"ms": round(1e3 * self._estimate.readout_s, 1), "sigma_ms": round(1e3 * self._estimate.sigma_s, 1)}
+
+    def known_s(self) -> tuple[float, ...]:
+        """The read-out that was found, and its deviation, for the next flight; (): none was."""
+        e = self._estimate
+        return () if e.sigma_s is None else (round(e.readout_s, 5), round(max(e.sigma_s, 1e-5), 5))
 
     def _move_map(self, change_s: float) -> None:
         """Move the pixels of landmarks in their keyframes, where the motion of these is known."""
