@@ -6,6 +6,7 @@ from kiteline_agent.initialisation.corner_tracks import CornerObservations, Trac
 from kiteline_agent.initialisation.metric_restart import MetricPoints
 from kiteline_agent.initialisation.window.window_state import WindowSolution
 from kiteline_agent.tracking.frame_context import FrameContext
+from kiteline_agent.tracking.shutter.rolling_shutter import RollingShutter
 from kiteline_core.arrays import F64
 
 
@@ -16,7 +17,8 @@ class InertialMap:
     frame: the newest keyframe of the window. points: new landmarks. solution: its window. cov: (17,17) of the state, as
     in InertialState. scale_sigma: relative deviation of the scale. duration_s: length of the window. accel_noise:
     factor on the accelerometer's noise. lens: (8,) found of the camera (lens_correction), with which the landmarks'
-    pixels are corrected. keyframes (K), corners (K,P): of the window.
+    pixels are corrected. keyframes (K), corners (K,P): of the window. shutters: (K) rolling shutters in motion, one
+    of each keyframe; none if it is a global one.
     """
 
     frame: FrameContext
@@ -29,3 +31,4 @@ class InertialMap:
     lens: F64
     keyframes: tuple[TrackedKeyframe, ...]
     corners: CornerObservations
+    shutters: tuple[RollingShutter, ...]

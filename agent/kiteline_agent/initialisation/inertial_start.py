@@ -20,6 +20,7 @@ from kiteline_agent.initialisation.landmark_realignment import realigned
 from kiteline_agent.initialisation.metric_restart import window_points
 from kiteline_agent.initialisation.window.known_length import KnownLength, joint_sigma
 from kiteline_agent.initialisation.window.noise_of_windows import NoiseOfWindows
+from kiteline_agent.initialisation.window.rolling_rows import RollingRows, Shutter
 from kiteline_agent.initialisation.window.window_bundle import InertialBundle, lens_prior
 from kiteline_agent.initialisation.window.window_noise import WindowNoise
 from kiteline_agent.initialisation.window.window_samples import WindowSamples
@@ -32,6 +33,7 @@ from kiteline_agent.initialisation.window.window_state import (
 )
 from kiteline_agent.initialisation.window_odometry import Mean, WindowOdometry
 from kiteline_agent.tracking.frame_context import FrameContext
+from kiteline_agent.tracking.shutter.rolling_shutter import RollingShutter
 from kiteline_agent.tracking.waiting_frames import WaitingFrames
 from kiteline_core.arrays import F64, I64
 from kiteline_core.frame import ImuCalibration
@@ -70,12 +72,16 @@ class _Solved:
 
 @dataclass(frozen=True, slots=True)
 class _Imu:
-    """Samples of a window, and what is known of the IMU before it: biases and time offset. clock: of the frames."""
+    """Samples of a window, and what is known of the IMU before it: biases and time offset. clock: of the frames.
+
+    rows: of a rolling shutter; None: a global one.
+    """
 
     samples: WindowSamples
     prior: BiasPrior
     offset: TimeOffset
     clock: FrameClock
+    rows: RollingRows | None
 
 
 class InertialStart:
@@ -87,16 +93,18 @@ class InertialStart:
     def __init__(
         self, camera: RectifiedCamera, calibration: ImuCalibration, config: AgentConfig, work: Work,
         may_go_on: Callable[[], bool] = lambda: True, odometry: Mean = lambda from_ns, to_ns: None,
+        shutter: Shutter = lambda twist: None,
     ) -> None:  # fmt: skip
         """may_go_on: asked before each part of a solution; False: no CPU time is left for it in this step.
 
-        odometry: means of an odometer's velocities between two stamps.
+        odometry: means of an odometer's velocities between two stamps. shutter: of the camera, by its motion.
         """
         self._camera = camera
         self._calibration = calibration
         self._config = config
         self._work = work
         self._may_go_on = may_go_on
+        self._shutter = shutter
         self._attempt: InParts[InertialMap | None] | None = None  # that has begun
         self._beside_map = False  # it began while a map was tracked
         start = config.inertial_start
@@ -245,7 +253,11 @@ class InertialStart:
             return None
         self._tried_ns = ctx.t_ns
         prior = self._default_prior() if imu.bias is None else imu.bias
-        return self._attempting(ctx, keyframes, _Imu(samples, prior, imu.offset, imu.clock))
+        rows, still = None, self._shutter(np.zeros(6))
+        if still is not None:
+            offset = imu.offset if self._before is None else self._before.solution.offset
+            rows = RollingRows(1e-9 * (np.array(times_ns) - times_ns[0]), samples.rates(offset.offset_s), still)
+        return self._attempting(ctx, keyframes, _Imu(samples, prior, imu.offset, imu.clock, rows))
 
     def _attempting(
         self, ctx: FrameContext, keyframes: list[TrackedKeyframe], imu: _Imu
@@ -273,7 +285,9 @@ class InertialStart:
         length = self.odometry.length(stamps, solution.state, sigma if solution.fits else np.inf)
         if joint_sigma(sigma, length) < _NEARLY * _SCALE_SIGMA:
             self._work.alignments += int(np.count_nonzero(observations.seen))
-            aligned = realigned(keyframes, observations, solution.state, found.xyz, found.first, self._camera)
+            aligned = realigned(
+                keyframes, observations, solution.state, found.xyz, found.first, self._camera, imu.rows
+            )  # fmt: skip
             all_corners = corner_tracks.with_found(all_corners, columns, aligned)
             yield
             keep = aligned.seen.sum(axis=0) >= _MIN_VIEWS
@@ -311,10 +325,20 @@ class InertialStart:
         self._lens_info = np.asarray(np.linalg.inv(solution.lens_cov), np.float64)
         lens = solution.state.lens
         accel_noise = noise.accel * max(self._noise.level_now, 1.0)
+        shutters = self._shutters(solution, imu.rows)
+        if shutters:
+            ctx, points = replace(ctx, shutter=shutters[-1]), points.at_frame(shutters[-1], self._camera)
         return InertialMap(
             ctx, points, solution, cov, solution.scale_sigma, duration_s, accel_noise, lens, tuple(keyframes),
-            all_corners,
+            all_corners, shutters,
         )  # fmt: skip
+
+    def _shutters(self, solution: WindowSolution, rows: RollingRows | None) -> tuple[RollingShutter, ...]:
+        """The rolling shutter in each keyframe of a solution; none of a global one."""
+        if rows is None:
+            return ()
+        twists = rows.twists(solution.state, self._camera.T_b_c)
+        return tuple(shutter for twist in twists if (shutter := self._shutter(twist)) is not None)
 
     def _doubt(self, clock: FrameClock) -> None:
         """Place the frames of the next window otherwise: by the camera's rate, or by their stamps."""
@@ -364,7 +388,7 @@ class InertialStart:
         return InertialBundle(
             corners, imu.samples.at, self._calibration, self._camera.T_b_c, self._camera.fx,
             self._config.inertial.gravity_m_s2, imu.prior, self._config.inertial_start.bundle,
-            self._noise.now, self._lens_info, imu.offset, length,
+            self._noise.now, self._lens_info, imu.offset, length, imu.rows,
         )  # fmt: skip
 
     def _default_prior(self) -> BiasPrior:

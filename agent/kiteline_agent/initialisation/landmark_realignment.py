@@ -9,6 +9,7 @@ from kiteline_agent.imaging import alignment_kernels
 from kiteline_agent.imaging.alignment_kernels import ALIGN_ITERATIONS, MIN_NCC, TEMPLATE, TEMPLATE_LEVELS
 from kiteline_agent.initialisation.corner_tracks import CornerObservations, TrackedKeyframe
 from kiteline_agent.initialisation.window import lens_correction
+from kiteline_agent.initialisation.window.rolling_rows import RollingRows, shifts
 from kiteline_agent.initialisation.window.window_state import WindowState
 from kiteline_agent.tracking.frame_images import NO_GRID
 from kiteline_core.arrays import F64, I64, U8
@@ -23,9 +24,12 @@ _MAX_SCALE = 3.0  # of areas
 
 def realigned(
     keyframes: list[TrackedKeyframe], observations: CornerObservations, state: WindowState, xyz: F64, first: I64,
-    camera: RectifiedCamera,
+    camera: RectifiedCamera, rolling: RollingRows | None = None,
 ) -> CornerObservations:  # fmt: skip
-    """Observations by alignment. xyz: (P,3) m landmarks in w. first: (P,) keyframe that saw each first."""
+    """Observations by alignment. xyz: (P,3) m landmarks in w. first: (P,) keyframe that saw each first.
+
+    rolling: rows of a rolling shutter; None: a global one.
+    """
     f, c = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
     R, centre = state.R @ camera.T_b_c[:3, :3], state.p + state.R @ camera.T_b_c[:3, 3]
     columns = np.arange(len(xyz))
@@ -39,10 +43,15 @@ def realigned(
         corners.append(centre[first] + np.einsum("pij,pj->pi", R[first], ray * depth[:, None]))
     xy, seen = observations.xy.copy(), np.zeros_like(observations.seen)
     octave = np.zeros(len(xyz), np.uint8)
+    twists = None if rolling is None else rolling.twists(state, camera.T_b_c)
     size = np.array([camera.width, camera.height]) - _MARGIN_PX
     for k, keyframe in enumerate(keyframes):
         local = [(x - centre[k]) @ R[k] for x in corners]
         uv = [lens_correction.moved(p[:, :2] / np.maximum(p[:, 2:], 1e-3), state.lens) * f + c for p in local]
+        if rolling is not None and twists is not None:
+            rho = 1.0 / np.maximum(local[0][:, 2], 1e-3)
+            place = (uv[0] - c) / f
+            uv[0] = uv[0] + f * shifts(place[None], rho[None], twists[k : k + 1], rolling.row_times_s(place[None]))[0]
         warp = np.stack([uv[1] - uv[2], uv[3] - uv[4]], axis=2) / (2.0 * _OFFSET_PX)
         area = np.abs(np.linalg.det(warp))
         inside = (uv[0] > _MARGIN_PX).all(axis=1) & (uv[0] < size).all(axis=1) & (local[0][:, 2] > 0.1)

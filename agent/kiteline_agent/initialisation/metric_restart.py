@@ -12,9 +12,10 @@ from kiteline_agent.imaging.feature_kernels import BORDER
 from kiteline_agent.initialisation.corner_tracks import CornerObservations
 from kiteline_agent.initialisation.window import lens_correction
 from kiteline_agent.initialisation.window.window_state import WindowSolution
-from kiteline_agent.keyframes.new_landmarks import NewPoints
+from kiteline_agent.keyframes.new_landmarks import NewPoints, moved_to_frame, shown_by_rows
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.tracking.frame_context import FrameContext
+from kiteline_agent.tracking.shutter.rolling_shutter import RollingShutter
 from kiteline_agent.tracking.track import Track
 from kiteline_core.arrays import F64, U8
 from kiteline_core.geometry.cameras import RectifiedCamera
@@ -37,6 +38,11 @@ class MetricPoints:
         """Their median depth."""
         return camera.bf / median(self.points.disparity)
 
+    def at_frame(self, shutter: RollingShutter, camera: RectifiedCamera) -> "MetricPoints":
+        """These, which a rolling shutter showed, where they are at the frame's stamp, of which their depths are."""
+        disparity = self.points.disparity
+        return replace(self, points=replace(moved_to_frame(self.points, camera, shutter), disparity=disparity))
+
     def set_sigma(self, local_map: LocalMap, keyframe: KeyframeId) -> None:
         """Write the deviations of their depths into the local map."""
         slot = local_map.slot_of(keyframe)
@@ -58,7 +64,10 @@ def metric_points(
     uv = track.observed[keep, :2]
     if lens is not None:
         uv = _true_pixels(uv, lens, local_map.camera)
-    return metric_points_at(ctx, uv, octave, unit_m * depth, relative, local_map.camera)
+    found = metric_points_at(ctx, uv, octave, unit_m * depth, relative, local_map.camera)
+    if ctx.shutter is None:
+        return found
+    return replace(found, points=shown_by_rows(found.points, local_map.camera, ctx.shutter.scaled(unit_m)))
 
 
 def window_points(

@@ -11,7 +11,7 @@ import numpy as np
 from kiteline_agent.governor.cost_model import Work
 from kiteline_agent.imaging import alignment_kernels
 from kiteline_agent.imaging.row_alignment import RowAlignment
-from kiteline_agent.keyframes.new_landmarks import EarlierView, NewPoints, moved_to_frame, new_points
+from kiteline_agent.keyframes.new_landmarks import EarlierView, NewPoints, moved_to_frame, nearby, new_points
 from kiteline_agent.keyframes.pair_search import Fault, PairSearch
 from kiteline_agent.local_map.keyframe_landmarks import KeyframeLandmarks
 from kiteline_agent.local_map.local_map import LocalMap
@@ -66,10 +66,10 @@ class KeyframeMaker:
 
     def points_beside(self, ctx: FrameContext, track: Track) -> NewPoints:
         """New landmarks where a tracked frame has none."""
-        return self._points(ctx, self._inliers(track)[1][:, :2])
+        return self._points(ctx, self._inliers(track)[1][:, :2], track)
 
-    def _points(self, ctx: FrameContext, taken: F64) -> NewPoints:
-        """New landmarks away from pixels `taken` (n,2), at the frame's stamp.
+    def _points(self, ctx: FrameContext, taken: F64, track: Track | None = None) -> NewPoints:
+        """New landmarks away from pixels `taken` (n,2), at the frame's stamp. track: tells depths nearby.
 
         If rows of the right image are off by pixels, hardly any is found along them: then they are searched for.
         """
@@ -77,7 +77,13 @@ class KeyframeMaker:
         hardly = len(points.uv) >= ctx.config.local_map.first_points and _with_depth(points) < _HARDLY * len(points.uv)
         if hardly and self._pairs is not None and self._pairs.find_rows(ctx, points):
             points = self._points_of_image(ctx, taken)
-        return points if ctx.shutter is None else moved_to_frame(points, self._camera, ctx.shutter)
+        if ctx.shutter is None:
+            return points
+        rho = None
+        if track is not None:
+            seen = track.inlier
+            rho = nearby(points.uv, track.observed[seen, :2], 1.0 / track.depth_m[seen])
+        return moved_to_frame(points, self._camera, ctx.shutter, rho)
 
     def _points_of_image(self, ctx: FrameContext, taken: F64) -> NewPoints:
         """New landmarks where the image shows them; their matches also measure the offset of the right image's rows."""
@@ -214,7 +220,7 @@ class KeyframeMaker:
         landmarks: points in `order`. Returns where the image shows them, (n,2) px.
         """
         uv, rho = landmarks.uv.astype(np.float64), landmarks.inv_depth.astype(np.float64)
-        seen_uv = uv if points.roll_px is None else uv + points.roll_px[order]
+        seen_uv = uv if points.rows is None else uv + points.rows.roll_px[order]
         rho = np.where(rho > 0.0, np.maximum(rho - self._map.offset_px(uv) / self._camera.bf, _MIN_RHO), 0.0)
         octave, config = landmarks.octave, ctx.config
         side = alignment_kernels.TEMPLATE
@@ -231,6 +237,9 @@ class KeyframeMaker:
         )
         slot = self._map.add(header, T_m_k, new, ctx.number)
         self._map.rolled[slot] = ctx.shutter is None
+        shown = None if points.rows is None else points.rows.part(order)
+        parallax_m, at_rho = (None, np.zeros(0)) if shown is None else (shown.parallax_m, shown.rho)
+        self._map.row_parallax.set(slot, parallax_m, at_rho)
         return seen_uv
 
 

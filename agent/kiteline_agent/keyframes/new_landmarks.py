@@ -12,15 +12,33 @@ from kiteline_core.arrays import F64, I64, U8, Bool
 from kiteline_core.geometry.cameras import RectifiedCamera
 
 _SEARCH_PX = 2.5  # px of the level: range of sub-pixel stereo around the coarse search, whose step is 2 px
+_STEP_RHO = 1e-3  # 1/m, of differences by inverse depth
 _UNIQUENESS = 1.15  # second-best cost over best; below it the row repeats itself
+
+
+@dataclass(frozen=True, slots=True)
+class RowShift:
+    """Where a rolling shutter's rows show landmarks.
+
+    roll_px: (n,2) from where they are at the frame's stamp. rho: (n,) 1/m, the inverse depths for which that holds.
+    parallax_m: (n,2) by which x/z and y/z at the stamp change with the inverse depth.
+    """
+
+    roll_px: F64
+    rho: F64
+    parallax_m: F64
+
+    def part(self, keep: Bool | I64) -> "RowShift":
+        """Those where `keep` (n,) is True, or those at these places."""
+        return RowShift(self.roll_px[keep], self.rho[keep], self.parallax_m[keep])
 
 
 @dataclass(frozen=True, slots=True)
 class NewPoints:
     """New landmarks of a keyframe, strongest first.
 
-    uv: (n,2) px. disparity: (n,) px, -1 unknown. octave: (n,). angle: (n,) 1/256 turns. descriptor: (n,32). roll_px:
-    (n,2) by which they are away from uv in the image of a rolling shutter; None: of a global one.
+    uv: (n,2) px. disparity: (n,) px, -1 unknown. octave: (n,). angle: (n,) 1/256 turns. descriptor: (n,32). rows: of a
+    rolling shutter; None: of a global one, or its motion is unknown.
     """
 
     uv: F64
@@ -28,13 +46,13 @@ class NewPoints:
     octave: U8
     angle: U8
     descriptor: U8
-    roll_px: F64 | None = None
+    rows: RowShift | None = None
 
     def part(self, keep: Bool) -> "NewPoints":
         """Those where `keep` (n,) is True."""
-        roll_px = None if self.roll_px is None else self.roll_px[keep]
+        rows = None if self.rows is None else self.rows.part(keep)
         return NewPoints(
-            self.uv[keep], self.disparity[keep], self.octave[keep], self.angle[keep], self.descriptor[keep], roll_px
+            self.uv[keep], self.disparity[keep], self.octave[keep], self.angle[keep], self.descriptor[keep], rows
         )  # fmt: skip
 
 
@@ -82,9 +100,32 @@ def new_points(images: FrameImages, taken: F64, camera: RectifiedCamera, config:
     return NewPoints(uv, disparity[order], octave, angle, descriptor)
 
 
-def moved_to_frame(points: NewPoints, camera: RectifiedCamera, shutter: RollingShutter) -> NewPoints:
-    """Landmarks where they are at the frame's stamp; one without a depth is taken as far away."""
-    moved = shutter.to_frame(points.uv, np.maximum(points.disparity, 0.0) / camera.bf)
+def moved_to_frame(
+    points: NewPoints, camera: RectifiedCamera, shutter: RollingShutter, rho: F64 | None = None
+) -> NewPoints:
+    """Landmarks that rows show, where they are at the frame's stamp.
+
+    rho: (n,) 1/m of those without a depth; None: they are far away.
+    """
+    has_depth = points.disparity > 0.0
+    rho = np.where(has_depth, points.disparity / camera.bf, 0.0 if rho is None else rho)
+    moved = shutter.to_frame(points.uv, rho)
     uv = np.clip(moved[:, :2], 0.0, [camera.width - 1.0, camera.height - 1.0])
-    disparity = np.where(points.disparity > 0.0, points.disparity * moved[:, 2], points.disparity)
-    return replace(points, uv=uv, disparity=disparity, roll_px=points.uv - uv)
+    disparity = np.where(has_depth, points.disparity * moved[:, 2], points.disparity)
+    nearer = shutter.to_frame(points.uv, rho + _STEP_RHO)
+    parallax_m = (nearer - moved)[:, :2] / (_STEP_RHO * np.array([camera.fx, camera.fy]))
+    return replace(points, uv=uv, disparity=disparity, rows=RowShift(points.uv - uv, rho, parallax_m))
+
+
+def shown_by_rows(points: NewPoints, camera: RectifiedCamera, shutter: RollingShutter) -> NewPoints:
+    """Landmarks at the frame's stamp whose depths are known, with where rows show them."""
+    rho = points.disparity / camera.bf
+    shown, nearer = (shutter.to_rows(points.uv, rho + step)[:, :2] for step in (0.0, _STEP_RHO))
+    parallax_m = (shown - nearer) / (_STEP_RHO * np.array([camera.fx, camera.fy]))
+    return replace(points, rows=RowShift(shown - points.uv, rho, parallax_m))
+
+
+def nearby(uv: F64, places: F64, values: F64) -> F64:
+    """Values (n,) at pixels (n,2) from those (m,) at pixels places (m,2), weighted by the inverse square distance."""
+    weight = 1.0 / (np.square(uv[:, None] - places[None]).sum(axis=2) + 1.0)
+    return np.asarray(weight @ values / weight.sum(axis=1))

@@ -17,6 +17,7 @@ from kiteline_agent.imaging.alignment_kernels import TEMPLATE, TEMPLATE_LEVELS
 from kiteline_agent.local_map import projection_kernels as kernels
 from kiteline_agent.local_map.held_corrections import HeldCorrections, Removed
 from kiteline_agent.local_map.keyframe_landmarks import KeyframeLandmarks
+from kiteline_agent.local_map.row_parallax import RowParallax
 from kiteline_codec.schema import KeyframeHeader, KeyframePose, RefinedLandmarks
 from kiteline_core.arrays import F64, I64, Bool
 from kiteline_core.geometry import disparity_offset, se3
@@ -73,6 +74,7 @@ class LocalMap:
         self.disparity_offset = disparity_offset.none()  # of the stereo disparities, as base or agent estimate it
         self.disparity = np.zeros((k, b))  # px, in the keyframe itself, with the offset; 0: not measured
         self.bearing = np.zeros((k, b, 2))
+        self.row_parallax = RowParallax(k, b)
         self.uv = np.zeros((k, b, 2))
         self.rho = np.zeros((k, b))
         self.sigma_rho = np.zeros((k, b))
@@ -207,6 +209,13 @@ class LocalMap:
             T_c_m, self.intrinsics, rows, inlier, observed, sigma_px, inflate, floor,
             self.T_m_k, self.bearing, self.rho, self.sigma_rho,
         )  # fmt: skip
+
+    def follow_depths(self, rows: I64) -> None:
+        """Move landmarks of rolling-shutter keyframes, rows (n,), to where their new depths put them at the stamps."""
+        change = self.row_parallax.change(rows, self.rho.take(rows))
+        if change is not None:
+            self.bearing.reshape(-1, 2)[rows] += change
+            self.uv.reshape(-1, 2)[rows] += change * self.intrinsics[:2]
 
     def note_tracking(self, rows: I64, inlier: Bool, frame_number: int) -> None:
         """Count tries and hits; landmarks that keep failing are no longer searched."""

@@ -11,7 +11,6 @@ from kiteline_agent.config import AgentConfig
 from kiteline_agent.imaging import features
 from kiteline_agent.imaging.feature_kernels import BORDER
 from kiteline_agent.imaging.features import DetectorConfig
-from kiteline_agent.initialisation.corner_tracks import CornerObservations, TrackedKeyframe
 from kiteline_agent.initialisation.inertial_map import InertialMap
 from kiteline_agent.initialisation.window import lens_correction
 from kiteline_agent.keyframes.new_landmarks import EarlierView, NewPoints
@@ -44,25 +43,22 @@ def earlier_views(
         if new and keyframes[k].t_ns - keyframes[chosen[-1]].t_ns >= gap_ns:
             chosen.append(k)
     T_n_w = se3.inverse(T_w_k[-1])
-    return tuple(
-        _view(keyframes[k], found.corners, k, se3.orthonormalise(T_n_w @ T_w_k[k]), found.lens, camera, config.detector)
-        for k in chosen
-    )
+    return tuple(_view(found, k, se3.orthonormalise(T_n_w @ T_w_k[k]), camera, config.detector) for k in chosen)
 
 
-def _view(
-    keyframe: TrackedKeyframe, corners: CornerObservations, k: int, T_n_k: F64, lens: F64, camera: RectifiedCamera,
-    detector: DetectorConfig,
-) -> EarlierView:  # fmt: skip
+def _view(found: InertialMap, k: int, T_n_k: F64, camera: RectifiedCamera, detector: DetectorConfig) -> EarlierView:
+    keyframe, corners = found.keyframes[k], found.corners
     focal, centre = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
     uv, margin = corners.xy[k] * focal + centre, BORDER + 1.0
     inside = (uv > margin).all(axis=1) & (uv < np.array([camera.width, camera.height]) - margin).all(axis=1)
     followed = np.flatnonzero(corners.seen[k] & inside)
     followed = followed[np.argsort(corners.ids[followed])]
-    found = features.detect(keyframe.left, uv[followed], detector)
-    uv = np.concatenate([uv[followed], found.uv])
-    octave = np.concatenate([np.zeros(len(followed), np.uint8), found.octave])
+    more = features.detect(keyframe.left, uv[followed], detector)
+    uv = np.concatenate([uv[followed], more.uv])
+    octave = np.concatenate([np.zeros(len(followed), np.uint8), more.octave])
     angle, descriptor = features.describe(keyframe.left, uv, octave)
-    true = lens_correction.true_place((uv - centre) / focal, lens) * focal + centre
-    ids = np.concatenate([corners.ids[followed], np.full(len(found.uv), -1, np.int64)])
+    true = lens_correction.true_place((uv - centre) / focal, found.lens) * focal + centre
+    if found.shutters:  # depths of most corners are not known here
+        true = found.shutters[k].to_frame(true, np.full(len(true), 1.0 / found.points.median_depth_m(camera)))[:, :2]
+    ids = np.concatenate([corners.ids[followed], np.full(len(more.uv), -1, np.int64)])
     return EarlierView(keyframe.t_ns, T_n_k, NewPoints(true, np.full(len(uv), -1.0), octave, angle, descriptor), ids)

@@ -8,6 +8,7 @@ from kiteline_agent.inertial_start_config import InertialBundleConfig
 from kiteline_agent.initialisation.corner_tracks import CornerObservations
 from kiteline_agent.initialisation.window import lens_correction
 from kiteline_agent.initialisation.window.lens_correction import TERMS
+from kiteline_agent.initialisation.window.rolling_rows import RollingRows, shifts
 from kiteline_agent.initialisation.window.window_kernels import add_observations
 from kiteline_agent.initialisation.window.window_state import WindowState
 from kiteline_core.arrays import F64, I64
@@ -40,10 +41,13 @@ class CornerTerms:
 
     def __init__(
         self, observations: CornerObservations, T_b_c: F64, focal_px: float, config: InertialBundleConfig,
-        lens_info: F64,
+        lens_info: F64, rows: RollingRows | None = None,
     ) -> None:  # fmt: skip
-        """lens_info: (8,8) inverse covariance of the lens."""
+        """lens_info: (8,8) inverse covariance of the lens. rows: of a rolling shutter; None: a global one."""
         self._obs = observations
+        self._rows, self._T_b_c = rows, T_b_c
+        self._row_times_s = None if rows is None else rows.row_times_s(observations.xy)
+        self._shown = observations.xy  # (K,P,2) where a global shutter would show the corners, see follow_shutter
         self._r_bc, self._t_bc = T_b_c[:3, :3].copy(), T_b_c[:3, 3].copy()
         self._sigma = config.sigma_px / focal_px
         self._config = config
@@ -66,7 +70,7 @@ class CornerTerms:
         first = self.first
         camera = state.p + state.R @ self._t_bc
         self._axes = (state.R @ self._r_bc)[first]
-        shown = self._obs.xy[first, np.arange(self.landmarks)]
+        shown = self._shown[first, np.arange(self.landmarks)]
         return replace(state, m=lens_correction.true_place(shown, state.lens), origin=camera[first])
 
     def at_places(self, state: WindowState, xyz: F64, usual_m: float) -> WindowState:
@@ -130,6 +134,15 @@ class CornerTerms:
 
     # errors
 
+    def follow_shutter(self, state: WindowState) -> None:
+        """Take the corners of a rolling shutter to the keyframes' stamps, by how the camera moves in this state."""
+        if self._rows is None or self._row_times_s is None:
+            return
+        _, z, xy, _ = self._project(state)
+        twists = self._rows.twists(state, self._T_b_c)
+        self._shown = self._obs.xy - shifts(xy, state.rho / z, twists, self._row_times_s)
+        self._projected = None
+
     def cost(self, state: WindowState) -> float:
         """Half the squared errors of corners, made robust, and of the lens."""
         return self._visual_cost(self._project(state)[3])[0] + self._lens_cost(state)
@@ -146,7 +159,7 @@ class CornerTerms:
         q = (y - state.rho[None, :, None] * self._t_bc) @ self._r_bc
         z = np.maximum(q[..., 2], 1e-3)
         xy = q[..., :2] / z[..., None]
-        error = (lens_correction.moved(xy, state.lens) - self._obs.xy) / self._sigma
+        error = (lens_correction.moved(xy, state.lens) - self._shown) / self._sigma
         found = y, z, xy, np.where(q[..., 2:] > 1e-2, error, 1e3)
         self._projected = state, found
         return found

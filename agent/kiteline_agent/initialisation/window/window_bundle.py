@@ -26,6 +26,7 @@ from kiteline_agent.initialisation.window.inertial_terms import (
 )
 from kiteline_agent.initialisation.window.known_length import KnownLength
 from kiteline_agent.initialisation.window.lens_correction import TERMS
+from kiteline_agent.initialisation.window.rolling_rows import RollingRows
 from kiteline_agent.initialisation.window.window_noise import WindowNoise
 from kiteline_agent.initialisation.window.window_state import (
     InParts,
@@ -77,16 +78,17 @@ class InertialBundle:
         lens_info: F64 | None = None,
         offset: TimeOffset = NO_OFFSET,
         length: KnownLength | None = None,
+        rows: RollingRows | None = None,
     ) -> None:
         """cut: gives the samples between the keyframes. noise: factors on the inertial error model.
 
         lens_info: (8,8) inverse covariance of the lens before this window; None: by the options. offset: known before.
-        length: of the path, if a sensor other than the IMU tells it.
+        length: of the path, if a sensor other than the IMU tells it. rows: of a rolling shutter; None: a global one.
         """
         self._offset_s = offset.offset_s
         self._terms = InertialTerms(cut, offset, calibration, gravity_m_s2, prior, config, noise or WindowNoise())
         lens_info = lens_prior(config, focal_px) if lens_info is None else lens_info
-        self._corners = CornerTerms(observations, T_b_c, focal_px, config, lens_info)
+        self._corners = CornerTerms(observations, T_b_c, focal_px, config, lens_info, rows)
         self._t_bc = T_b_c[:3, 3].copy()
         self._length, self._known_length = gravity_m_s2, length
         self._prior = prior
@@ -275,6 +277,7 @@ class InertialBundle:
     def _linearise(self, state: WindowState, *, inertial: bool) -> _System:
         n, size = self._keyframes, STATE * self._keyframes + SHARED + TERMS
         h, b = np.zeros((size, size)), np.zeros(size)
+        self._corners.follow_shutter(state)
         corners = self._corners.reduced(state)
         rows = np.append((STATE * np.arange(n)[:, None] + np.arange(6)).ravel(), np.arange(size - TERMS, size))
         h[np.ix_(rows, rows)] += corners.h

@@ -3,9 +3,13 @@
 from collections.abc import Callable, Sequence
 from itertools import pairwise
 
+import numpy as np
+
 from kiteline_agent.inertial.preintegration import Samples
 from kiteline_agent.inertial.samples.sample_buffer import SampleBuffer, without_held
+from kiteline_core.arrays import F64
 
+_RATE_NS = 10_000_000  # about a stamp, over which rates are averaged: vibration is faster
 _MOST_S = 0.5  # s; change of the time offset: a solver that diverges asks for more
 
 
@@ -30,6 +34,17 @@ class WindowSamples:
             return None
         late = self._buffer.lacks(self._stamps_ns[-1] + round(offset_s * 1e9))
         return [*complete[:-1], without_held(complete[-1])] if late else complete
+
+    def rates(self, offset_s: float) -> F64:
+        """Angular velocity (K,3) rad/s by the gyro, with its bias, in the body at each stamp; NaN without samples."""
+        out = np.full((len(self._stamps_ns), 3), np.nan)
+        for k, stamp_ns in enumerate(self._stamps_ns):
+            at_ns = stamp_ns + round(offset_s * 1e9)
+            samples = self._buffer.between(at_ns - _RATE_NS, at_ns + _RATE_NS)
+            if samples is not None:
+                t_s, gyro = samples.t_s, self._correct(samples).gyro
+                out[k] = 0.5 * np.diff(t_s) @ (gyro[1:] + gyro[:-1]) / t_s[-1]
+        return out
 
     def missing(self, offset_s: float) -> int | None:
         """The last interval that lacks samples; None if none does."""

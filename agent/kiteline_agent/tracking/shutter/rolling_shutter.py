@@ -1,6 +1,6 @@
 """Rolling shutter: pixels moved from the time of their row to that of the frame, by the camera's predicted motion."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -22,6 +22,10 @@ class RollingShutter:
     height: int
     grid: F32 | None
     twist: F64
+
+    def scaled(self, factor: float) -> "RollingShutter":
+        """The same where all lengths are `factor` times as long."""
+        return replace(self, twist=self.twist * [factor, factor, factor, 1.0, 1.0, 1.0])
 
     def to_frame(self, uv: F64, rho: F64) -> F64:
         """Where pixels (n,2), of landmarks at inverse depths (n,) 1/m, would be at the frame's stamp.
@@ -54,10 +58,18 @@ class RollingShutter:
     def _moved(self, uv: F64, rho: F64, dt_s: F64) -> F64:
         """Pixels of landmarks seen at uv, after the camera has moved back by dt_s (n,)."""
         c = self.camera
-        x, y = (uv[:, 0] - c.cx) / c.fx, (uv[:, 1] - c.cy) / c.fy
-        v, w = self.twist[:3], self.twist[3:]
-        # the point (x, y, 1) / rho moves by w x p + v, in units of its depth
-        px = x + dt_s * (w[1] - w[2] * y + v[0] * rho)
-        py = y + dt_s * (w[2] * x - w[0] + v[1] * rho)
-        pz = np.maximum(1.0 + dt_s * (w[0] * y - w[1] * x + v[2] * rho), 0.1)
-        return np.column_stack([px / pz * c.fx + c.cx, py / pz * c.fy + c.cy, 1.0 / pz])
+        x, y, z = moved_back((uv[:, 0] - c.cx) / c.fx, (uv[:, 1] - c.cy) / c.fy, rho, self.twist, dt_s)
+        return np.column_stack([x * c.fx + c.cx, y * c.fy + c.cy, 1.0 / z])
+
+
+def moved_back(x: F64, y: F64, rho: F64, twist: F64, dt_s: F64) -> tuple[F64, F64, F64]:
+    """Landmarks at x/z, y/z (...), at inverse depths rho 1/m, after the camera has moved back by dt_s: x/z, y/z, and z.
+
+    twist: (...,6) [m/s, rad/s] of the camera, in its own axes. z: in units of the depth before.
+    """
+    v, w = twist[..., :3], twist[..., 3:]
+    # the point (x, y, 1) / rho moves by w x p + v, in units of its depth
+    px = x + dt_s * (w[..., 1] - w[..., 2] * y + v[..., 0] * rho)
+    py = y + dt_s * (w[..., 2] * x - w[..., 0] + v[..., 1] * rho)
+    pz = np.maximum(1.0 + dt_s * (w[..., 0] * y - w[..., 1] * x + v[..., 2] * rho), 0.1)
+    return px / pz, py / pz, pz

@@ -59,6 +59,10 @@ class ShutterStage:
         self._keyframe = local_map.keyframe.copy()
         self._twists = np.full((len(self._keyframe), 6), np.nan)  # of the images of keyframes
 
+    def at(self, twist: F64) -> RollingShutter | None:
+        """The rolling shutter of a camera that moves with a twist (6,); None for a global one."""
+        return None if self._estimate.readout_s == 0.0 else self._shutter(self._estimate.readout_s, twist)
+
     def motion(self, t_ns: int, dt_s: float) -> RollingShutter | None:
         """The rolling shutter's motion in a frame; None for a global shutter, and while the motion is unknown."""
         self._measured = None

@@ -1,0 +1,32 @@
+"""Landmarks of a rolling shutter at the stamp of their keyframe, which depends on depths that are known later."""
+
+import numpy as np
+
+from kiteline_core.arrays import F64, I64
+
+
+class RowParallax:
+    """By how much the bearings of landmarks in their keyframes change with their inverse depths."""
+
+    def __init__(self, keyframes: int, landmarks: int) -> None:
+        self._any = False  # keyframe of a rolling shutter
+        self._change_m = np.zeros((keyframes, landmarks, 2))  # of a bearing, by inverse depth
+        self._rho = np.zeros((keyframes, landmarks))  # 1/m for which the bearings are right
+
+    def set(self, slot: int, change_m: F64 | None, rho: F64) -> None:
+        """Note it for a new keyframe: change_m (n,2) m; None: nothing changes. rho: (n,) 1/m of the bearings now."""
+        if change_m is not None or self._any:
+            self._any = True
+            n = min(len(rho), self._rho.shape[1])
+            self._change_m[slot] = 0.0
+            self._rho[slot, :n] = rho[:n]
+            if change_m is not None:
+                self._change_m[slot, :n] = change_m[:n]
+
+    def change(self, rows: I64, rho: F64) -> F64 | None:
+        """Change (n,2) of the bearings of landmarks whose inverse depths (n,) have become known better; None: none."""
+        if not self._any:
+            return None
+        change = self._change_m.reshape(-1, 2)[rows] * (rho - self._rho.reshape(-1)[rows])[:, None]
+        self._rho.reshape(-1)[rows] = rho
+        return np.asarray(change)
