@@ -110,7 +110,7 @@ class Agent:
             None if self._has_depth or imu is None
             else InertialStart(
                 camera, imu, config, self.work, self._governor.may_solve, self._camera.motion.odometer.mean_between,
-                self._shutter.at,
+                self._shutter,
             )
         )  # fmt: skip
         self._submaps = SubmapStage(

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 
@@ -20,9 +21,10 @@ from kiteline_agent.initialisation.landmark_realignment import realigned
 from kiteline_agent.initialisation.metric_restart import window_points
 from kiteline_agent.initialisation.window.known_length import KnownLength, joint_sigma
 from kiteline_agent.initialisation.window.noise_of_windows import NoiseOfWindows
-from kiteline_agent.initialisation.window.rolling_rows import RollingRows, Shutter
+from kiteline_agent.initialisation.window.rolling_rows import RollingRows
 from kiteline_agent.initialisation.window.window_bundle import InertialBundle, lens_prior
 from kiteline_agent.initialisation.window.window_noise import WindowNoise
+from kiteline_agent.initialisation.window.window_readout import WindowReadout
 from kiteline_agent.initialisation.window.window_samples import WindowSamples
 from kiteline_agent.initialisation.window.window_state import (
     InParts,
@@ -34,12 +36,13 @@ from kiteline_agent.initialisation.window.window_state import (
 from kiteline_agent.initialisation.window_odometry import Mean, WindowOdometry
 from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_agent.tracking.shutter.rolling_shutter import RollingShutter
+from kiteline_agent.tracking.shutter.shutter_stage import ShutterStage
 from kiteline_agent.tracking.waiting_frames import WaitingFrames
 from kiteline_core.arrays import F64, I64
 from kiteline_core.frame import ImuCalibration
 from kiteline_core.geometry.cameras import RectifiedCamera
 
-Solving = InParts[WindowSolution | None]
+Result = TypeVar("Result")
 
 _NEARLY = 1.3  # times the deviation of a known scale: below it the landmarks are aligned again, to know it sooner
 _MIN_VIEWS = 3  # keyframes in which a landmark is aligned again, to be kept
@@ -63,9 +66,10 @@ _LANDMARKS = 220  # of the window, with the longest tracks: errors of few add up
 
 @dataclass(frozen=True, slots=True)
 class _Solved:
-    """A solution, its landmarks (P,3) m and the keyframe (P,) that saw each first."""
+    """A solution, what found it, its landmarks (P,3) m and the keyframe (P,) that saw each first."""
 
     solution: WindowSolution
+    bundle: InertialBundle
     xyz: F64
     first: I64
 
@@ -74,7 +78,7 @@ class _Solved:
 class _Imu:
     """Samples of a window, and what is known of the IMU before it: biases and time offset. clock: of the frames.
 
-    rows: of a rolling shutter; None: a global one.
+    rows: of the camera's shutter; None: nothing is known of it.
     """
 
     samples: WindowSamples
@@ -82,6 +86,11 @@ class _Imu:
     offset: TimeOffset
     clock: FrameClock
     rows: RollingRows | None
+
+    @property
+    def rolling(self) -> RollingRows | None:
+        """The rows, if their times count."""
+        return self.rows if self.rows is not None and self.rows.rolls else None
 
 
 class InertialStart:
@@ -93,11 +102,11 @@ class InertialStart:
     def __init__(
         self, camera: RectifiedCamera, calibration: ImuCalibration, config: AgentConfig, work: Work,
         may_go_on: Callable[[], bool] = lambda: True, odometry: Mean = lambda from_ns, to_ns: None,
-        shutter: Shutter = lambda twist: None,
+        shutter: ShutterStage | None = None,
     ) -> None:  # fmt: skip
         """may_go_on: asked before each part of a solution; False: no CPU time is left for it in this step.
 
-        odometry: means of an odometer's velocities between two stamps. shutter: of the camera, by its motion.
+        odometry: means of an odometer's velocities between two stamps. shutter: of the camera; None: a global one.
         """
         self._camera = camera
         self._calibration = calibration
@@ -105,6 +114,7 @@ class InertialStart:
         self._work = work
         self._may_go_on = may_go_on
         self._shutter = shutter
+        self._readout = WindowReadout()
         self._attempt: InParts[InertialMap | None] | None = None  # that has begun
         self._beside_map = False  # it began while a map was tracked
         start = config.inertial_start
@@ -143,6 +153,7 @@ class InertialStart:
         self._attempt = self._before = self._tried_ns = None
         self._noise.clear()
         self._by_stamps = False
+        self._readout.clear()
         self._contradiction.begin_again()
 
     @property
@@ -253,10 +264,11 @@ class InertialStart:
             return None
         self._tried_ns = ctx.t_ns
         prior = self._default_prior() if imu.bias is None else imu.bias
-        rows, still = None, self._shutter(np.zeros(6))
-        if still is not None:
+        rows = None
+        if self._shutter is not None:
             offset = imu.offset if self._before is None else self._before.solution.offset
-            rows = RollingRows(1e-9 * (np.array(times_ns) - times_ns[0]), samples.rates(offset.offset_s), still)
+            rates, stamps_s = samples.rates(offset.offset_s), 1e-9 * (np.array(times_ns) - times_ns[0])
+            rows = RollingRows(stamps_s, rates, self._shutter.at_rest)
         return self._attempting(ctx, keyframes, _Imu(samples, prior, imu.offset, imu.clock, rows))
 
     def _attempting(
@@ -280,14 +292,16 @@ class InertialStart:
             wrong_turns = self._structure_px > _STRUCTURE_PX
             self._note_contradiction(ctx.t_ns, contradicts=True if wrong_turns else None)
             return None
+        if (yield from self._finds_readout(found, observations, imu)):
+            return None
         solution, modelled = found.solution, self._noise.now
         noise, sigma = self._noise.seen(solution)
         length = self.odometry.length(stamps, solution.state, sigma if solution.fits else np.inf)
         if joint_sigma(sigma, length) < _NEARLY * _SCALE_SIGMA:
             self._work.alignments += int(np.count_nonzero(observations.seen))
             aligned = realigned(
-                keyframes, observations, solution.state, found.xyz, found.first, self._camera, imu.rows
-            )  # fmt: skip
+                keyframes, observations, solution.state, found.xyz, found.first, self._camera, imu.rolling
+            )
             all_corners = corner_tracks.with_found(all_corners, columns, aligned)
             yield
             keep = aligned.seen.sum(axis=0) >= _MIN_VIEWS
@@ -325,7 +339,7 @@ class InertialStart:
         self._lens_info = np.asarray(np.linalg.inv(solution.lens_cov), np.float64)
         lens = solution.state.lens
         accel_noise = noise.accel * max(self._noise.level_now, 1.0)
-        shutters = self._shutters(solution, imu.rows)
+        shutters = self._shutters(solution, imu.rolling)
         if shutters:
             ctx, points = replace(ctx, shutter=shutters[-1]), points.at_frame(shutters[-1], self._camera)
         return InertialMap(
@@ -337,8 +351,22 @@ class InertialStart:
         """The rolling shutter in each keyframe of a solution; none of a global one."""
         if rows is None:
             return ()
-        twists = rows.twists(solution.state, self._camera.T_b_c)
-        return tuple(shutter for twist in twists if (shutter := self._shutter(twist)) is not None)
+        return tuple(replace(rows.shutter, twist=twist) for twist in rows.twists(solution.state, self._camera.T_b_c))
+
+    def _finds_readout(self, found: _Solved, corners: CornerObservations, imu: _Imu) -> InParts[bool]:
+        """True if this window tells the read-out of a rolling shutter: the next one is solved with it."""
+        if self._shutter is None or imu.rows is None or not (self._shutter.is_unknown and found.solution.fits):
+            return False
+        asking = self._readout.asking(
+            found.bundle, found.solution, lambda rows: self._bundle(corners, replace(imu, rows=rows)), imu.rows,
+            self._config.inertial_start.bundle.sigma_px,
+        )  # fmt: skip
+        told = yield from self._counted(asking, len(corners.seen))
+        if told is None:
+            return False
+        self._warnings += self._shutter.take(*told)
+        self._before = self._tried_ns = None
+        return True
 
     def _doubt(self, clock: FrameClock) -> None:
         """Place the frames of the next window otherwise: by the camera's rate, or by their stamps."""
@@ -348,9 +376,9 @@ class InertialStart:
         bundle = self._bundle(corners, imu)
         solution = yield from self._counted(bundle.solving(warm), len(corners.seen))
         self._structure_px = bundle.structure_px
-        return None if solution is None else _Solved(solution, *bundle.landmarks_of(solution.state))
+        return None if solution is None else _Solved(solution, bundle, *bundle.landmarks_of(solution.state))
 
-    def _counted(self, parts: Solving, keyframes: int) -> Solving:
+    def _counted(self, parts: InParts[Result], keyframes: int) -> InParts[Result]:
         """The parts of a solution, each counted as work of the frame in which it is done."""
         while True:
             self._work.window_keyframes += keyframes
@@ -388,7 +416,7 @@ class InertialStart:
         return InertialBundle(
             corners, imu.samples.at, self._calibration, self._camera.T_b_c, self._camera.fx,
             self._config.inertial.gravity_m_s2, imu.prior, self._config.inertial_start.bundle,
-            self._noise.now, self._lens_info, imu.offset, length, imu.rows,
+            self._noise.now, self._lens_info, imu.offset, length, imu.rolling,
         )  # fmt: skip
 
     def _default_prior(self) -> BiasPrior:

@@ -2,7 +2,7 @@
 
 from kiteline_bench.agent import altitude, bent, rigs, slants
 from kiteline_bench.base import real_places
-from kiteline_bench.reality import base, cpu, difficult, fixed_parts, nees, people, street, worn
+from kiteline_bench.reality import base, cpu, difficult, fixed_parts, nees, people, shutter, street, worn
 from kiteline_bench.reality.one_camera import euroc, metric, starts
 from kiteline_bench.reality.sensors import imu, missing, motion
 
@@ -25,6 +25,7 @@ PARTS = {
     "altitude": ("Reality: high above ground", altitude.run),
     "difficult": ("Reality: difficult images", difficult.run),
     "fixed": ("Reality: what stands still in the images", fixed_parts.run),
+    "shutter": ("Reality: rolling shutters", shutter.run),
     "places": ("Reality: places on real images", real_places.run),
     "cpu": ("Reality: CPU over a yardstick", cpu.run),
 }

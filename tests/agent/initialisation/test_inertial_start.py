@@ -180,7 +180,8 @@ def test_a_lower_cost_at_the_same_scale_confirms_it(monkeypatch: pytest.MonkeyPa
     def solved(scale: float, cost: float) -> inertial_start._Solved:
         state = SimpleNamespace(p=scale * np.arange(12.0).reshape(4, 3))
         solution: Any = SimpleNamespace(state=state, cost=cost, scale_sigma=0.02)
-        return inertial_start._Solved(solution, np.full((5, 3), scale), np.zeros(5, np.int64))
+        bundle: Any = None
+        return inertial_start._Solved(solution, bundle, np.full((5, 3), scale), np.zeros(5, np.int64))
 
     def is_lowest(scale: float, cost: float) -> tuple[bool, float]:
         """Whether a solution with cost 1000 stands beside this one from nothing; scale of the next start."""

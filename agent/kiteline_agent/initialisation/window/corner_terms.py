@@ -147,6 +147,27 @@ class CornerTerms:
         """Half the squared errors of corners, made robust, and of the lens."""
         return self._visual_cost(self._project(state)[3])[0] + self._lens_cost(state)
 
+    def by_readout(self, state: WindowState, rows: RollingRows) -> tuple[float, float, F64]:
+        """Second and first derivative of the cost by the read-out, and that of `b` (6K+8,) in `reduced`; by s.
+
+        rows: of the same keyframes, with a short read-out. Landmarks are eliminated.
+        """
+        system = self.reduced(state)
+        _, z, xy, error = self._project(state)
+        _, weight = self._visual_cost(error)
+        shift = shifts(xy, state.rho / z, rows.twists(state, self._T_b_c), rows.row_times_s(self._obs.xy))
+        column = shift / self._sigma
+        shown = self._shown
+        self._shown, self._projected = shown - shift, None
+        longer = self.reduced(state)
+        self._shown, self._projected = shown, None
+        of_landmarks = longer.bp - system.bp
+        eliminated = (system.inv @ of_landmarks[..., None])[..., 0]
+        second = float((weight[..., None] * column * column).sum() - (of_landmarks * eliminated).sum())
+        first = float((weight[..., None] * column * error).sum() - (system.bp * eliminated).sum())
+        unit_s = rows.shutter.readout_s
+        return second / unit_s**2, first / unit_s, (longer.b - system.b) / unit_s
+
     def _lens_cost(self, state: WindowState) -> float:
         return 0.5 * float(state.lens @ self._lens_info @ state.lens)
 

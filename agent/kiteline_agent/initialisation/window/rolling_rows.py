@@ -1,15 +1,12 @@
 """A rolling shutter in a window: where corners were at the stamps of keyframes whose rows showed them at others."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from kiteline_agent.initialisation.window.window_state import WindowState
 from kiteline_agent.tracking.shutter.rolling_shutter import RollingShutter, moved_back
 from kiteline_core.arrays import F64
-
-Shutter = Callable[[F64], RollingShutter | None]  # of a camera that moves with a twist (6,); None: a global one
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,6 +16,15 @@ class RollingRows:
     stamps_s: F64
     rate: F64
     shutter: RollingShutter
+
+    @property
+    def rolls(self) -> bool:
+        """False for a global shutter."""
+        return self.shutter.readout_s != 0.0
+
+    def with_readout(self, readout_s: float) -> "RollingRows":
+        """The same with another read-out."""
+        return replace(self, shutter=replace(self.shutter, readout_s=readout_s))
 
     def row_times_s(self, xy: F64) -> F64:
         """Times (...) of the rows that show x/z, y/z (...,2) after a keyframe's stamp."""

@@ -132,6 +132,28 @@ class InertialBundle:
             system = self._linearise(state, inertial=True)
         return self._solution(state, system, np.arange(6, len(still)))
 
+    def readout_step(self, state: WindowState, rows: RollingRows) -> tuple[float, float]:
+        """By how much longer the read-out should be at a solution, in s, and its deviation. rows: of a short one."""
+        system = self._linearise(state, inertial=True)
+        second, first, by_unknowns = self._corners.by_readout(state, rows)
+        column = np.zeros(len(system.b))
+        column[self._rows_of_corners] = by_unknowns
+        h = system.h[6:, 6:]
+        along = np.linalg.solve(h + np.diag(1e-9 * np.diag(h) + 1e-12), column[6:])
+        information, gradient = second - float(column[6:] @ along), first - float(system.b[6:] @ along)
+        return -gradient / information, float(np.sqrt(1.0 / information)) if information > 0.0 else np.inf
+
+    @property
+    def reprojection_px(self) -> float:
+        """Root mean square of the inliers, of the last state that was looked at."""
+        return self._corners.reprojection_px
+
+    @property
+    def _rows_of_corners(self) -> I64:
+        """The unknowns (6K+8,) that corners depend on: poses and lens."""
+        n, size = self._keyframes, STATE * self._keyframes + SHARED + TERMS
+        return np.append((STATE * np.arange(n)[:, None] + np.arange(6)).ravel(), np.arange(size - TERMS, size))
+
     def landmarks_of(self, state: WindowState) -> tuple[F64, I64]:
         """Landmarks (P,3) in w, and the keyframe (P,) that saw each one first."""
         return state.origin + self._corners.rays(state) / state.rho[:, None], self._corners.first
@@ -279,7 +301,7 @@ class InertialBundle:
         h, b = np.zeros((size, size)), np.zeros(size)
         self._corners.follow_shutter(state)
         corners = self._corners.reduced(state)
-        rows = np.append((STATE * np.arange(n)[:, None] + np.arange(6)).ravel(), np.arange(size - TERMS, size))
+        rows = self._rows_of_corners
         h[np.ix_(rows, rows)] += corners.h
         b[rows] += corners.b
         cost = corners.cost + self._terms.add(state, h, b, inertial=inertial)

@@ -30,6 +30,15 @@ class ReadoutEstimate:
         # blocks behind the read-out in use
         self._used = 0 if sigma_s is None else min(round((_SCATTER_S / sigma_s) ** 2), _KEPT_BLOCKS)
 
+    def take(self, readout_s: float, sigma_s: float) -> float:
+        """Take a read-out that was found otherwise, and its deviation. Returns the change in s."""
+        change = readout_s - self.readout_s
+        self.readout_s, self.sigma_s = readout_s, sigma_s
+        self._used = min(round((_SCATTER_S / sigma_s) ** 2), _KEPT_BLOCKS)
+        self._information = self._gradient = 0.0
+        self._blocks.clear()
+        return change
+
     @property
     def settled(self) -> bool:
         """True if all blocks that count agree with the read-out in use."""

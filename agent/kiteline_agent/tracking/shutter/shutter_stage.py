@@ -59,9 +59,19 @@ class ShutterStage:
         self._keyframe = local_map.keyframe.copy()
         self._twists = np.full((len(self._keyframe), 6), np.nan)  # of the images of keyframes
 
-    def at(self, twist: F64) -> RollingShutter | None:
-        """The rolling shutter of a camera that moves with a twist (6,); None for a global one."""
-        return None if self._estimate.readout_s == 0.0 else self._shutter(self._estimate.readout_s, twist)
+    @property
+    def at_rest(self) -> RollingShutter:
+        """The shutter of a camera that does not move; with a read-out of 0 it is a global one."""
+        return self._shutter(self._estimate.readout_s, np.zeros(6))
+
+    @property
+    def is_unknown(self) -> bool:
+        """True if neither a calibration nor a flight has told a read-out, and one is looked for."""
+        return self._estimated and self._estimate.sigma_s is None
+
+    def take(self, readout_s: float, sigma_s: float) -> list[str]:
+        """Take the read-out, and its deviation, that the window of a start told. Returns events."""
+        return self._changed(self._estimate.take(readout_s, sigma_s))
 
     def motion(self, t_ns: int, dt_s: float) -> RollingShutter | None:
         """The rolling shutter's motion in a frame; None for a global shutter, and while the motion is unknown."""
@@ -104,14 +114,7 @@ class ShutterStage:
             )
         )  # fmt: skip
         # 3. The map's pixels lie where a frame's stamp has them, by the read-out in use.
-        if change_s == 0.0:
-            return []
-        self._move_map(change_s)
-        readout_s = self._estimate.readout_s
-        if abs(readout_s - self._told_s) < _TOLD_S:
-            return []
-        self._told_s = readout_s
-        return [_FOUND.format(1e3 * readout_s, readout_s)]
+        return self._changed(change_s)
 
     def end_frame(self) -> None:
         """Note the motion of this frame's image, if a keyframe was made of it."""
@@ -132,6 +135,17 @@ class ShutterStage:
         """The read-out that was found, and its deviation, for the next flight; (): none was."""
         e = self._estimate
         return () if e.sigma_s is None else (round(e.readout_s, 5), round(max(e.sigma_s, 1e-5), 5))
+
+    def _changed(self, change_s: float) -> list[str]:
+        """Follow a change of the read-out. Returns events."""
+        if change_s == 0.0:
+            return []
+        self._move_map(change_s)
+        readout_s = self._estimate.readout_s
+        if abs(readout_s - self._told_s) < _TOLD_S:
+            return []
+        self._told_s = readout_s
+        return [_FOUND.format(1e3 * readout_s, readout_s)]
 
     def _move_map(self, change_s: float) -> None:
         """Move the pixels of landmarks in their keyframes, where the motion of these is known."""
