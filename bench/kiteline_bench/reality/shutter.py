@@ -1,4 +1,4 @@
-"""Rolling shutters: read-outs that a calibration tells and such that the flight has to find, beside a global shutter."""
+"""Rolling shutters whose read-out a calibration tells, or the flight has to find, beside global shutters."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -41,8 +41,8 @@ def _flights(bench: Bench, cameras: str, number: int) -> dict[str, Flown]:
         recording = _recording(bench, number, mono=cameras == "one camera", readout_s=true_s)
         rig = replace(recording.rig, left=replace(recording.rig.left, readout_s=told_s))
         flight = flown(bench, f"{cameras}, {number}, {kind}", replace(recording, rig=rig))
-        bench.say("  metric after {:.1f} s, windows off by {:.1f} %, live {:.4f}, base {:.4f} m, found {}".format(
-            *_row(cameras, number, kind, flight)[3:]))  # fmt: skip
+        bench.say("  metric after {:.1f} s, windows off by {:.1f} %, live {:.4f}, base {:.4f} m".format(
+            *_figures(flight)))  # fmt: skip
         out[kind] = flight
     return out
 
@@ -56,8 +56,12 @@ def _recording(bench: Bench, number: int, *, mono: bool, readout_s: float) -> Re
 
 def _row(cameras: str, number: int, kind: str, flight: Flown) -> tuple[object, ...]:
     found_ms = _readout_ms(flight)
-    return (cameras, number, kind, flight.metric_after_s, 100.0 * flight.false_metric(), flight.ate_m("live"),
-            flight.ate_m("base"), "none" if found_ms is None else f"{found_ms:.1f}")  # fmt: skip
+    return (cameras, number, kind, *_figures(flight), "none" if found_ms is None else f"{found_ms:.1f}")
+
+
+def _figures(flight: Flown) -> tuple[float, float, float, float]:
+    """When metres are said, how wrong windows of them are in %, ATE live and at the base in m."""
+    return flight.metric_after_s, 100.0 * flight.false_metric(), flight.ate_m("live"), flight.ate_m("base")
 
 
 def _readout_ms(flight: Flown) -> float | None:
