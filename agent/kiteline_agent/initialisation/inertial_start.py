@@ -354,7 +354,7 @@ class InertialStart:
         return tuple(replace(rows.shutter, twist=twist) for twist in rows.twists(solution.state, self._camera.T_b_c))
 
     def _finds_readout(self, found: _Solved, corners: CornerObservations, imu: _Imu) -> InParts[bool]:
-        """True if this window tells the read-out of a rolling shutter: the next one is solved with it."""
+        """True if this window tells the read-out of a rolling shutter. A map waits until the next one confirms it."""
         if self._shutter is None or imu.rows is None or not (self._shutter.is_unknown and found.solution.fits):
             return False
         asking = self._readout.asking(
@@ -363,7 +363,7 @@ class InertialStart:
         )  # fmt: skip
         told = yield from self._counted(asking, len(corners.seen))
         if told is None:
-            return False
+            return self._readout.waits
         self._warnings += self._shutter.take(*told)
         self._before = self._tried_ns = None
         return True

@@ -1,7 +1,8 @@
 """The read-out of a rolling shutter of which nothing is known, by the window of a monocular start.
 
-A window in which every row counts as of the frame's stamp bends poses and landmarks to what the shutter did, and so
-tells a part of the read-out at first. It is solved again with what it told, until it tells no change.
+A window in which every row counts as of the frame's stamp bends poses and landmarks to what the shutter did. So one
+step of least squares tells the read-out's sign, but a part of its length: the window is solved with longer and longer
+ones, until the corners' errors grow again.
 """
 
 from collections.abc import Callable
@@ -13,14 +14,12 @@ from kiteline_agent.initialisation.window.rolling_rows import RollingRows
 from kiteline_agent.initialisation.window.window_bundle import InertialBundle
 from kiteline_agent.initialisation.window.window_state import InParts, WarmStart, WindowSolution
 
-_MOST_S = 0.06  # longer than any camera takes at 20 images a second
-_SOLUTIONS = 4  # of one window
-_SETTLED_S = 0.001  # change that a window tells once it is solved with the right read-out
-_LEAST_FALL = 0.1  # of the step, by the change of the read-out; below it nothing is extrapolated
+_FIRST_S, _MOST_S = 0.01, 0.06  # first and longest read-out that is tried; longer ones double
 _SHORT_S = 0.001  # read-out with which derivatives are taken
 _LOOKED_AT = 2.0  # deviations of the first step above which a window is solved again
 _LEAST_S = 0.005  # read-outs below change little; errors of lens and depth tell 2 ms
-_LEAST_CHI2 = 36.0  # by which the errors of the corners are smaller with the read-out, in their own variances
+_LEAST_CHI2 = 64.0  # by which the errors of the corners are smaller with the read-out, in their own variances
+_LEAST_SIGMAS, _MOST_SIGMA_S = 5.0, 0.004  # of its own deviation; worn rigs that hardly turn tell 25 ms with 5
 _AGREEMENT = 0.5  # of the longer one, by which the read-outs of two windows may differ
 _SHARE = 0.15  # deviation of a read-out over the read-out: windows tell some too short
 
@@ -29,10 +28,17 @@ BundleWith = Callable[[RollingRows], InertialBundle]
 
 @dataclass(frozen=True, slots=True)
 class _Told:
-    """A read-out in s, and by how much it makes the corners' errors smaller, in their own variances."""
+    """A read-out and its deviation in s, and by how much it makes the corners' errors smaller, in their variances."""
 
     readout_s: float
+    sigma_s: float
     chi2: float
+
+    @property
+    def is_rolling(self) -> bool:
+        """True if a global shutter would hardly tell this."""
+        sure = abs(self.readout_s) > _LEAST_SIGMAS * self.sigma_s and self.sigma_s < _MOST_SIGMA_S
+        return sure and abs(self.readout_s) > _LEAST_S and self.chi2 > _LEAST_CHI2
 
 
 class WindowReadout:
@@ -55,7 +61,7 @@ class WindowReadout:
         """
         told = yield from _told(solved, found, bundle_with, rows, sigma_px)
         before, self._before = self._before, None
-        if told is None or abs(told.readout_s) < _LEAST_S or told.chi2 < _LEAST_CHI2:
+        if told is None or not told.is_rolling:
             return None
         self._before = told.readout_s
         longer = max(abs(told.readout_s), abs(before or 0.0))
@@ -63,29 +69,58 @@ class WindowReadout:
             return None
         return told.readout_s, _SHARE * abs(told.readout_s)
 
+    @property
+    def waits(self) -> bool:
+        """True if the last window told a read-out that another one has to confirm."""
+        return self._before is not None
+
 
 def _told(
     bundle: InertialBundle, found: WindowSolution, bundle_with: BundleWith, rows: RollingRows, sigma_px: float
 ) -> InParts[_Told | None]:
-    """Solve a window with the read-out that it tells, by the secant method; None if that does not settle."""
+    """Solve a window with other read-outs; None if it tells none."""
     short = rows.with_readout(_SHORT_S)
     step_s, step_sigma_s = bundle.readout_step(found.state, short)
-    scale = 0.5 * (found.reprojection_px / sigma_px) ** 2  # of the corners' variances; they are smaller than is told
-    if not abs(step_s) > _LOOKED_AT * step_sigma_s * np.sqrt(scale):
+    # Errors of corners are smaller than is told; two numbers each.
+    variance = 0.5 * (found.reprojection_px / sigma_px) ** 2
+    if not abs(step_s) > _LOOKED_AT * step_sigma_s * np.sqrt(variance):
         return None
-    readout_s, change_s, solution = rows.shutter.readout_s, step_s, found
-    for _ in range(_SOLUTIONS):
-        last_s, readout_s = readout_s, float(np.clip(readout_s + change_s, -_MOST_S, _MOST_S))
-        warm = WarmStart(solution.state, bundle.landmarks_of(solution.state)[0])
-        bundle = bundle_with(rows.with_readout(readout_s))
-        again = yield from bundle.solving(warm)
-        if again is None or not again.fits:
-            return None
-        solution, last_step_s = again, step_s
-        step_s, _ = bundle.readout_step(solution.state, short)
-        if abs(step_s) < _SETTLED_S:
+    # 1. Longer and longer ones, until the errors grow.
+    tried = [(0.0, found.cost)]
+    best, best_bundle = found, bundle
+    longer_s = float(np.copysign(_FIRST_S, step_s))
+    while abs(longer_s) <= _MOST_S:
+        again = yield from _again(best, best_bundle, bundle_with(rows.with_readout(longer_s)))
+        if again is None:
             break
-        # each solution takes up a part of what the shutter does: the share by which the step fell says how much
-        fell = (last_step_s - step_s) / (readout_s - last_s) if readout_s != last_s else 1.0
-        change_s = step_s / fell if _LEAST_FALL < fell < 1.0 else step_s
-    return _Told(readout_s, 2.0 * (found.cost - solution.cost) / scale)
+        tried.append((longer_s, again[0].cost))
+        if again[0].cost > best.cost:
+            break
+        (best, best_bundle), longer_s = again, 2.0 * longer_s
+    # 2. The lowest point of the parabola through the last three; there a step tells what is left.
+    readout_s = _lowest(tried[-3:])
+    again = yield from _again(best, best_bundle, bundle_with(rows.with_readout(readout_s)))
+    if again is None:
+        return None
+    rest_s, sigma_s = again[1].readout_step(again[0].state, short)
+    return _Told(readout_s + rest_s, sigma_s, 2.0 * (found.cost - min(again[0].cost, best.cost)) / variance)
+
+
+def _again(
+    before: WindowSolution, solver: InertialBundle, bundle: InertialBundle
+) -> InParts[tuple[WindowSolution, InertialBundle] | None]:
+    """The window solved from a solution by `solver`, with what found it; None if it does not fit."""
+    solution = yield from bundle.solving(WarmStart(before.state, solver.landmarks_of(before.state)[0]))
+    return None if solution is None or not solution.fits else (solution, bundle)
+
+
+def _lowest(tried: list[tuple[float, float]]) -> float:
+    """Where a parabola through the costs of three read-outs is lowest; the lowest one of fewer, or of a line."""
+    lowest = min(tried, key=lambda point: point[1])[0]
+    if len(tried) < 3:
+        return lowest
+    s, cost = np.array(tried).T
+    curvature, slope, _ = np.polyfit(s, cost, 2)
+    if not curvature > 0.0:
+        return lowest
+    return float(np.clip(-0.5 * slope / curvature, s.min(), s.max()))

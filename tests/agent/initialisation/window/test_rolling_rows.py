@@ -9,9 +9,12 @@ from kiteline_agent.inertial.preintegration import BiasPrior, Samples
 from kiteline_agent.inertial.samples.sample_buffer import SampleBuffer
 from kiteline_agent.inertial_start_config import InertialBundleConfig
 from kiteline_agent.initialisation.corner_tracks import CornerObservations
+from kiteline_agent.initialisation.window.lens_correction import moved
 from kiteline_agent.initialisation.window.rolling_rows import RollingRows, shifts
 from kiteline_agent.initialisation.window.window_bundle import InertialBundle
+from kiteline_agent.initialisation.window.window_readout import WindowReadout
 from kiteline_agent.initialisation.window.window_samples import WindowSamples
+from kiteline_agent.initialisation.window.window_state import finished
 from kiteline_agent.tracking.shutter.rolling_shutter import RollingShutter
 from kiteline_core.arrays import F64
 from kiteline_core.frame import ImuBatch, ImuCalibration
@@ -32,8 +35,8 @@ def path_of(seed: int) -> Path:
     return Path(path.coefficients, path.knot_s * HASTE, path.length_s * HASTE, 0.7, 0.0)
 
 
-def window(seed: int) -> tuple[CornerObservations, WindowSamples, RollingRows, F64]:
-    """Corners of keyframes 0.25 s apart, each seen when its row is exposed, samples, and true poses T_w_b."""
+def window(seed: int, row_s: float = ROW_S) -> tuple[CornerObservations, WindowSamples, RollingRows, F64]:
+    """Corners of keyframes 0.25 s apart, each seen when its row is exposed, samples, and true poses T_w_b (K,4,4)."""
     rng, path = np.random.default_rng(seed), path_of(seed)
     t_ns = 500_000_000 + 250_000_000 * np.arange(KEYFRAMES, dtype=np.int64)
     imu_t = np.arange(0, int(t_ns[-1]) + 200_000_000, 5_000_000, dtype=np.int64)
@@ -44,12 +47,12 @@ def window(seed: int) -> tuple[CornerObservations, WindowSamples, RollingRows, F
     cloud = truth[:, :3, 3].mean(axis=0) + rng.uniform(-5.0, 5.0, (400, 3))
     xy, seen = np.zeros((KEYFRAMES, len(cloud), 2)), np.zeros((KEYFRAMES, len(cloud)), np.bool_)
     for k, stamp_ns in enumerate(t_ns):
-        row_s = np.zeros(len(cloud))
+        after_s = np.zeros(len(cloud))
         for _ in range(4):  # until each landmark's row is the one that is exposed then
-            T_w_c = path.motion(stamp_ns * 1e-9 + row_s).T_w_b @ T_B_C
+            T_w_c = path.motion(stamp_ns * 1e-9 + after_s).T_w_b @ T_B_C
             p = np.einsum("nji,nj->ni", T_w_c[:, :3, :3], cloud - T_w_c[:, :3, 3])
             shown = p[:, :2] / np.maximum(p[:, 2:], 1e-3)
-            row_s = np.clip(shown[:, 1] * CAMERA.fy, -225.0, 225.0) * ROW_S
+            after_s = np.clip(shown[:, 1] * CAMERA.fy, -225.0, 225.0) * row_s
         seen[k] = (p[:, 2] > 0.4) & (np.abs(shown) < np.array([0.8, 0.5])).all(axis=1)
         xy[k] = shown + 0.3 / CAMERA.fx * rng.normal(size=shown.shape)
     corners = CornerObservations(xy, seen, np.arange(len(cloud)))
@@ -63,6 +66,19 @@ def bundle(corners: CornerObservations, samples: WindowSamples, rows: RollingRow
     prior = BiasPrior(np.zeros(6), np.repeat([0.1, 0.2], 3))
     config = replace(InertialBundleConfig(), sigma_px=0.5)
     return InertialBundle(corners, samples.at, ImuCalibration(), T_B_C, CAMERA.fx, 9.81, prior, config, rows=rows)
+
+
+def asked(readout: WindowReadout, seed: int, row_s: float, lens: F64 | None = None) -> tuple[float, float] | None:
+    """What a window answers that is solved as if every row were taken at the stamp."""
+    corners, samples, rows, _ = window(seed, row_s)
+    if lens is not None:
+        corners = replace(corners, xy=moved(corners.xy, lens))
+    solver = bundle(corners, samples, None)
+    found = solver.solve()
+    assert found is not None
+    asking = readout.asking(solver, found, lambda r: bundle(corners, samples, r), rows.with_readout(0.0), 0.5)
+    with np.errstate(all="ignore"):
+        return finished(asking)
 
 
 def length(p: F64) -> float:
@@ -110,3 +126,28 @@ def test_samples_are_corrected_before_rates_are_taken() -> None:
     _, samples, rows, _ = window(0)
     twice = WindowSamples(samples._buffer, lambda s: Samples(s.t_s, 2.0 * s.gyro, s.accel), samples._stamps_ns, 0.0)
     assert twice.rates(0.0) == pytest.approx(2.0 * rows.rate)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])  # -1: rows are read from the bottom up
+def test_two_windows_in_turn_tell_a_read_out(sign: float) -> None:
+    readout = WindowReadout()
+    assert asked(readout, 0, sign * ROW_S) is None  # one alone is not believed
+    told = asked(readout, 1, sign * ROW_S)
+    assert told is not None
+    assert told[0] == pytest.approx(sign * READOUT_S, abs=0.004)
+    assert 0.0 < told[1] < 0.2 * READOUT_S
+
+
+def test_windows_that_disagree_tell_none() -> None:
+    readout = WindowReadout()
+    asked(readout, 0, ROW_S)
+    assert asked(readout, 1, -ROW_S) is None
+    asked(readout, 0, ROW_S)
+    readout.clear()
+    assert asked(readout, 1, ROW_S) is None
+
+
+@pytest.mark.parametrize("lens", [None, np.array([0.003, 0.001, -0.001, -0.004, 0.003, -0.002, 0.002, 0.001])])
+def test_windows_of_a_global_shutter_tell_none(lens: F64 | None) -> None:
+    readout = WindowReadout()
+    assert all(asked(readout, seed, 0.0, lens) is None for seed in range(6))
