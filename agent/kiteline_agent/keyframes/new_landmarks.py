@@ -12,7 +12,6 @@ from kiteline_core.arrays import F64, I64, U8, Bool
 from kiteline_core.geometry.cameras import RectifiedCamera
 
 _SEARCH_PX = 2.5  # px of the level: range of sub-pixel stereo around the coarse search, whose step is 2 px
-_STEP_RHO = 1e-3  # 1/m, of differences by inverse depth
 _UNIQUENESS = 1.15  # second-best cost over best; below it the row repeats itself
 
 
@@ -112,17 +111,15 @@ def moved_to_frame(
     moved = shutter.to_frame(points.uv, rho)
     uv = np.clip(moved[:, :2], 0.0, [camera.width - 1.0, camera.height - 1.0])
     disparity = np.where(has_depth, points.disparity * moved[:, 2], points.disparity)
-    nearer = shutter.to_frame(points.uv, rho + _STEP_RHO)
-    parallax_m = (nearer - moved)[:, :2] / (_STEP_RHO * np.array([camera.fx, camera.fy]))
-    return replace(points, uv=uv, disparity=disparity, rows=RowShift(points.uv - uv, rho, parallax_m))
+    rows = RowShift(points.uv - uv, rho, shutter.parallax_m(points.uv, rho))
+    return replace(points, uv=uv, disparity=disparity, rows=rows)
 
 
 def shown_by_rows(points: NewPoints, camera: RectifiedCamera, shutter: RollingShutter) -> NewPoints:
     """Landmarks at the frame's stamp whose depths are known, with where rows show them."""
     rho = points.disparity / camera.bf
-    shown, nearer = (shutter.to_rows(points.uv, rho + step)[:, :2] for step in (0.0, _STEP_RHO))
-    parallax_m = (shown - nearer) / (_STEP_RHO * np.array([camera.fx, camera.fy]))
-    return replace(points, rows=RowShift(shown - points.uv, rho, parallax_m))
+    shown = shutter.to_rows(points.uv, rho)[:, :2]
+    return replace(points, rows=RowShift(shown - points.uv, rho, shutter.parallax_m(shown, rho)))
 
 
 def nearby(uv: F64, places: F64, values: F64) -> F64:

@@ -23,6 +23,13 @@ class RowParallax:
             if change_m is not None:
                 self._change_m[slot, :n] = change_m[:n]
 
+    def add(self, slot: int, change_m: F64, rho: F64) -> None:
+        """Bearings were moved, as is right for inverse depths rho (n,) 1/m: they change by change_m (n,2) m more."""
+        n = len(rho)
+        self._any = True
+        self._change_m[slot, :n] += change_m
+        self._rho[slot, :n] = rho
+
     def change(self, rows: I64, rho: F64) -> F64 | None:
         """Change (n,2) of the bearings of landmarks whose inverse depths (n,) have become known better; None: none."""
         if not self._any:

@@ -7,6 +7,8 @@ import numpy as np
 from kiteline_core.arrays import F32, F64
 from kiteline_core.geometry.cameras import GRID_STEP, RectifiedCamera
 
+_STEP_RHO = 1e-3  # 1/m, of differences by inverse depth
+
 
 @dataclass(frozen=True, slots=True)
 class RollingShutter:
@@ -43,6 +45,11 @@ class RollingShutter:
         w, h = self.camera.width - 1.0, self.camera.height - 1.0
         border = np.array([[0.0, 0.0], [w, 0.0], [0.0, h], [w, h], [0.5 * w, 0.0], [0.5 * w, h]])
         return float(np.abs(self.to_frame(border, np.full(len(border), 0.5))[:, :2] - border).max())
+
+    def parallax_m(self, uv: F64, rho: F64) -> F64:
+        """By how much x/z and y/z at the stamp (n,2) change with the inverse depth, of pixels (n,2) that rows show."""
+        near, far = (self.to_frame(uv, rho + step)[:, :2] for step in (_STEP_RHO, 0.0))
+        return np.asarray((near - far) / (_STEP_RHO * np.array([self.camera.fx, self.camera.fy])))
 
     def row_times_s(self, uv: F64) -> F64:
         """Times (n,) of the rows of pixels (n,2) after the frame's stamp."""

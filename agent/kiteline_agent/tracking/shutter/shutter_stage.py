@@ -149,14 +149,18 @@ class ShutterStage:
 
     def _move_map(self, change_s: float) -> None:
         """Move the pixels of landmarks in their keyframes, where the motion of these is known."""
-        m, focal = self._map, self._map.intrinsics[:2]
         for slot in np.flatnonzero(~np.isnan(self._twists[:, 0])).tolist():
-            n = m.counts[slot]
-            shift_px = self._shutter(change_s, self._twists[slot]).to_frame(m.uv[slot, :n], m.rho[slot, :n])[:, :2]
-            shift_px -= m.uv[slot, :n]
-            m.uv[slot, :n] += shift_px
-            m.bearing[slot, :n] += shift_px / focal
-            m.rolled[slot] = False
+            self._move(slot, self._shutter(change_s, self._twists[slot]))
+
+    def _move(self, slot: int, shutter: RollingShutter) -> None:
+        """Move the pixels of a keyframe's landmarks from where this shutter's rows showed them to its stamp."""
+        m = self._map
+        uv, rho = m.uv[slot, : m.counts[slot]].copy(), m.rho[slot, : m.counts[slot]]
+        shift_px = shutter.to_frame(uv, rho)[:, :2] - uv
+        m.uv[slot, : len(uv)] += shift_px
+        m.bearing[slot, : len(uv)] += shift_px / m.intrinsics[:2]
+        m.row_parallax.add(slot, shutter.parallax_m(uv, rho), rho)
+        m.rolled[slot] = False
 
     def _shutter(self, readout_s: float, twist: F64) -> RollingShutter:
         camera = self._rectifier.camera
