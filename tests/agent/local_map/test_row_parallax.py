@@ -50,6 +50,16 @@ def test_a_slot_forgets_its_keyframe() -> None:
     assert not kept.change(N + np.arange(N), np.ones(N)).any()
 
 
+def test_a_keyframe_that_is_moved_later_keeps_what_its_depths_change() -> None:
+    """Its read-out was unknown: its landmarks are where rows showed them, and are moved as if they were far away."""
+    kept, shown = RowParallax(2, N), points(0.0)
+    kept.set(0, None, np.zeros(0))
+    far = SHUTTER.to_frame(shown.uv, np.zeros(N))[:, :2]
+    kept.add(0, SHUTTER.parallax_m(shown.uv, np.zeros(N)), np.zeros(N))
+    change = kept.change(np.arange(N), np.full(N, 0.4))
+    assert far + change * FOCAL == pytest.approx(moved_to_frame(points(0.4), CAMERA, SHUTTER).uv, abs=0.02)
+
+
 def test_rows_show_a_landmark_of_the_stamp_where_it_came_from() -> None:
     moved = moved_to_frame(points(0.3), CAMERA, SHUTTER)
     again = shown_by_rows(moved, CAMERA, SHUTTER)

@@ -15,7 +15,7 @@ from kiteline_agent.tracking.shutter.readout import BLOCK_SIGMA_S, MOST_S, Reado
 from kiteline_agent.tracking.shutter.readout_kernels import readout_equation, row_shift
 from kiteline_agent.tracking.shutter.rolling_shutter import RollingShutter
 from kiteline_core.arrays import F64
-from kiteline_core.frame import Frame
+from kiteline_core.frame import Frame, ImuBatch
 from kiteline_core.geometry import se3, tum
 from kiteline_core.geometry.cameras import RectifiedCamera, Rectifier
 from kiteline_core.ids import AgentId
@@ -152,6 +152,24 @@ def turning(tmp_path_factory: pytest.TempPathFactory) -> str:
     file = tmp_path_factory.mktemp("turning") / "turning.txt"
     file.write_text("".join(tum.line(int(1e9 * t), T) for t, T in zip(t_s, poses, strict=True)))
     return str(file)
+
+
+def test_the_window_of_one_camera_and_an_imu_finds_it_before_there_is_a_map(turning: str) -> None:
+    source = open_sim(
+        "room", trajectory=turning, seconds=6.0, seed=5, scale=0.5, texture_bits=9, readout_s=0.02, mono=True
+    )
+    rig = replace(source.rig, left=replace(source.rig.left, readout_s=0.0))
+    agent = Agent(rig, source.imu, AgentConfig(), Identity(AgentId(0), 0), NoBaseChannel())
+    imu, events = None, list[str]()
+    for item in source:
+        if isinstance(item, ImuBatch):
+            imu = item
+        elif isinstance(item, Frame) and agent.motion_reports()["readout"] is None:
+            output = agent.step(StepInput(item, imu), item.t_ns)
+            assert output.estimate is None or not output.estimate.tracked
+            events += output.events
+    assert agent.motion_reports()["readout"]["ms"] == pytest.approx(20.0, abs=6.0)
+    assert any(event.startswith("rolling shutter: ") for event in events)
 
 
 def flown(turning: str, readout_s: float, told_s: float, seconds: float) -> tuple[Agent, F64, F64]:
