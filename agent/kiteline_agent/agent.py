@@ -83,8 +83,9 @@ class Agent:
         self._camera = CameraState(rig, imu, config, identity, self.map)
         tracker = Tracker(self.map, self.work)
         self._shutter = ShutterStage(
-            self.map, self._rectifier, config.readout, self._camera.known_twist, config.known_rig.readout_of(camera)
-        )
+            self.map, self._rectifier, config.readout, self._camera.known_twist,
+            self._camera.has_motion_sensor, config.known_rig.readout_of(camera),
+        )  # fmt: skip
         self._stuck_camera = StuckCamera(camera)
         self._fixed_parts = FixedPartsStage(self.map, self._rectifier, config.fixed_parts, config.detector)
         self._relocaliser = Relocaliser(
@@ -267,7 +268,7 @@ class Agent:
 
     def _finish(self, ctx: FrameContext, outcome: FrameOutcome) -> Estimate:
         """Note how a frame ended, and report its pose."""
-        self._shutter.end_frame()
+        self._shutter.end_frame(ctx.t_ns)
         self._was_lost = not outcome.tracked or outcome.bridged
         if not self._was_lost:
             self._track.remember(ctx)

@@ -107,10 +107,11 @@ def moved_to_frame(
     rho: (n,) 1/m of those without a depth; None: they are far away.
     """
     has_depth = points.disparity > 0.0
-    rho = np.where(has_depth, points.disparity / camera.bf, 0.0 if rho is None else rho)
+    disparity = shutter.at_once(points.uv, points.disparity)
+    rho = np.where(has_depth, disparity / camera.bf, 0.0 if rho is None else rho)
     moved = shutter.to_frame(points.uv, rho)
     uv = np.clip(moved[:, :2], 0.0, [camera.width - 1.0, camera.height - 1.0])
-    disparity = np.where(has_depth, points.disparity * moved[:, 2], points.disparity)
+    disparity = np.where(has_depth, disparity * moved[:, 2], disparity)
     rows = RowShift(points.uv - uv, rho, shutter.parallax_m(points.uv, rho))
     return replace(points, uv=uv, disparity=disparity, rows=rows)
 

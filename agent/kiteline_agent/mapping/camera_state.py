@@ -60,6 +60,10 @@ class CameraState:
         """True if a sensor or earlier frames tell how the camera moves."""
         return self.motion.measures_motion or self.pose.moves
 
+    def has_motion_sensor(self) -> bool:
+        """True if an IMU or an odometer helps to tell how the camera moves."""
+        return self.motion.tracker is not None or self.motion.measures_motion
+
     def known_twist(self, t_ns: int, dt_s: float) -> F64 | None:
         """Predicted twist (6,) [m/s, rad/s] of the camera in its own axes; None while nothing tells how it moves."""
         return self.motion.camera_twist(t_ns, dt_s) if self.knows_motion else None

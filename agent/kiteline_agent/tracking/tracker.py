@@ -158,7 +158,8 @@ class Tracker:
             )
         if shutter is not None:
             at_frame = shutter.to_frame(observed[:, :2], 1.0 / candidates.depth.take(chosen))
-            at_frame[:, 2] = np.where(observed[:, 2] >= 0.0, observed[:, 2] * at_frame[:, 2], observed[:, 2])
+            disparity = shutter.at_once(observed[:, :2], observed[:, 2])
+            at_frame[:, 2] = np.where(disparity >= 0.0, disparity * at_frame[:, 2], disparity)
             rolled = self._map.rolled[candidates.rows.take(chosen) // self._map.slot_size]
             observed = np.where(rolled[:, None], observed, at_frame)
         if near_px < np.inf:

@@ -97,3 +97,25 @@ def test_a_calibrated_read_out_makes_the_motion_truer(rolled: Rolled, begins: tu
         return float(np.hypot.reduce([step_error_m(rolled, readout_s, begin) for begin in begins]))
 
     assert error_m(READOUT_S) < 0.9 * error_m(0.0)
+
+
+def test_disparities_are_those_of_images_exposed_at_once() -> None:
+    """Rows that rectification brings together are 6 px apart in the raw images: the right one is exposed later."""
+    rectifier = Rectifier(make_rig())
+    assert rectifier.left_grid is not None
+    later = rectifier.left_grid + np.array([0.0, 6.0], np.float32)
+    rolling = replace(shutter(TWIST), right_grid=later)
+    camera, rng = rolling.camera, np.random.default_rng(2)
+    uv = rng.uniform([150.0, 20.0], [camera.width - 20.0, camera.height - 20.0], (200, 2))
+    centre, focal = np.array([camera.cx, camera.cy]), np.array([camera.fx, camera.fy])
+    xyz = np.column_stack([(uv - centre) / focal, np.ones(200)]) * rng.uniform(1.5, 6.0, (200, 1))
+    true = camera.bf / xyz[:, 2]
+    T_c0_c1 = se3.exp(READOUT_S * 6.0 / 480 * TWIST)  # the pair, when the right row is exposed
+    moved = se3.transform(se3.inverse(T_c0_c1), xyz)
+    right_u = (moved[:, 0] - camera.baseline_m) / moved[:, 2] * camera.fx + camera.cx
+    measured = uv[:, 0] - right_u
+    assert np.abs(measured - true).max() > 0.1
+    assert rolling.at_once(uv, measured) == pytest.approx(true, abs=0.02)
+    assert (rolling.at_once(uv, np.full(200, -1.0)) == -1.0).all()
+    assert rolling.at_once(uv, measured) is not measured
+    assert shutter(TWIST).at_once(uv, measured) is measured  # one camera, or a depth camera

@@ -16,7 +16,7 @@ class RollingShutter:
 
     readout_s: from the first row to the last. height: rows of the raw image. grid: (gh,gw,2) raw pixels of every
     GRID_STEP-th rectified one, None if the image needs no rectification. twist: (6,) [m/s, rad/s] of the camera, in
-    its own axes.
+    its own axes. right_grid: as grid, of a right camera whose rows are exposed together with those of the left one.
     """
 
     camera: RectifiedCamera
@@ -24,6 +24,7 @@ class RollingShutter:
     height: int
     grid: F32 | None
     twist: F64
+    right_grid: F32 | None = None
 
     def scaled(self, factor: float) -> "RollingShutter":
         """The same where all lengths are `factor` times as long."""
@@ -51,14 +52,33 @@ class RollingShutter:
         near, far = (self.to_frame(uv, rho + step)[:, :2] for step in (_STEP_RHO, 0.0))
         return np.asarray((near - far) / (_STEP_RHO * np.array([self.camera.fx, self.camera.fy])))
 
+    def at_once(self, uv: F64, disparity: F64) -> F64:
+        """Disparities (n,) of pixels (n,2) as if the right image had been exposed when the left one was; < 0: unknown.
+
+        Rectification brings rows together that two cameras expose at different times.
+        """
+        if self.right_grid is None:
+            return disparity
+        c, w = self.camera, self.twist[3:]
+        right_uv = np.column_stack([uv[:, 0] - disparity, uv[:, 1]])
+        dt_s = self._times_s(right_uv, self.right_grid) - self.row_times_s(uv)
+        x, y, rho = (right_uv[:, 0] - c.cx) / c.fx, (uv[:, 1] - c.cy) / c.fy, disparity / c.bf
+        v = self.twist[:3] + np.array([0.0, w[2], -w[1]]) * c.baseline_m  # of the right camera
+        # forward in time x falls by this rate
+        rate = w[1] - w[2] * y + v[0] * rho - x * (w[0] * y - w[1] * x + v[2] * rho)
+        return np.where(disparity >= 0.0, disparity - c.fx * rate * dt_s, disparity)
+
     def row_times_s(self, uv: F64) -> F64:
         """Times (n,) of the rows of pixels (n,2) after the frame's stamp."""
+        return self._times_s(uv, self.grid)
+
+    def _times_s(self, uv: F64, grid: F32 | None) -> F64:
         v = uv[:, 1]
-        if self.grid is not None:
-            gh, gw = self.grid.shape[:2]
+        if grid is not None:
+            gh, gw = grid.shape[:2]
             column = np.clip(np.rint(uv[:, 0] / GRID_STEP).astype(np.int64), 0, gw - 1)
             line = np.clip(np.rint(v / GRID_STEP).astype(np.int64), 0, gh - 1)
-            v = self.grid[line, column, 1] + (v - GRID_STEP * line)
+            v = grid[line, column, 1] + (v - GRID_STEP * line)
         share = np.clip((v + 0.5) / self.height, 0.0, 1.0)
         return np.asarray(self.readout_s * (share - 0.5))
 

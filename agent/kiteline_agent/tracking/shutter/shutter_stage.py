@@ -27,6 +27,7 @@ _FOUND = (
     "the calibration, corrects it from the start"
 )
 _TOLD_S = 0.002  # s by which a read-out has changed until that is said again
+_SAME_MOTION_NS = 120_000_000  # in which a vehicle hardly moves otherwise
 _MAX_GAP_S = 0.2  # s between two frames whose poses tell the motion of the second
 
 
@@ -39,15 +40,18 @@ class ShutterStage:
         rectifier: Rectifier,
         config: ReadoutConfig,
         twist: Callable[[int, float], F64 | None],
+        has_motion_sensor: Callable[[], bool],
         known_s: tuple[float, ...] = (),
     ) -> None:
         """twist: predicted (6,) of the camera at a stamp, and so many seconds after the last frame; None: unknown.
 
-        known_s: read-out that an earlier flight found, and its deviation; (): none.
+        has_motion_sensor: whether IMU or odometer help to tell that. known_s: read-out that an earlier flight found,
+        and its deviation; (): none.
         """
         self._map = local_map
         self._rectifier = rectifier
         self._twist = twist
+        self._has_motion_sensor = has_motion_sensor
         self._estimated = config.on and rectifier.readout_s == 0.0
         self._estimate = (
             ReadoutEstimate(*known_s) if self._estimated and known_s else ReadoutEstimate(rectifier.readout_s)
@@ -58,6 +62,7 @@ class ShutterStage:
         self._measured: F64 | None = None  # twist (6,) of this frame by images
         self._keyframe = local_map.keyframe.copy()
         self._twists = np.full((len(self._keyframe), 6), np.nan)  # of the images of keyframes
+        self._keyframe_ns = np.zeros(len(self._keyframe), np.int64)  # their stamps
 
     @property
     def at_rest(self) -> RollingShutter:
@@ -83,6 +88,9 @@ class ShutterStage:
         shutter = self._shutter(self._estimate.readout_s, twist)
         if not self._motion_known and shutter.largest_px() < _STILL_PX:
             self._map.rolled[:] = False  # the vehicle stood still when its motion was unknown
+        elif not self._motion_known and self._has_motion_sensor():  # it hardly moved otherwise in the frame before
+            for slot in np.flatnonzero(self._map.rolled & (self._keyframe_ns >= t_ns - _SAME_MOTION_NS)).tolist():
+                self._move(slot, shutter)
         self._motion_known = True
         return shutter
 
@@ -116,13 +124,14 @@ class ShutterStage:
         # 3. The map's pixels lie where a frame's stamp has them, by the read-out in use.
         return self._changed(change_s)
 
-    def end_frame(self) -> None:
-        """Note the motion of this frame's image, if a keyframe was made of it."""
-        if self._estimated:
+    def end_frame(self, t_ns: int) -> None:
+        """Note stamp and motion of this frame's image, if a keyframe was made of it."""
+        if self._estimated or self._estimate.readout_s != 0.0:
             new = self._map.keyframe != self._keyframe
             if new.any():
                 known = self._measured is not None and (self._estimate.readout_s == 0.0 or self._motion_known)
                 self._twists[new] = self._measured if known else np.nan
+                self._keyframe_ns[new] = t_ns
                 self._keyframe[new] = self._map.keyframe[new]
 
     def report(self) -> dict[str, Any] | None:
@@ -154,14 +163,19 @@ class ShutterStage:
 
     def _move(self, slot: int, shutter: RollingShutter) -> None:
         """Move the pixels of a keyframe's landmarks from where this shutter's rows showed them to its stamp."""
-        m = self._map
-        uv, rho = m.uv[slot, : m.counts[slot]].copy(), m.rho[slot, : m.counts[slot]]
-        shift_px = shutter.to_frame(uv, rho)[:, :2] - uv
-        m.uv[slot, : len(uv)] += shift_px
-        m.bearing[slot, : len(uv)] += shift_px / m.intrinsics[:2]
+        m, n = self._map, int(self._map.counts[slot])
+        uv, rho = m.uv[slot, :n].copy(), m.rho[slot, :n]
+        by_stereo = m.measured[slot, :n] & m.camera.stereo
+        disparity = shutter.at_once(uv, np.where(by_stereo, rho * m.camera.bf, -1.0))
+        rho[by_stereo] = disparity[by_stereo] / m.camera.bf
+        moved = shutter.to_frame(uv, rho)
+        rho[by_stereo] *= moved[by_stereo, 2]
+        m.uv[slot, :n] = moved[:, :2]
+        m.bearing[slot, :n] += (moved[:, :2] - uv) / m.intrinsics[:2]
         m.row_parallax.add(slot, shutter.parallax_m(uv, rho), rho)
         m.rolled[slot] = False
 
     def _shutter(self, readout_s: float, twist: F64) -> RollingShutter:
         camera = self._rectifier.camera
-        return RollingShutter(camera, readout_s, camera.height, self._rectifier.left_grid, twist)
+        r = self._rectifier
+        return RollingShutter(camera, readout_s, camera.height, r.left_grid, twist, r.right_grid)
