@@ -212,8 +212,8 @@ class LocalMap:
 
     def follow_depths(self, rows: I64) -> None:
         """Move landmarks of rolling-shutter keyframes, rows (n,), to where their new depths put them at the stamps."""
-        change = self.row_parallax.change(rows, self.rho.take(rows))
-        if change is not None:
+        if self.row_parallax.any:
+            change = self.row_parallax.change(rows, self.rho.take(rows))
             self.bearing.reshape(-1, 2)[rows] += change
             self.uv.reshape(-1, 2)[rows] += change * self.intrinsics[:2]
 

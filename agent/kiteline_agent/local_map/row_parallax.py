@@ -9,14 +9,14 @@ class RowParallax:
     """By how much the bearings of landmarks in their keyframes change with their inverse depths."""
 
     def __init__(self, keyframes: int, landmarks: int) -> None:
-        self._any = False  # keyframe of a rolling shutter
+        self.any = False  # keyframe of a rolling shutter so far
         self._change_m = np.zeros((keyframes, landmarks, 2))  # of a bearing, by inverse depth
         self._rho = np.zeros((keyframes, landmarks))  # 1/m for which the bearings are right
 
     def set(self, slot: int, change_m: F64 | None, rho: F64) -> None:
         """Note it for a new keyframe: change_m (n,2) m; None: nothing changes. rho: (n,) 1/m of the bearings now."""
-        if change_m is not None or self._any:
-            self._any = True
+        if change_m is not None or self.any:
+            self.any = True
             n = min(len(rho), self._rho.shape[1])
             self._change_m[slot] = 0.0
             self._rho[slot, :n] = rho[:n]
@@ -26,14 +26,12 @@ class RowParallax:
     def add(self, slot: int, change_m: F64, rho: F64) -> None:
         """Bearings were moved, as is right for inverse depths rho (n,) 1/m: they change by change_m (n,2) m more."""
         n = len(rho)
-        self._any = True
+        self.any = True
         self._change_m[slot, :n] += change_m
         self._rho[slot, :n] = rho
 
-    def change(self, rows: I64, rho: F64) -> F64 | None:
-        """Change (n,2) of the bearings of landmarks whose inverse depths (n,) have become known better; None: none."""
-        if not self._any:
-            return None
+    def change(self, rows: I64, rho: F64) -> F64:
+        """Change (n,2) of the bearings of landmarks whose inverse depths (n,) have become known better."""
         change = self._change_m.reshape(-1, 2)[rows] * (rho - self._rho.reshape(-1)[rows])[:, None]
         self._rho.reshape(-1)[rows] = rho
         return np.asarray(change)
