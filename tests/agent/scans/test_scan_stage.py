@@ -94,6 +94,20 @@ def test_what_covers_the_view_is_neither_mapped_nor_scanned(recording: Path) -> 
     assert half.map.usable.any() and (half.map.uv[half.map.usable][:, 0] >= middle).all()
 
 
+def test_covered_parts_at_a_border_end_where_the_scans_view_ends(data_dir: Path) -> None:
+    """It is wider than the rectified image and lies lower: a strip beside them would show what is to be left out."""
+    rig = open_source(str(data_dir / "euroc_v101_start")).rig
+    stage = Agent(rig, None, AgentConfig(), Identity(AgentId(0), 0), Heard())._scans
+    assert stage is not None
+    seen, side, lower = stage._segmenter.camera, 64, 32
+    at = seen.columns * 2
+    assert stage._covered_slices(np.array([[0.0, 0.0, 1.0, 1.0]])) == ((slice(0, seen.height), slice(0, seen.width)),)
+    left, top, right, bottom = 0.25 * 752, 0.5 * 480, 0.5 * 752, 0.75 * 480
+    ((rows, columns),) = stage._covered_slices(np.array([[0.25, 0.5, 0.5, 0.75]]))
+    assert (columns.start, columns.stop - 1) == pytest.approx(((left + side) / at, (right + side) / at), abs=1)
+    assert (rows.start, rows.stop - 1) == pytest.approx(((top - lower) / 4, (bottom - lower) / 4), abs=1)
+
+
 def test_a_slow_camera_matches_two_stripes_a_frame(recording: Path) -> None:
     """Else a keyframe of every third frame at 10 Hz would come before the scan of the one before is made."""
     (_, _, fast, _), (_, slow, matched, _) = flown(recording, eager()), flown(recording, eager(), every=2)
@@ -126,6 +140,11 @@ def test_the_log_tells_the_nearest_obstacle(recording: Path) -> None:
     told = [event for event in events if event.startswith("nearest obstacle")]
     assert told and len(told) <= len(channel.scans)
     assert np.isfinite([s.scan.up_c for s in channel.scans]).all()
+
+
+def test_the_local_grid_is_told_how_high_the_ground_is(recording: Path) -> None:
+    agent, _, _, _ = flown(recording, eager())
+    assert agent._local_grid._ground_m == pytest.approx(-1.0, abs=0.05)
 
 
 def test_scans_are_not_shared_while_the_height_of_the_ground_is_unknown(recording: Path) -> None:
@@ -171,7 +190,9 @@ def test_the_next_scan_begins_in_the_frame_that_finishes_one(recording: Path) ->
     assert len(set(keys)) == len(keys)
 
 
-def test_a_view_that_stays_is_scanned_again_and_not_shared(recording: Path) -> None:
+@pytest.mark.parametrize("used_up", [False, True])
+def test_a_view_that_stays_is_scanned_again_and_not_shared(recording: Path, used_up: bool) -> None:
+    """Also where the keyframe has no number left for a scan that would be shared."""
     source = open_source(str(recording))
     channel = Heard(busy=False)
     agent = Agent(source.rig, None, AgentConfig(), Identity(AgentId(0), 0), channel)
@@ -180,6 +201,8 @@ def test_a_view_that_stays_is_scanned_again_and_not_shared(recording: Path) -> N
     for k in range(100):  # 5 s
         frame = replace(first, t_ns=first.t_ns + 50_000_000 * k)
         agent.step(StepInput(frame), frame.t_ns)
+        if used_up:
+            agent._scans._part = KeyframeScan.PARTS - 1
     grid = agent._local_grid
     assert len(grid._scans) == 1 + AgentConfig().local_grid.repeats
     assert len(channel.scans) == 1
