@@ -142,6 +142,17 @@ def test_the_log_tells_the_nearest_obstacle(recording: Path) -> None:
     assert np.isfinite([s.scan.up_c for s in channel.scans]).all()
 
 
+def test_errors_of_ranges_are_renewed_with_the_disparity_offset_or_its_covariance(recording: Path) -> None:
+    agent, _, _, _ = flown(recording, AgentConfig(), every=20)
+    stage, cov = agent._scans, np.eye(5)
+    first = stage.range_error(cov)
+    assert first.cov_px is cov and stage.range_error(cov) is first and stage.range_error(None) is first
+    second = stage.range_error(2.0 * cov)
+    assert second is not first
+    agent.map.disparity_offset = agent.map.disparity_offset + 0.1
+    assert stage.range_error(second.cov_px).offset_px is agent.map.disparity_offset
+
+
 def test_the_local_grid_is_told_how_high_the_ground_is(recording: Path) -> None:
     agent, _, _, _ = flown(recording, eager())
     assert agent._local_grid._ground_m == pytest.approx(-1.0, abs=0.05)
@@ -175,9 +186,19 @@ def test_frames_between_keyframes_are_scanned_and_hang_on_the_one_before(recordi
     assert len({record.key() for record in channel.scans}) == len(channel.scans)
     for record in later:
         assert record.T_k_s is not None and not len(record.labels)
+        assert np.linalg.norm(record.T_k_s[:3, 3]) > 0.01  # the vehicle flies sideways
         messages.encode(record)
     _, still, _, _ = flown(recording, AgentConfig())
     assert len(still.scans) < len(channel.scans)
+
+
+def test_the_scan_of_a_keyframe_itself_labels_its_landmarks(recording: Path) -> None:
+    _, channel, _, _ = flown(recording, eager())
+    own = [record for record in channel.scans if record.part == 0]
+    assert len(own) > 1
+    for record in own:
+        assert record.T_k_s is None and len(record.labels)
+        messages.encode(record)
 
 
 def test_the_next_scan_begins_in_the_frame_that_finishes_one(recording: Path) -> None:
@@ -197,12 +218,14 @@ def test_a_view_that_stays_is_scanned_again_and_not_shared(recording: Path, used
     channel = Heard(busy=False)
     agent = Agent(source.rig, None, AgentConfig(), Identity(AgentId(0), 0), channel)
     agent._scans._ground.start_at(np.array([0.0, 0.0, -1.0]))
-    first = next(item for item in source if isinstance(item, Frame))
+    first, matched = next(item for item in source if isinstance(item, Frame)), 0
     for k in range(100):  # 5 s
         frame = replace(first, t_ns=first.t_ns + 50_000_000 * k)
         agent.step(StepInput(frame), frame.t_ns)
+        matched += agent.work.matched_px > 0
         if used_up:
             agent._scans._part = KeyframeScan.PARTS - 1
+    assert matched <= 11 * GroundConfig().stripes  # every 0.5 s
     grid = agent._local_grid
     assert len(grid._scans) == 1 + AgentConfig().local_grid.repeats
     assert len(channel.scans) == 1
