@@ -108,6 +108,22 @@ def test_covered_parts_at_a_border_end_where_the_scans_view_ends(data_dir: Path)
     assert (rows.start, rows.stop - 1) == pytest.approx(((top - lower) / 4, (bottom - lower) / 4), abs=1)
 
 
+def test_what_is_matched_with_a_covered_part_of_the_right_image_is_left_out(recording: Path) -> None:
+    agent, _, _, _ = flown(recording, AgentConfig(), every=20)
+    stage, seen, right = agent._scans, agent._scans._segmenter.camera, np.array([[0.0, 0.5, 0.5, 1.0]])
+    ((rows, columns),) = stage._covered_slices(right)
+    for left in (np.empty((0, 4)), np.array([[0.9, 0.0, 1.0, 0.25]])):
+        disparity = np.full((seen.height, seen.width), 3.0, np.float32)
+        disparity[:, 0] = 0.0  # unknown, and stays so
+        expected = disparity.copy()
+        expected[rows, : columns.stop + 3] = 0.0
+        for part in stage._covered_slices(left):
+            expected[part] = 0.0
+        stage.cover(left, right)
+        stage._without_covered(disparity)
+        assert np.array_equal(disparity, expected)
+
+
 def test_a_slow_camera_matches_two_stripes_a_frame(recording: Path) -> None:
     """Else a keyframe of every third frame at 10 Hz would come before the scan of the one before is made."""
     (_, _, fast, _), (_, slow, matched, _) = flown(recording, eager()), flown(recording, eager(), every=2)
@@ -261,6 +277,18 @@ def test_an_older_keyframe_gets_no_second_scan_under_a_number(recording: Path, m
     assert returned and len(channel.scans) > 1
     keys = [scan.key() for scan in channel.scans]
     assert len(set(keys)) == len(keys)
+
+
+def test_a_keyframe_has_no_more_scans_than_numbers(recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(KeyframeScan, "PARTS", 3)
+    frames, channel = open_source(str(recording)), Heard()
+    agent = Agent(frames.rig, None, eager(), Identity(AgentId(0), 0), channel)
+    agent._scans._ground.start_at(np.array([0.0, 0.0, -1.0]))
+    for frame in (item for item in frames if isinstance(item, Frame)):
+        agent.step(StepInput(frame, cpu_ns=3_000_000), frame.t_ns)
+        if channel.scans:  # and no keyframe more
+            monkeypatch.setattr(agent._keyframes, "add_if_needed", lambda ctx, track: [])
+    assert max(scan.part for scan in channel.scans) == 2
 
 
 def test_what_was_seen_before_a_long_loss_is_forgotten(recording: Path) -> None:
