@@ -1,4 +1,4 @@
-"""Corrections that are not applied: results that are no numbers, and ties between maps that a user has split."""
+"""Which matches, ties, results and commands change maps, and which do not."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -9,8 +9,11 @@ import pytest
 
 from kiteline_basestation.inertial.ties import InertialTie
 from kiteline_basestation.job_kinds import run_job
+from kiteline_basestation.management import Command
 from kiteline_basestation.mapper import Mapper, MapperInput
+from kiteline_basestation.merging.loop_edges import LoopEdge, LoopMatch, slot_pairs
 from kiteline_basestation.merging.merges import NOTHING
+from kiteline_basestation.refinement import landmark_matching
 from kiteline_basestation.refinement.bundle_job import FULL_BUNDLE
 from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import SubmapId, submap_of_keyframe
@@ -62,3 +65,43 @@ def test_maps_that_a_user_has_split_are_not_merged_by_inertial_steps(make_flight
     assert merger.merge_tied(tie).rescaled == {older: 2.0}
     assert mapper.map.map_id(newer) == older
     assert sim3.scale_of(mapper.map.submap_pose(older)) == pytest.approx(2.0)
+
+
+def test_loop_edges_of_a_deleted_map_go_with_it(make_flight: MakeFlight, words: Any) -> None:
+    mapper, maps = mapped(make_flight, words, 2)
+    first, second = (mapper.map.submaps[submap][:2] for submap in maps)
+    assert mapper.merger is not None
+    ends = [(first[1], first[0]), (second[1], first[0]), (first[1], second[0]), (second[1], second[0])]
+    mapper.merger._edges = [LoopEdge(new, old, np.eye(4), 40, 3.0) for new, old in ends]
+    mapper.step(MapperInput((), (), (Command(1, "delete", '{"map": "1.1.0"}'),)), 10**12)
+    assert [(edge.new, edge.old) for edge in mapper.merger.edges] == ends[:1]
+
+
+def test_keyframes_of_a_deleted_map_are_not_searched(make_flight: MakeFlight, words: Any) -> None:
+    mapper, (older, newer) = mapped(make_flight, words, 2)
+    merger = mapper.merger
+    assert merger is not None
+    merger.search_overlap(newer, older)
+    assert not merger.idle
+    output = mapper.step(MapperInput((), (), (Command(1, "delete", '{"map": "1.1.0"}'),)), 10**12)
+    assert output.answers[0].ok and output.jobs == () and merger.idle
+
+
+def test_landmarks_by_which_two_maps_are_merged_become_one(
+    make_flight: MakeFlight, words: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At once: matching around the keyframes, which finds most of them again, is left out here."""
+    monkeypatch.setattr(landmark_matching, "match_landmarks", lambda *given: 0)
+    a = make_flight(keyframes=10, turns=0.2)
+    b = make_flight(keyframes=10, turns=0.2, start=0.1, variant=1, agent=1, T_w_m=ELSEWHERE)
+    mapper, matches = Mapper(WITHOUT_GRID, words), list[LoopMatch]()
+    merger = mapper.merger
+    assert merger is not None
+    close = merger._close
+    merger._close = lambda found, keyframe: (matches.extend(found.matches), close(found, keyframe))[1]  # type: ignore[method-assign]
+    feed(mapper, [a, b])
+    assert mapper.summary()["merges"] == 1
+    root = mapper.map.keypoints.root
+    pairs = [slot_pairs(mapper.map, match.new_landmarks, match.old_landmarks) for match in matches]
+    new, old = (np.concatenate([pair[side] for pair in pairs]) for side in (0, 1))
+    assert len(new) > 50 and np.mean(root[new] == root[old]) > 0.9
