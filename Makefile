@@ -3,6 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.kiteline-installed
+OLDEST := $(VENV)/oldest
 ROOMS := core codec hw agent basestation lab bench cli
 
 # Compiled kernels are kept with the environment, so that tests and demo compile once.
@@ -15,7 +16,7 @@ export PYTHONUNBUFFERED := 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test check format lint types contracts kernels refs docs bench clean
+.PHONY: help install demo test oldest check format lint types contracts kernels refs docs bench clean
 
 help: ## say what can be made
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -40,6 +41,13 @@ test: $(STAMP) ## run the tests: four at a time, as some only wait, then those t
 	@$(BIN)/kiteline doctor --warm >/dev/null
 	$(BIN)/python -m pytest -q -n 4 --dist loadfile --no-loadscope-reorder -m "not alone"
 	$(BIN)/python -m pytest -q -m alone
+
+oldest: ## run the tests with the oldest versions that pyproject.toml allows, in an environment of their own
+	@$(MAKE) --no-print-directory VENV=$(OLDEST) $(OLDEST)/bin/python
+	$(OLDEST)/bin/python -m pip install --quiet uv
+	$(OLDEST)/bin/uv pip install --quiet --python $(OLDEST)/bin/python --resolution lowest-direct -e '.[base,lab,dev]'
+	@touch $(OLDEST)/$(notdir $(STAMP))
+	@$(MAKE) --no-print-directory VENV=$(OLDEST) NUMBA_CACHE_DIR=$(CURDIR)/$(OLDEST)/numba-cache test
 
 check: lint types contracts test ## everything that a change must pass
 

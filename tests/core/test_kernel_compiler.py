@@ -22,6 +22,10 @@ from kiteline_core.imaging.matching_kernels import fill_cells
 from kiteline_core.kernel_compiler import KernelCompiler, install, remembered_call_type
 from kiteline_core.pose.pnp_kernels import p3p
 
+with_shortcuts = pytest.mark.skipif(
+    not numba.__version__.startswith(kernel_compiler.TRIED), reason="kernels are compiled as this numba does"
+)
+
 
 @numba.njit
 def _helper(line: Any, k: int) -> tuple[int, float]:
@@ -51,6 +55,7 @@ def _code(options: dict[str, Any]) -> str:
     return re.sub(r'_ZN[\w.$]+|@[\w.$"]+|[!#]\d+|\[\d+ x i8\]|\d{6,}', "", code)
 
 
+@with_shortcuts
 def test_the_short_pipeline_makes_the_same_code(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(arrayobj, "fix_integer_index", kernel_lowering._fix_index)
     for name, usual in (
@@ -65,9 +70,8 @@ def _at(line: Any, k: int) -> float:
     return line[k] + line.max()
 
 
+@with_shortcuts
 def test_a_kernel_takes_an_index_as_it_is() -> None:
-    if not numba.__version__.startswith(kernel_compiler.TRIED):
-        pytest.skip("compiles as numba does")
     line = np.arange(4.0)
     usual: Any = numba.njit(_at)
     kernel: Any = numba.njit(pipeline_class=KernelCompiler)(_at)
@@ -92,9 +96,8 @@ def _sum_of_views(levels: Any, rows: Any, out: Any) -> float:
     return total
 
 
+@with_shortcuts
 def test_views_of_a_kernels_arguments_are_not_counted() -> None:
-    if not numba.__version__.startswith(kernel_compiler.TRIED):
-        pytest.skip("compiles as numba does")
     levels, rows = (np.arange(40.0).reshape(10, 4), np.ones((10, 4), np.float64)), np.array([3, 4, 9, 1, 0, 2])
     counted = []
     for options in ({}, {"pipeline_class": KernelCompiler}):
@@ -127,9 +130,8 @@ def _sum_of_some(levels: Any, rows: Any) -> float:
 
 
 @pytest.mark.parametrize(("function", "counts"), [(_sum_of_rows, False), (_sum_of_some, True)])
+@with_shortcuts
 def test_only_a_kernel_that_makes_an_array_counts(function: Any, counts: bool) -> None:
-    if not numba.__version__.startswith(kernel_compiler.TRIED):
-        pytest.skip("compiles as numba does")
     levels, rows = (np.arange(40.0).reshape(10, 4), np.ones((10, 4))), np.array([3, 4, 9, 1, 0, 2])
     compiled: Any = numba.njit(nogil=True, no_cfunc_wrapper=True, pipeline_class=KernelCompiler)(function)
     held = [sys.getrefcount(one) for one in (*levels, rows)]
@@ -209,9 +211,8 @@ def _means(a: Any, k: int) -> tuple[float, float]:
     return _mean(a[0], k), _mean(a[:, 0], k)
 
 
+@with_shortcuts
 def test_a_helper_is_translated_in_its_callers_only() -> None:
-    if not numba.__version__.startswith(kernel_compiler.TRIED):
-        pytest.skip("compiles as numba does")
     compiled: Any = numba.njit(_means)
     values = np.arange(12.0).reshape(3, 4)
     assert compiled(values, 3) == (_mean.py_func(values[0], 3), _mean.py_func(values[:, 0], 3))
@@ -224,12 +225,11 @@ def test_a_helper_is_translated_in_its_callers_only() -> None:
         compiled(values, 0)
 
 
+@with_shortcuts
 def test_helpers_are_read_from_the_cache(tmp_path: Path) -> None:
     """A second process loads the caller, and nothing of what compiles; a third compiles another caller with the helper
     from the cache.
     """
-    if not numba.__version__.startswith(kernel_compiler.TRIED):
-        pytest.skip("caches as numba does")
     (tmp_path / "cached.py").write_text(
         "from kiteline_core.jit import njit\n\n"
         "@njit\ndef _twice(a, i):\n    return 2.0 * a[i]\n\n"
@@ -257,9 +257,8 @@ def test_helpers_are_read_from_the_cache(tmp_path: Path) -> None:
     ]  # fmt: skip
 
 
+@with_shortcuts
 def test_processes_that_write_to_the_cache_at_once_lose_nothing(tmp_path: Path) -> None:
-    if not numba.__version__.startswith(kernel_compiler.TRIED):
-        pytest.skip("caches as numba does")
     slow = (
         "from numba.core.caching import IndexDataCacheFile as File\nimport time, sys\nfrom kiteline_core import jit\n"
         "load = File._load_index\nFile._load_index = lambda self: (load(self), time.sleep(.02))[0]\n"
@@ -297,6 +296,7 @@ def test_variables_of_instructions_are_all_found() -> None:
     assert found > 1000
 
 
+@with_shortcuts
 def test_remembered_types_are_the_resolved_ones() -> None:
     context = cpu_target.typing_context
     t = numba.types

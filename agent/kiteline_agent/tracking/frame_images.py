@@ -18,6 +18,11 @@ _MIN_NCC = 0.85  # correlation of the two patches; lower at occlusions and depth
 _ITERATIONS = 6  # Gauss-Newton steps; it converges in 3
 
 
+def grid_for_kernels(grid: F32 | None) -> F32:
+    """A rectifier's grid of raw pixels (h,w,2) as kernels take it: NO_GRID where it has none."""
+    return NO_GRID if grid is None else grid
+
+
 class RightImage:
     """One right image (h, w) uint8, not rectified. Raises CalibrationError when its size is not the left's."""
 
@@ -65,12 +70,11 @@ class RightImage:
         disparity: F64, found: Bool,
     ) -> None:  # fmt: skip
         """Measure disparities to sub-pixel (stereo_kernels.refine_rows); rectifies only the patches that it reads."""
-        grid = self._rectifier.right_grid
         wanted = disparity >= 0.0
         offset = np.zeros(len(uv)) if self._offset_px is None else self._offset_px(uv)
         np.maximum(disparity + offset, 0.0, out=disparity, where=wanted)
         stereo_kernels.refine_rows(
-            left, left_grid, self.raw(), NO_GRID if grid is None else grid, uv, octave, sure, slopes,
+            left, left_grid, self.raw(), grid_for_kernels(self._rectifier.right_grid), uv, octave, sure, slopes,
             _ITERATIONS, search_px, _MIN_NCC, disparity, found,
         )  # fmt: skip
         np.maximum(disparity - offset, 0.0, out=disparity, where=wanted)
@@ -120,9 +124,9 @@ class FrameImages:
 
     def rectified_by(self, rectifier: Rectifier) -> "FrameImages":
         """The same frame, read through a rectifier that has changed."""
-        grid = NO_GRID if rectifier.left_grid is None else rectifier.left_grid
-        used = None if rectifier.left_grid is None else rectifier
-        return FrameImages(self.sampled, self.right, self.depth_m, self.first, grid, used)
+        grid = rectifier.left_grid
+        used = None if grid is None else rectifier
+        return FrameImages(self.sampled, self.right, self.depth_m, self.first, grid_for_kernels(grid), used)
 
     def raw_half(self) -> U8:
         """Level 1 of the left image as it came."""

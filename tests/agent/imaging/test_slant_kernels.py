@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 import pytest
+from scipy.ndimage import map_coordinates
 
 from kiteline_agent.imaging import alignment_kernels, slant_kernels
 from kiteline_agent.imaging.alignment_kernels import PATCH, PATCH_RADIUS, TEMPLATE, TEMPLATE_LEVELS
@@ -87,6 +88,11 @@ def solved(equations: F64) -> F64:
     return np.asarray(np.linalg.solve(matrices, equations[:, 3:, None])[..., 0])
 
 
+def interpolated(image: U8, uv: F64) -> F64:
+    """Bilinear values (n,) of an image at pixels (n,2), in floating point: OpenCV 4 has weights of 1/32."""
+    return np.asarray(map_coordinates(image.astype(np.float64), uv[:, ::-1].T, order=1))
+
+
 def reference(views: Views, slant: F64, uv: F64, i: int) -> F64:
     """The equations of landmark i at octave 0, written plainly: sampled in floating point, solved by projection."""
     warp, parallax = views.seen_with(slant)
@@ -96,11 +102,9 @@ def reference(views: Views, slant: F64, uv: F64, i: int) -> F64:
     offsets = np.array([[c, r] for r in range(-PATCH_RADIUS, PATCH_RADIUS + 1) for c in range(-4, 5)], np.float64)
 
     def template(at: F64) -> F64:
-        xy = (at * s @ inverse.T + TEMPLATE // 2).astype(np.float32)
-        return cv2.remap(views.templates[i, 0].astype(np.float32), xy[:, 0], xy[:, 1], cv2.INTER_LINEAR).ravel()
+        return interpolated(views.templates[i, 0], at * s @ inverse.T + TEMPLATE // 2)
 
-    xy = (offsets + uv[i] / s).astype(np.float32)
-    seen = cv2.remap(views.second[level].astype(np.float32), xy[:, 0], xy[:, 1], cv2.INTER_LINEAR).ravel()
+    seen = interpolated(views.second[level], offsets + uv[i] / s)
     gx = 0.5 * (template(offsets + [1, 0]) - template(offsets - [1, 0]))
     gy = 0.5 * (template(offsets + [0, 1]) - template(offsets - [0, 1]))
     nuisances = np.column_stack([np.ones(len(offsets)), template(offsets), gx, gy])

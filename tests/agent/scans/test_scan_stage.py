@@ -94,6 +94,36 @@ def test_what_covers_the_view_is_neither_mapped_nor_scanned(recording: Path) -> 
     assert half.map.usable.any() and (half.map.uv[half.map.usable][:, 0] >= middle).all()
 
 
+def test_covered_parts_at_a_border_end_where_the_scans_view_ends(data_dir: Path) -> None:
+    """It is wider than the rectified image and lies lower: a strip beside them would show what is to be left out."""
+    rig = open_source(str(data_dir / "euroc_v101_start")).rig
+    stage = Agent(rig, None, AgentConfig(), Identity(AgentId(0), 0), Heard())._scans
+    assert stage is not None
+    seen, side, lower = stage._segmenter.camera, 64, 32
+    at = seen.columns * 2
+    assert stage._covered_slices(np.array([[0.0, 0.0, 1.0, 1.0]])) == ((slice(0, seen.height), slice(0, seen.width)),)
+    left, top, right, bottom = 0.25 * 752, 0.5 * 480, 0.5 * 752, 0.75 * 480
+    ((rows, columns),) = stage._covered_slices(np.array([[0.25, 0.5, 0.5, 0.75]]))
+    assert (columns.start, columns.stop - 1) == pytest.approx(((left + side) / at, (right + side) / at), abs=1)
+    assert (rows.start, rows.stop - 1) == pytest.approx(((top - lower) / 4, (bottom - lower) / 4), abs=1)
+
+
+def test_what_is_matched_with_a_covered_part_of_the_right_image_is_left_out(recording: Path) -> None:
+    agent, _, _, _ = flown(recording, AgentConfig(), every=20)
+    stage, seen, right = agent._scans, agent._scans._segmenter.camera, np.array([[0.0, 0.5, 0.5, 1.0]])
+    ((rows, columns),) = stage._covered_slices(right)
+    for left in (np.empty((0, 4)), np.array([[0.9, 0.0, 1.0, 0.25]])):
+        disparity = np.full((seen.height, seen.width), 3.0, np.float32)
+        disparity[:, 0] = 0.0  # unknown, and stays so
+        expected = disparity.copy()
+        expected[rows, : columns.stop + 3] = 0.0
+        for part in stage._covered_slices(left):
+            expected[part] = 0.0
+        stage.cover(left, right)
+        stage._without_covered(disparity)
+        assert np.array_equal(disparity, expected)
+
+
 def test_a_slow_camera_matches_two_stripes_a_frame(recording: Path) -> None:
     """Else a keyframe of every third frame at 10 Hz would come before the scan of the one before is made."""
     (_, _, fast, _), (_, slow, matched, _) = flown(recording, eager()), flown(recording, eager(), every=2)
@@ -128,6 +158,22 @@ def test_the_log_tells_the_nearest_obstacle(recording: Path) -> None:
     assert np.isfinite([s.scan.up_c for s in channel.scans]).all()
 
 
+def test_errors_of_ranges_are_renewed_with_the_disparity_offset_or_its_covariance(recording: Path) -> None:
+    agent, _, _, _ = flown(recording, AgentConfig(), every=20)
+    stage, cov = agent._scans, np.eye(5)
+    first = stage.range_error(cov)
+    assert first.cov_px is cov and stage.range_error(cov) is first and stage.range_error(None) is first
+    second = stage.range_error(2.0 * cov)
+    assert second is not first
+    agent.map.disparity_offset = agent.map.disparity_offset + 0.1
+    assert stage.range_error(second.cov_px).offset_px is agent.map.disparity_offset
+
+
+def test_the_local_grid_is_told_how_high_the_ground_is(recording: Path) -> None:
+    agent, _, _, _ = flown(recording, eager())
+    assert agent._local_grid._ground_m == pytest.approx(-1.0, abs=0.05)
+
+
 def test_scans_are_not_shared_while_the_height_of_the_ground_is_unknown(recording: Path) -> None:
     agent, channel, matched, _ = flown(recording, eager(), known=False)
     assert any(matched)
@@ -156,9 +202,19 @@ def test_frames_between_keyframes_are_scanned_and_hang_on_the_one_before(recordi
     assert len({record.key() for record in channel.scans}) == len(channel.scans)
     for record in later:
         assert record.T_k_s is not None and not len(record.labels)
+        assert np.linalg.norm(record.T_k_s[:3, 3]) > 0.01  # the vehicle flies sideways
         messages.encode(record)
     _, still, _, _ = flown(recording, AgentConfig())
     assert len(still.scans) < len(channel.scans)
+
+
+def test_the_scan_of_a_keyframe_itself_labels_its_landmarks(recording: Path) -> None:
+    _, channel, _, _ = flown(recording, eager())
+    own = [record for record in channel.scans if record.part == 0]
+    assert len(own) > 1
+    for record in own:
+        assert record.T_k_s is None and len(record.labels)
+        messages.encode(record)
 
 
 def test_the_next_scan_begins_in_the_frame_that_finishes_one(recording: Path) -> None:
@@ -171,15 +227,21 @@ def test_the_next_scan_begins_in_the_frame_that_finishes_one(recording: Path) ->
     assert len(set(keys)) == len(keys)
 
 
-def test_a_view_that_stays_is_scanned_again_and_not_shared(recording: Path) -> None:
+@pytest.mark.parametrize("used_up", [False, True])
+def test_a_view_that_stays_is_scanned_again_and_not_shared(recording: Path, used_up: bool) -> None:
+    """Also where the keyframe has no number left for a scan that would be shared."""
     source = open_source(str(recording))
     channel = Heard(busy=False)
     agent = Agent(source.rig, None, AgentConfig(), Identity(AgentId(0), 0), channel)
     agent._scans._ground.start_at(np.array([0.0, 0.0, -1.0]))
-    first = next(item for item in source if isinstance(item, Frame))
+    first, matched = next(item for item in source if isinstance(item, Frame)), 0
     for k in range(100):  # 5 s
         frame = replace(first, t_ns=first.t_ns + 50_000_000 * k)
         agent.step(StepInput(frame), frame.t_ns)
+        matched += agent.work.matched_px > 0
+        if used_up:
+            agent._scans._part = KeyframeScan.PARTS - 1
+    assert matched <= 11 * GroundConfig().stripes  # every 0.5 s
     grid = agent._local_grid
     assert len(grid._scans) == 1 + AgentConfig().local_grid.repeats
     assert len(channel.scans) == 1
@@ -215,6 +277,18 @@ def test_an_older_keyframe_gets_no_second_scan_under_a_number(recording: Path, m
     assert returned and len(channel.scans) > 1
     keys = [scan.key() for scan in channel.scans]
     assert len(set(keys)) == len(keys)
+
+
+def test_a_keyframe_has_no_more_scans_than_numbers(recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(KeyframeScan, "PARTS", 3)
+    frames, channel = open_source(str(recording)), Heard()
+    agent = Agent(frames.rig, None, eager(), Identity(AgentId(0), 0), channel)
+    agent._scans._ground.start_at(np.array([0.0, 0.0, -1.0]))
+    for frame in (item for item in frames if isinstance(item, Frame)):
+        agent.step(StepInput(frame, cpu_ns=3_000_000), frame.t_ns)
+        if channel.scans:  # and no keyframe more
+            monkeypatch.setattr(agent._keyframes, "add_if_needed", lambda ctx, track: [])
+    assert max(scan.part for scan in channel.scans) == 2
 
 
 def test_what_was_seen_before_a_long_loss_is_forgotten(recording: Path) -> None:

@@ -2,6 +2,7 @@
 
 import base64
 import json
+from collections.abc import MutableSequence
 from pathlib import Path
 from typing import Any
 
@@ -59,7 +60,7 @@ def to_json(message: Any) -> Any:
     out = {}
     for field in message.DESCRIPTOR.fields:
         value = getattr(message, field.name)
-        if field.is_repeated:
+        if isinstance(value, MutableSequence):
             value = [to_json(v) if field.message_type else v for v in value]
         elif field.message_type:
             value = to_json(value)
