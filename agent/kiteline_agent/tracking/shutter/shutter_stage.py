@@ -9,7 +9,7 @@ from kiteline_agent.config import ReadoutConfig
 from kiteline_agent.local_map import projection_kernels
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.tracking.frame_context import FrameContext
-from kiteline_agent.tracking.frame_images import NO_GRID
+from kiteline_agent.tracking.frame_images import grid_for_kernels
 from kiteline_agent.tracking.shutter.readout import ReadoutEstimate
 from kiteline_agent.tracking.shutter.readout_kernels import readout_equation
 from kiteline_agent.tracking.shutter.rolling_shutter import RollingShutter
@@ -113,7 +113,7 @@ class ShutterStage:
         projection_kernels.views(
             track.T_c_m, m.intrinsics, rows, m.T_m_k, m.bearing, m.rho, m.slant, warp, parallax
         )  # fmt: skip
-        grid = NO_GRID if self._rectifier.left_grid is None else self._rectifier.left_grid
+        grid = grid_for_kernels(self._rectifier.left_grid)
         change_s = self._estimate.add(
             *readout_equation(
                 track.T_c_m, m.intrinsics, float(m.camera.height), grid, twist, rows,
