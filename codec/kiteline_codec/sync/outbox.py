@@ -4,7 +4,7 @@ With a limit, keyframes that were not used for long are archived until they are 
 them, old sections of low priority are dropped instead.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 
 from kiteline_codec.coding.packing import Writer
 from kiteline_codec.schema import KEYFRAME_KINDS, PREDICTOR_KINDS, RECORD_TYPES, Key
@@ -14,14 +14,13 @@ from kiteline_codec.sync.digest import MODULUS, Digest, hash_value
 from kiteline_codec.sync.in_flight import Acknowledged, Carried, PacketsInFlight, SentPacket
 from kiteline_codec.sync.resident import ResidentValues
 from kiteline_codec.sync.round_trip import RoundTrip
-from kiteline_codec.sync.send_queue import Entry, Order, SendQueue, item_of
+from kiteline_codec.sync.send_queue import Entry, Order, SendQueue, Skipped, item_of
 from kiteline_codec.transport.packet import write_item
 
 Known = Callable[[Key], tuple[int, bytes] | None]  # version and code of an own value that the peer holds
 Compress = Callable[[Key, bytes, Known], bytes | None]  # a residual code, None where there is none
 
 _URGENCY = {kind: int(record.URGENCY) for kind, record in RECORD_TYPES.items()}
-_MAX_SKIPPED = 8  # values too long for the rest of a packet that are passed over in search of a shorter one
 _ENTRY_BYTES = 700  # memory of a value beside its code, roughly
 _POSES = (1,)  # lower orders, poses and placements, go before the value that has waited longest
 _FETCHED_PAGES = 16  # that are taken back at once when nothing else is left to be sent
@@ -274,9 +273,9 @@ class Outbox:
         key = self._top()
         return None if key is None else max(self._entries[key].order[0], _URGENCY.get(key.kind, 0))
 
-    def _top(self) -> Key | None:
-        key = self._queue.top()
-        if key is not None or self.archive.newest_unacknowledged() is None:
+    def _top(self, without: Collection[int] = ()) -> Key | None:
+        key = self._queue.top(without)
+        if key is not None or without or self.archive.newest_unacknowledged() is None:
             return key
         self._make_room()
         for _ in range(_FETCHED_PAGES):
@@ -312,12 +311,12 @@ class Outbox:
                 return None
             return entry.version, entry.code
 
-        skipped: list[tuple[Key, Entry]] = []
+        skipped = Skipped()
         empty = limit - len(out)
         last_id = 0
         oldest_due = self.packets.number % self._oldest_every == 0
-        while len(skipped) < _MAX_SKIPPED:
-            key, oldest = self._top(), None
+        while True:
+            key, oldest = self._top(skipped.priorities), None
             if oldest_due and (key is None or self._entries[key].order > _POSES):
                 oldest_due = False
                 oldest = self._oldest()
@@ -330,7 +329,7 @@ class Outbox:
             residual = self._residual_maker(key, entry, known) if self._compress is not None else None
             item = item_of(key, entry, limit - len(out), empty, last_id, watermark, residual)
             if item is None:
-                skipped.append((key, entry))
+                skipped.add(key, entry)
                 continue
             write_item(out, item, last_id, watermark)
             last_id = key.id
@@ -341,8 +340,8 @@ class Outbox:
             entry.unsent = ranges.cut(entry.unsent, start, stop)
             entry.sent = True
             if entry.unsent:
-                skipped.append((key, entry))
-        for key, entry in skipped:
+                skipped.add(key, entry)
+        for key, entry in skipped.values:
             self._queue.add(key, entry)
         self.packets.add(now_ns, len(out), carried)
 

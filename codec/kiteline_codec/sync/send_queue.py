@@ -1,8 +1,8 @@
 """One own value with what the peer has of it, and the order in which values are sent."""
 
 import heapq
-from collections import deque
-from collections.abc import Callable
+from collections import Counter, deque
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 
 from kiteline_codec.coding.packing import varint_bytes, zigzag
@@ -14,6 +14,7 @@ Order = tuple[int, ...]
 
 _MIN_FRAGMENT_BYTES = 32  # a smaller one costs more for its header than it carries
 _MAX_COMPRESSION = 4  # a residual code is not tried if it would not fit even at this ratio
+_MAX_SKIPPED = 8  # values of one priority that are passed over in search of a shorter one for the rest of a packet
 _SLACK = 64  # outdated entries that a queue may hold beyond twice the values
 
 
@@ -93,24 +94,46 @@ def item_of(
     return Item(key, version, len(code), start, code[start:stop])
 
 
+class Skipped:
+    """Values that do not fit the rest of a packet. Those of each priority are passed over up to a number: however many
+    long ones wait, shorter ones of lower priority fill the packet.
+    """
+
+    def __init__(self) -> None:
+        self.values: list[tuple[Key, Entry]] = []
+        self.priorities: set[int] = set()  # of which too many were passed over
+        self._numbers = Counter[int]()
+
+    def add(self, key: Key, entry: Entry) -> None:
+        """Pass over a value."""
+        self.values.append((key, entry))
+        self._numbers[entry.order[0]] += 1
+        if self._numbers[entry.order[0]] == _MAX_SKIPPED:
+            self.priorities.add(entry.order[0])
+
+
 class SendQueue:
     """Entries with anything to send, by priority and by age. `entries` is the outbox's own table."""
 
     def __init__(self, entries: dict[Key, Entry]) -> None:
         self._entries = entries
-        self._by_order: list[tuple[Order, Key]] = []  # heap
+        self._by_order: dict[int, list[tuple[Order, Key]]] = {}  # heaps by priority, the first number of an order
         self._by_age: deque[Key] = deque()  # so that none starves
         self._versions: list[tuple[int, Key]] = []  # heap of versions that are not acknowledged
 
     def __len__(self) -> int:
         """Length of the longest queue, outdated entries included."""
-        return max(len(self._by_order), len(self._by_age), len(self._versions))
+        return max(self._ordered, len(self._by_age), len(self._versions))
+
+    @property
+    def _ordered(self) -> int:
+        return sum(map(len, self._by_order.values()))
 
     def restart(self) -> None:
         """Queue every entry, as not acknowledged."""
         self._versions = [(e.version, k) for k, e in self._entries.items()]
         heapq.heapify(self._versions)
-        self._by_order = []
+        self._by_order = {}
         self._by_age = deque()
         for _, key in sorted(self._versions):
             entry = self._entries[key]
@@ -128,31 +151,41 @@ class SendQueue:
         """Queue an entry with anything to send, or one whose order has changed."""
         if entry.queued != entry.order:
             entry.queued = entry.order
-            heapq.heappush(self._by_order, (entry.order, key))
-            if len(self._by_order) > 2 * len(self._entries) + _SLACK:
-                self._by_order = [(e.queued, k) for k, e in self._entries.items() if e.queued is not None]
-                heapq.heapify(self._by_order)
+            heapq.heappush(self._by_order.setdefault(entry.order[0], []), (entry.order, key))
+            if self._ordered > 2 * len(self._entries) + _SLACK:
+                self._drop_outdated()
         if not entry.in_oldest:
             entry.in_oldest = True
             self._by_age.append(key)
             if len(self._by_age) > 2 * len(self._entries) + _SLACK:
                 self._by_age = deque(dict.fromkeys(k for k in self._by_age if k in self._entries))
 
-    def top(self) -> Key | None:
-        """The entry of highest priority."""
-        while self._by_order:
-            order, key = self._by_order[0]
-            entry = self._entries.get(key)
-            if entry is not None and entry.queued == order:
-                if entry.unsent:
-                    return key
-                entry.queued = None
-            heapq.heappop(self._by_order)
+    def _drop_outdated(self) -> None:
+        self._by_order = {}
+        for key, entry in self._entries.items():
+            if entry.queued is not None:
+                self._by_order.setdefault(entry.queued[0], []).append((entry.queued, key))
+        for heap in self._by_order.values():
+            heapq.heapify(heap)
+
+    def top(self, without: Collection[int] = ()) -> Key | None:
+        """The entry that goes first. without: priorities that are left out."""
+        for priority in sorted(self._by_order):
+            heap = self._by_order[priority]
+            while heap and priority not in without:
+                order, key = heap[0]
+                entry = self._entries.get(key)
+                if entry is not None and entry.queued == order:
+                    if entry.unsent:
+                        return key
+                    entry.queued = None
+                heapq.heappop(heap)
         return None
 
     def pop(self, entry: Entry) -> None:
-        """Remove the top."""
-        heapq.heappop(self._by_order)
+        """Remove an entry that `top` gave."""
+        assert entry.queued is not None
+        heapq.heappop(self._by_order[entry.queued[0]])
         entry.queued = None
 
     def oldest(self) -> Key | None:
