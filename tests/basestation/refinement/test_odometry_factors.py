@@ -90,6 +90,16 @@ def test_links_hold_what_few_points_cannot() -> None:
     assert error_m(result.T_c_m, truth) < 0.5 * error_m(alone.T_c_m, truth)
 
 
+def test_few_points_hardly_move_what_the_agent_tracked() -> None:
+    """Its steps rest on ten times as many landmarks as a thin link carries."""
+    sparse_map, truth = flight(noise_px=0.25)
+    part = window(sparse_map)
+    alone = bundle(part.problem, CONFIG.bundle)
+    linked = with_odometry_factors(sparse_map, part, CONFIG.odometry_factors)
+    result = without_odometry_factors(part, bundle(linked, CONFIG.bundle))
+    assert error_m(result.T_c_m, truth) < 0.05 * error_m(alone.T_c_m, truth)
+
+
 def test_keyframes_that_see_nothing_of_those_before_them_are_held_by_their_parent() -> None:
     sparse_map, _ = flight(noise_px=0.1, births=40, unseen=3)
     part = window(sparse_map, IDS[3:])
