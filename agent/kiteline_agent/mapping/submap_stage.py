@@ -41,6 +41,7 @@ _IGNORED = "imu: not used from here on: the images alone are flown, in a unit of
 _NO_METRES = "mono: lengths are not metres any more: nothing measured the motion while images were lost"
 _FAILURES = 2  # failed searches in frames with texture before a new submap is opened
 _SCALE_SIGMA = 0.02  # relative deviation below which the metric scale of two views is used
+_SETTLED_S = 1.0  # s of images after some without; a map corrected sooner begins with the few landmarks found again
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,6 +76,7 @@ class SubmapStage:
         self._governor = governor
         self._channel = channel
         self._path = UnscaledPath(local_map)
+        self._tracked_number, self._tracked_since_ns = -1, 0  # the last tracked frame, and the first one without a gap
         self._loss_tie = LossTie(camera, channel)
         self._warnings: list[str] = []
         self._start_watch, self._views_watch = StartWatch(), StartWatch(VIEWS_S)
@@ -257,9 +259,14 @@ class SubmapStage:
     def restart_in_metres(self, ctx: FrameContext, track: Track) -> list[str]:
         """Continue a monocular map in a new submap in metres, once IMU or odometer give its scale. Returns events."""
         limits, camera = ctx.config.two_view_start, self._camera
+        if ctx.number != self._tracked_number + 1:  # images did not lead in the frame before
+            self._tracked_since_ns = ctx.t_ns
+        self._tracked_number = ctx.number
         if self._two_view_start is None or ctx.number % limits.scale_every or not camera.submaps.room:
             return []
         correction = camera.motion.scale_correction()
+        if correction is not None and (ctx.t_ns - self._tracked_since_ns) * 1e-9 < _SETTLED_S:
+            return []
         unit_m = camera.motion.metres_per_unit(_SCALE_SIGMA) if correction is None else correction[0]
         if unit_m is None:
             return []

@@ -18,9 +18,9 @@ _FIRST_S, _MOST_S = 0.01, 0.06  # first and longest read-out that is tried; long
 _SHORT_S = 0.001  # read-out with which derivatives are taken
 _LOOKED_AT = 2.0  # deviations of the first step above which a window is solved again
 _LEAST_S = 0.005  # read-outs below change little; errors of lens and depth tell 2 ms
-_LEAST_CHI2 = 64.0  # by which the errors of the corners are smaller with the read-out, in their own variances
-_LEAST_SIGMAS, _MOST_SIGMA_S = 5.0, 0.004  # of its own deviation; worn rigs that hardly turn tell 25 ms with 5
-_AGREEMENT = 0.5  # of the longer one, by which the read-outs of two windows may differ
+_LEAST_CHI2 = 64.0  # by which corners' errors are smaller with it, in their own variances; a worn rig had 91 once
+_LEAST_SIGMAS = 3.5  # of its own deviation
+_AGREEMENT = 0.3  # of the longer one, by which the read-outs of two windows may differ
 _SHARE = 0.15  # deviation of a read-out over the read-out: windows tell some too short
 
 BundleWith = Callable[[RollingRows], InertialBundle]
@@ -37,8 +37,8 @@ class _Told:
     @property
     def is_rolling(self) -> bool:
         """True if a global shutter would hardly tell this."""
-        sure = abs(self.readout_s) > _LEAST_SIGMAS * self.sigma_s and self.sigma_s < _MOST_SIGMA_S
-        return sure and abs(self.readout_s) > _LEAST_S and self.chi2 > _LEAST_CHI2
+        least_s = max(_LEAST_SIGMAS * self.sigma_s, _LEAST_S)
+        return abs(self.readout_s) > least_s and self.chi2 > _LEAST_CHI2
 
 
 class WindowReadout:
