@@ -4,8 +4,6 @@ Two rays are intersected by least squares; successive inverse depths are average
 "SVO", 2014, section V). A seed becomes a landmark of the map once its depth is known well enough.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from kiteline_agent.config import AgentConfig
@@ -14,10 +12,10 @@ from kiteline_agent.imaging import alignment_kernels
 from kiteline_agent.imaging.alignment_kernels import ALIGN_ITERATIONS, FINE_STEP_PX, MIN_NCC
 from kiteline_agent.imaging.epipolar_kernels import search_segments
 from kiteline_agent.keyframes import seed_kernels as kernels
+from kiteline_agent.keyframes.seed_shutter import SeedShutter
 from kiteline_agent.local_map.local_map import Candidates, LocalMap
 from kiteline_agent.tracking.frame_context import FrameContext
 from kiteline_agent.tracking.frame_images import FrameImages
-from kiteline_agent.tracking.shutter.rolling_shutter import RollingShutter
 from kiteline_agent.tracking.track import Track
 from kiteline_core.arrays import F64, I8, I64, Bool
 from kiteline_core.order_statistics import quantiles
@@ -35,34 +33,6 @@ _DISTINCT = 0.93  # share of the best correlation that nothing else on the segme
 _INFLATION = 2.0  # factor on variances of seeds: successive frames share the template's error
 _NEARER = 2.0  # times the inverse depth of the nearest twentieth of the landmarks: end of the search
 _KNOWN = 0.12  # deviation over inverse depth below which a seed becomes a landmark
-
-
-@dataclass(frozen=True, slots=True)
-class SeedShutter:
-    """A rolling shutter's rows of seeds, which lie at (direction + centre rho) / rho (n,3) in the camera.
-
-    rolled: (n,) their keyframes show them as rows did.
-    """
-
-    shutter: RollingShutter
-    direction: F64
-    centre: F64
-    rolled: Bool
-
-    def at_rows(self, start: F64, end: F64, rho: F64) -> tuple[F64, F64]:
-        """Segments from start to end (n,2), moved as seeds at rho (n,) are."""
-        middle = 0.5 * (start + end)
-        shift = self.shutter.to_rows(middle, self._inverse_depth(rho))[:, :2] - middle
-        shift[self.rolled] = 0.0
-        return start + shift, end + shift
-
-    def at_frame(self, uv: F64, rho: F64) -> F64:
-        """Pixels (n,2) of seeds at rho (n,), at the frame's stamp."""
-        moved = self.shutter.to_frame(uv, self._inverse_depth(rho))[:, :2]
-        return np.where(self.rolled[:, None], uv, moved)
-
-    def _inverse_depth(self, rho: F64) -> F64:
-        return np.asarray(rho / np.maximum(self.direction[:, 2] + self.centre[:, 2] * rho, 1e-3))
 
 
 class DepthFromMotion:
@@ -105,23 +75,19 @@ class DepthFromMotion:
             track.T_c_m, m.intrinsics, rows, m.T_m_k, m.bearing, rho, sigma, _REACH, ceiling,
             direction, centre, start, end,
         )  # fmt: skip
-        shutter = (
-            None
-            if ctx.shutter is None
-            else SeedShutter(ctx.shutter, direction, centre, m.rolled.take(rows // m.slot_size))
-        )
-        if shutter is not None:
-            start, end = shutter.at_rows(start, end, rho)
+        rolling = None
+        if ctx.shutter is not None:
+            rolling = SeedShutter(ctx.shutter, direction, centre, m.rolled.take(rows // m.slot_size))
+            start, end = rolling.segments(start, end, rho)
         uv, found = self._search(images, rows, warp, start, end)
         measured, variance, off_line = np.empty((3, n))
-        place = uv if shutter is None else shutter.at_frame(uv, rho)
-        for again in range(1 if shutter is None else 2):
-            if again and shutter is not None:  # where the depth that was measured puts it
-                place = shutter.at_frame(uv, np.maximum(measured, 0.0))
+        octave = m.octave.take(rows)
+        # The depth that was measured says where a rolling shutter's pixels were at the stamp.
+        for depths in (rho,) if rolling is None else (rho, measured):
+            place = uv if rolling is None else rolling.at_frame(uv, np.maximum(depths, 0.0))
             kernels.intersect(
-                direction, centre, place, m.octave.take(rows), m.intrinsics, config.sigma_px, measured, variance,
-                off_line,
-            )  # fmt: skip
+                direction, centre, place, octave, m.intrinsics, config.sigma_px, measured, variance, off_line
+            )
         agree = np.square(measured - rho) < config.gate**2 * (variance + sigma**2)
         scale = (1 << self._map.octave[rows]).astype(np.float64)
         hit = (found == 1) & agree & (off_line < config.off_line_px * scale) & np.isfinite(variance)
