@@ -374,6 +374,7 @@ class LocalMap:
 
     def _set_landmarks(self, slot: int, index: I64, rho: F64, bearing: F64) -> None:
         self.rho[slot, index], self.bearing[slot, index] = rho, bearing
+        self.row_parallax.refer(slot, index, rho)
         self.measured[slot, index] = False
         self.sigma_rho[slot, index] = _REFINED_SIGMA_PX / self.camera.bf
 

@@ -30,6 +30,10 @@ class RowParallax:
         self._change_m[slot, :n] += change_m
         self._rho[slot, :n] = rho
 
+    def refer(self, slot: int, index: I64, rho: F64) -> None:
+        """The bearings of a keyframe's landmarks (n,) have become right for these inverse depths (n,) 1/m."""
+        self._rho[slot, index] = rho
+
     def change(self, rows: I64, rho: F64) -> F64:
         """Change (n,2) of the bearings of landmarks whose inverse depths (n,) have become known better."""
         change = self._change_m.reshape(-1, 2)[rows] * (rho - self._rho.reshape(-1)[rows])[:, None]

@@ -60,6 +60,14 @@ def test_a_keyframe_that_is_moved_later_keeps_what_its_depths_change() -> None:
     assert far + change * FOCAL == pytest.approx(moved_to_frame(points(0.4), CAMERA, SHUTTER).uv, abs=0.02)
 
 
+def test_a_bearing_that_the_base_refined_is_right_for_its_depth() -> None:
+    kept, moved = RowParallax(2, N), moved_to_frame(points(0.0), CAMERA, SHUTTER)
+    kept.set(0, moved.rows.parallax_m, moved.rows.rho)
+    kept.refer(0, np.arange(N), np.full(N, 0.4))
+    assert not kept.change(np.arange(N), np.full(N, 0.4)).any()
+    assert kept.change(np.arange(N), np.full(N, 0.5)).any()
+
+
 def test_rows_show_a_landmark_of_the_stamp_where_it_came_from() -> None:
     moved = moved_to_frame(points(0.3), CAMERA, SHUTTER)
     again = shown_by_rows(moved, CAMERA, SHUTTER)
