@@ -237,9 +237,11 @@ class KeyframeMaker:
         )
         slot = self._map.add(header, T_m_k, new, ctx.number)
         self._map.rolled[slot] = ctx.shutter is None
-        shown = None if points.rows is None else points.rows.part(order)
-        parallax_m, at_rho = (None, np.zeros(0)) if shown is None else (shown.parallax_m, shown.rho)
-        self._map.row_parallax.set(slot, parallax_m, at_rho)
+        if points.rows is None:
+            self._map.row_parallax.clear(slot)
+        else:
+            shown = points.rows.part(order)
+            self._map.row_parallax.set(slot, shown.parallax_m, shown.rho)
         return seen_uv
 
 

@@ -13,15 +13,15 @@ class RowParallax:
         self._change_m = np.zeros((keyframes, landmarks, 2))  # of a bearing, by inverse depth
         self._rho = np.zeros((keyframes, landmarks))  # 1/m for which the bearings are right
 
-    def set(self, slot: int, change_m: F64 | None, rho: F64) -> None:
-        """Note it for a new keyframe: change_m (n,2) m; None: nothing changes. rho: (n,) 1/m of the bearings now."""
-        if change_m is not None or self.any:
-            self.any = True
-            n = min(len(rho), self._rho.shape[1])
-            self._change_m[slot] = 0.0
-            self._rho[slot, :n] = rho[:n]
-            if change_m is not None:
-                self._change_m[slot, :n] = change_m[:n]
+    def clear(self, slot: int) -> None:
+        """A new keyframe, of which no bearing changes."""
+        self._change_m[slot] = 0.0
+
+    def set(self, slot: int, change_m: F64, rho: F64) -> None:
+        """Note it for a new keyframe: change_m (n,2) m. rho: (n,) 1/m of the bearings now."""
+        self.clear(slot)
+        n = min(len(rho), self._rho.shape[1])
+        self.add(slot, change_m[:n], rho[:n])
 
     def add(self, slot: int, change_m: F64, rho: F64) -> None:
         """Bearings were moved, as is right for inverse depths rho (n,) 1/m: they change by change_m (n,2) m more."""

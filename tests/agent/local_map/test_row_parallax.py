@@ -39,21 +39,21 @@ def test_a_landmark_whose_depth_is_found_later_is_where_it_had_been_with_that_de
 
 def test_with_a_global_shutter_nothing_moves() -> None:
     kept = RowParallax(3, N)
-    kept.set(1, None, np.zeros(0))
+    kept.clear(1)
     assert not kept.any
 
 
 def test_a_slot_forgets_its_keyframe() -> None:
     kept, moved = RowParallax(2, N), moved_to_frame(points(0.0), CAMERA, SHUTTER)
     kept.set(1, moved.rows.parallax_m, moved.rows.rho)
-    kept.set(1, None, np.zeros(0))
+    kept.clear(1)
     assert not kept.change(N + np.arange(N), np.ones(N)).any()
 
 
 def test_a_keyframe_that_is_moved_later_keeps_what_its_depths_change() -> None:
     """Its read-out was unknown: its landmarks are where rows showed them, and are moved as if they were far away."""
     kept, shown = RowParallax(2, N), points(0.0)
-    kept.set(0, None, np.zeros(0))
+    kept.clear(0)
     far = SHUTTER.to_frame(shown.uv, np.zeros(N))[:, :2]
     kept.add(0, SHUTTER.parallax_m(shown.uv, np.zeros(N)), np.zeros(N))
     change = kept.change(np.arange(N), np.full(N, 0.4))

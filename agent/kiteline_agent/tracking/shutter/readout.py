@@ -28,13 +28,13 @@ class ReadoutEstimate:
         self._information = self._gradient = 0.0
         self._blocks: list[float] = []  # s by which the read-out in use is too short
         # blocks behind the read-out in use
-        self._used = 0 if sigma_s is None else min(round((_SCATTER_S / sigma_s) ** 2), _KEPT_BLOCKS)
+        self._used = 0 if sigma_s is None else _blocks_behind(sigma_s)
 
     def take(self, readout_s: float, sigma_s: float) -> float:
         """Take a read-out that was found otherwise, and its deviation. Returns the change in s."""
         change = readout_s - self.readout_s
         self.readout_s, self.sigma_s = readout_s, sigma_s
-        self._used = min(round((_SCATTER_S / sigma_s) ** 2), _KEPT_BLOCKS)
+        self._used = _blocks_behind(sigma_s)
         self._information = self._gradient = 0.0
         self._blocks.clear()
         return change
@@ -76,3 +76,8 @@ class ReadoutEstimate:
         self._of_earlier_flight = False
         self._blocks.clear()
         return change
+
+
+def _blocks_behind(sigma_s: float) -> int:
+    """How many blocks tell a read-out as well as its deviation says."""
+    return min(round((_SCATTER_S / sigma_s) ** 2), _KEPT_BLOCKS)
