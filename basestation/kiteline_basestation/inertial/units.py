@@ -13,7 +13,8 @@ _MOST_GROWTH = 1.1  # by which lengths along a map differ from those of its unit
 def units_of(sparse_map: SparseMap, rows: I32, run: int) -> F64:
     """Length (k,) in w of the agent's unit at keyframes in `rows` (k,), by age in each submap.
 
-    One for a whole submap; once accelerations have corrected lengths, the agent's steps from keyframe to keyframe tell
+    One for a whole submap: if it followed the map, nothing would hold lengths, and each bundle would stretch them a
+    little. Once accelerations have corrected lengths, and hold them, the agent's steps from keyframe to keyframe tell
     it, the weighted median of `run` of them, by the lengths that they have in the map now.
     """
     table = sparse_map.keyframes
@@ -22,9 +23,9 @@ def units_of(sparse_map: SparseMap, rows: I32, run: int) -> F64:
     units = np.array([sparse_map.scale(s) for s in submaps])
     place = table.T_w_k[rows, :3, 3]
     for submap in dict.fromkeys(submaps):
-        one, corrected = sparse_map.scale(submap), submap in sparse_map.scaled_submaps
-        if not sparse_map.has_metric_scale_by_imu(submap) or not (corrected or one != 1.0):
+        if submap not in sparse_map.scaled_submaps or not sparse_map.has_metric_scale_by_imu(submap):
             continue
+        one = sparse_map.scale(submap)
         own = [k for k, s in enumerate(submaps) if s == submap]
         steps = [(k, p) for k in own if (p := number.get(int(table.parent[rows[k]]))) is not None]
         if len(steps) < _MIN_RUN:

@@ -303,6 +303,19 @@ def test_median_depths_are_those_of_each_camera_s_disparities() -> None:
         assert depth[k] == pytest.approx(CAMERA.bf / np.median(disparity) if k != 2 else 3.0, rel=1e-9)
 
 
+def test_a_map_with_another_unit_that_no_accelerations_corrected_is_held_to_it() -> None:
+    sparse_map, step = SparseMap(), se3.from_rt(np.eye(3), [0.5, 0.0, 0.0])
+    sparse_map.set_camera(AgentId(0), replace(CAMERA, stereo=False))
+    sparse_map.metric_submaps.add(SUBMAP)
+    keyframes = [keyframe_id(SUBMAP, k) for k in range(12)]
+    for k, keyframe in enumerate(keyframes):
+        sparse_map.add_keyframe(keyframe, k, keyframes[k - 1] if k else NO_KEYFRAME, step if k else np.eye(4), 0)
+    sparse_map.scale_submap(SUBMAP, 0.98)  # a tie to a later submap told the metre
+    rows = np.array([sparse_map.rows[k] for k in keyframes], np.int32)
+    sparse_map.keyframes.T_w_k[rows, 0, 3] *= 1.03  # bundles stretched it
+    assert np.array_equal(units_of(sparse_map, rows, 20), np.full(12, 0.98))
+
+
 def test_where_accelerations_have_corrected_lengths_steps_are_as_long_as_the_map_has_them_now() -> None:
     sparse_map, n, step = SparseMap(), 60, se3.from_rt(np.eye(3), [0.5, 0.0, 0.0])
     sparse_map.set_camera(AgentId(0), replace(CAMERA, stereo=False))
