@@ -59,14 +59,13 @@ class RollingShutter:
         """
         if self.right_grid is None:
             return disparity
-        c, w = self.camera, self.twist[3:]
+        c, v, w = self.camera, self.twist[:3], self.twist[3:]
         right_uv = np.column_stack([uv[:, 0] - disparity, uv[:, 1]])
         dt_s = self._times_s(right_uv, self.right_grid) - self.row_times_s(uv)
         x, y, rho = (right_uv[:, 0] - c.cx) / c.fx, (uv[:, 1] - c.cy) / c.fy, disparity / c.bf
-        v = self.twist[:3] + np.array([0.0, w[2], -w[1]]) * c.baseline_m  # of the right camera
-        # forward in time x falls by this rate
-        rate = w[1] - w[2] * y + v[0] * rho - x * (w[0] * y - w[1] * x + v[2] * rho)
-        return np.where(disparity >= 0.0, disparity - c.fx * rate * dt_s, disparity)
+        right_twist = np.concatenate([v + np.array([0.0, w[2], -w[1]]) * c.baseline_m, w])
+        moved_x, _, _ = moved_back(x, y, rho, right_twist, dt_s)
+        return np.where(disparity >= 0.0, disparity - c.fx * (moved_x - x), disparity)
 
     def row_times_s(self, uv: F64) -> F64:
         """Times (n,) of the rows of pixels (n,2) after the frame's stamp."""
