@@ -109,18 +109,18 @@ def moved_to_frame(
     has_depth = points.disparity > 0.0
     disparity = shutter.at_once(points.uv, points.disparity)
     rho = np.where(has_depth, disparity / camera.bf, 0.0 if rho is None else rho)
-    moved = shutter.to_frame(points.uv, rho)
+    moved, parallax_m = shutter.to_frame_with_parallax(points.uv, rho)
     uv = np.clip(moved[:, :2], 0.0, [camera.width - 1.0, camera.height - 1.0])
     disparity = np.where(has_depth, disparity * moved[:, 2], disparity)
-    rows = RowShift(points.uv - uv, rho, shutter.parallax_m(points.uv, rho))
-    return replace(points, uv=uv, disparity=disparity, rows=rows)
+    return replace(points, uv=uv, disparity=disparity, rows=RowShift(points.uv - uv, rho, parallax_m))
 
 
 def shown_by_rows(points: NewPoints, camera: RectifiedCamera, shutter: RollingShutter) -> NewPoints:
     """Landmarks at the frame's stamp whose depths are known, with where rows show them."""
     rho = points.disparity / camera.bf
     shown = shutter.to_rows(points.uv, rho)[:, :2]
-    return replace(points, rows=RowShift(shown - points.uv, rho, shutter.parallax_m(shown, rho)))
+    _, parallax_m = shutter.to_frame_with_parallax(shown, rho)
+    return replace(points, rows=RowShift(shown - points.uv, rho, parallax_m))
 
 
 def nearby(uv: F64, places: F64, values: F64) -> F64:

@@ -54,10 +54,10 @@ def test_a_keyframe_that_is_moved_later_keeps_what_its_depths_change() -> None:
     """Its read-out was unknown: its landmarks are where rows showed them, and are moved as if they were far away."""
     kept, shown = RowParallax(2, N), points(0.0)
     kept.clear(0)
-    far = SHUTTER.to_frame(shown.uv, np.zeros(N))[:, :2]
-    kept.add(0, SHUTTER.parallax_m(shown.uv, np.zeros(N)), np.zeros(N))
+    far, parallax_m = SHUTTER.to_frame_with_parallax(shown.uv, np.zeros(N))
+    kept.add(0, parallax_m, np.zeros(N))
     change = kept.change(np.arange(N), np.full(N, 0.4))
-    assert far + change * FOCAL == pytest.approx(moved_to_frame(points(0.4), CAMERA, SHUTTER).uv, abs=0.02)
+    assert far[:, :2] + change * FOCAL == pytest.approx(moved_to_frame(points(0.4), CAMERA, SHUTTER).uv, abs=0.02)
 
 
 def test_a_bearing_that_the_base_refined_is_right_for_its_depth() -> None:

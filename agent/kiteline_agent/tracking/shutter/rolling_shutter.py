@@ -47,10 +47,12 @@ class RollingShutter:
         border = np.array([[0.0, 0.0], [w, 0.0], [0.0, h], [w, h], [0.5 * w, 0.0], [0.5 * w, h]])
         return float(np.abs(self.to_frame(border, np.full(len(border), 0.5))[:, :2] - border).max())
 
-    def parallax_m(self, uv: F64, rho: F64) -> F64:
-        """By how much x/z and y/z at the stamp (n,2) change with the inverse depth, of pixels (n,2) that rows show."""
-        near, far = (self.to_frame(uv, rho + step)[:, :2] for step in (_STEP_RHO, 0.0))
-        return np.asarray((near - far) / (_STEP_RHO * np.array([self.camera.fx, self.camera.fy])))
+    def to_frame_with_parallax(self, uv: F64, rho: F64) -> tuple[F64, F64]:
+        """`to_frame`, and by how much x/z and y/z there (n,2) change with the inverse depth, in m."""
+        row_times_s = self.row_times_s(uv)
+        moved, near = (self._moved(uv, rho + step, row_times_s) for step in (0.0, _STEP_RHO))
+        change = (near[:, :2] - moved[:, :2]) / (_STEP_RHO * np.array([self.camera.fx, self.camera.fy]))
+        return moved, np.asarray(change)
 
     def at_once(self, uv: F64, disparity: F64) -> F64:
         """Disparities (n,) of pixels (n,2) as if the right image had been exposed when the left one was; < 0: unknown.

@@ -168,11 +168,11 @@ class ShutterStage:
         by_stereo = m.measured[slot, :n] & m.camera.stereo
         disparity = shutter.at_once(uv, np.where(by_stereo, rho * m.camera.bf, -1.0))
         rho[by_stereo] = disparity[by_stereo] / m.camera.bf
-        moved = shutter.to_frame(uv, rho)
+        moved, parallax_m = shutter.to_frame_with_parallax(uv, rho)
         rho[by_stereo] *= moved[by_stereo, 2]
         m.uv[slot, :n] = moved[:, :2]
         m.bearing[slot, :n] += (moved[:, :2] - uv) / m.intrinsics[:2]
-        m.row_parallax.add(slot, shutter.parallax_m(uv, rho), rho)
+        m.row_parallax.add(slot, parallax_m, rho)
         m.rolled[slot] = False
 
     def _shutter(self, readout_s: float, twist: F64) -> RollingShutter:
