@@ -78,7 +78,7 @@ class _Solved:
 class _Imu:
     """Samples of a window, and what is known of the IMU before it: biases and time offset. clock: of the frames.
 
-    rows: of the camera's shutter; None: nothing is known of it.
+    rows: of a rolling shutter; None: of a global one, or of one of which nothing is known.
     """
 
     samples: WindowSamples
@@ -86,11 +86,6 @@ class _Imu:
     offset: TimeOffset
     clock: FrameClock
     rows: RollingRows | None
-
-    @property
-    def rolling(self) -> RollingRows | None:
-        """The rows, if their times count."""
-        return self.rows if self.rows is not None and self.rows.rolls else None
 
 
 class InertialStart:
@@ -265,11 +260,14 @@ class InertialStart:
         self._tried_ns = ctx.t_ns
         prior = self._default_prior() if imu.bias is None else imu.bias
         rows = None
-        if self._shutter is not None:
-            offset = imu.offset if self._before is None else self._before.solution.offset
-            rates, stamps_s = samples.rates(offset.offset_s), 1e-9 * (np.array(times_ns) - times_ns[0])
-            rows = RollingRows(stamps_s, rates, self._shutter.at_rest)
+        if self._shutter is not None and self._shutter.rolls:
+            rows = self._rows(samples, imu.offset, self._shutter)
         return self._attempting(ctx, keyframes, _Imu(samples, prior, imu.offset, imu.clock, rows))
+
+    def _rows(self, samples: WindowSamples, offset: TimeOffset, shutter: ShutterStage) -> RollingRows:
+        """Rows of the shutter in a window. offset: where no window before this one tells it."""
+        offset = offset if self._before is None else self._before.solution.offset
+        return RollingRows(samples.stamps_s, samples.rates(offset.offset_s), shutter.at_rest)
 
     def _attempting(
         self, ctx: FrameContext, keyframes: list[TrackedKeyframe], imu: _Imu
@@ -300,7 +298,7 @@ class InertialStart:
         if joint_sigma(sigma, length) < _NEARLY * _SCALE_SIGMA:
             self._work.alignments += int(np.count_nonzero(observations.seen))
             aligned = realigned(
-                keyframes, observations, solution.state, found.xyz, found.first, self._camera, imu.rolling
+                keyframes, observations, solution.state, found.xyz, found.first, self._camera, imu.rows
             )
             all_corners = corner_tracks.with_found(all_corners, columns, aligned)
             yield
@@ -339,7 +337,7 @@ class InertialStart:
         self._lens_info = np.asarray(np.linalg.inv(solution.lens_cov), np.float64)
         lens = solution.state.lens
         accel_noise = noise.accel * max(self._noise.level_now, 1.0)
-        shutters = self._shutters(solution, imu.rolling)
+        shutters = self._shutters(solution, imu.rows)
         if shutters:
             ctx, points = replace(ctx, shutter=shutters[-1]), points.at_frame(shutters[-1], self._camera)
         return InertialMap(
@@ -355,11 +353,11 @@ class InertialStart:
 
     def _finds_readout(self, found: _Solved, corners: CornerObservations, imu: _Imu) -> InParts[bool]:
         """True if this window tells the read-out of a rolling shutter. A map waits until the next one confirms it."""
-        if self._shutter is None or imu.rows is None or not (self._shutter.is_unknown and found.solution.fits):
+        if self._shutter is None or not (self._shutter.is_unknown and found.solution.fits):
             return False
         asking = self._readout.asking(
-            found.bundle, found.solution, lambda rows: self._bundle(corners, replace(imu, rows=rows)), imu.rows,
-            self._config.inertial_start.bundle.sigma_px,
+            found.bundle, found.solution, lambda rows: self._bundle(corners, replace(imu, rows=rows)),
+            self._rows(imu.samples, imu.offset, self._shutter), self._config.inertial_start.bundle.sigma_px,
         )  # fmt: skip
         told = yield from self._counted(asking, len(corners.seen))
         if told is None:
@@ -416,7 +414,7 @@ class InertialStart:
         return InertialBundle(
             corners, imu.samples.at, self._calibration, self._camera.T_b_c, self._camera.fx,
             self._config.inertial.gravity_m_s2, imu.prior, self._config.inertial_start.bundle,
-            self._noise.now, self._lens_info, imu.offset, length, imu.rolling,
+            self._noise.now, self._lens_info, imu.offset, length, imu.rows,
         )  # fmt: skip
 
     def _default_prior(self) -> BiasPrior:

@@ -17,11 +17,6 @@ class RollingRows:
     rate: F64
     shutter: RollingShutter
 
-    @property
-    def rolls(self) -> bool:
-        """False for a global shutter."""
-        return self.shutter.readout_s != 0.0
-
     def with_readout(self, readout_s: float) -> "RollingRows":
         """The same with another read-out."""
         return replace(self, shutter=replace(self.shutter, readout_s=readout_s))

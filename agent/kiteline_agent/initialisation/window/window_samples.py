@@ -35,6 +35,11 @@ class WindowSamples:
         late = self._buffer.lacks(self._stamps_ns[-1] + round(offset_s * 1e9))
         return [*complete[:-1], without_held(complete[-1])] if late else complete
 
+    @property
+    def stamps_s(self) -> F64:
+        """(K,) the camera's stamps after the first one."""
+        return 1e-9 * (np.array(self._stamps_ns) - self._stamps_ns[0])
+
     def rates(self, offset_s: float) -> F64:
         """Angular velocity (K,3) rad/s by the gyro, with its bias, in the body at each stamp; NaN without samples."""
         out = np.full((len(self._stamps_ns), 3), np.nan)

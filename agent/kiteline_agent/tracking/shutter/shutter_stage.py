@@ -70,6 +70,11 @@ class ShutterStage:
         return self._shutter(self._estimate.readout_s, np.zeros(6))
 
     @property
+    def rolls(self) -> bool:
+        """True if a read-out is known: rows are exposed at times of their own."""
+        return self._estimate.readout_s != 0.0
+
+    @property
     def is_unknown(self) -> bool:
         """True if neither a calibration nor a flight has told a read-out, and one is looked for."""
         return self._estimated and self._estimate.sigma_s is None
@@ -81,7 +86,7 @@ class ShutterStage:
     def motion(self, t_ns: int, dt_s: float) -> RollingShutter | None:
         """The rolling shutter's motion in a frame; None for a global shutter, and while the motion is unknown."""
         self._measured = None
-        twist = self._twist(t_ns, dt_s) if self._estimate.readout_s != 0.0 and dt_s > 0.0 else None
+        twist = self._twist(t_ns, dt_s) if self.rolls and dt_s > 0.0 else None
         if twist is None:
             self._motion_known = False
             return None
@@ -126,10 +131,10 @@ class ShutterStage:
 
     def end_frame(self, t_ns: int) -> None:
         """Note stamp and motion of this frame's image, if a keyframe was made of it."""
-        if self._estimated or self._estimate.readout_s != 0.0:
+        if self._estimated or self.rolls:
             new = self._map.keyframe != self._keyframe
             if new.any():
-                known = self._measured is not None and (self._estimate.readout_s == 0.0 or self._motion_known)
+                known = self._measured is not None and (self._motion_known or not self.rolls)
                 self._twists[new] = self._measured if known else np.nan
                 self._keyframe_ns[new] = t_ns
                 self._keyframe[new] = self._map.keyframe[new]
