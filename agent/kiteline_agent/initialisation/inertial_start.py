@@ -75,17 +75,24 @@ class _Solved:
 
 
 @dataclass(frozen=True, slots=True)
-class _Imu:
-    """Samples of a window, and what is known of the IMU before it: biases and time offset. clock: of the frames.
+class _Window:
+    """Keyframes that are solved for together, samples of the IMU between them, and what is known before.
 
-    rows: of a rolling shutter; None: of a global one, or of one of which nothing is known.
+    prior: of the IMU's biases. offset: of time between camera and IMU. clock: of the frames. rows: of a rolling
+    shutter; None: of a global one, or of one of which nothing is known.
     """
 
+    keyframes: tuple[TrackedKeyframe, ...]
     samples: WindowSamples
     prior: BiasPrior
     offset: TimeOffset
     clock: FrameClock
     rows: RollingRows | None
+
+    @property
+    def t_ns(self) -> tuple[int, ...]:
+        """Stamps of the keyframes."""
+        return tuple(k.t_ns for k in self.keyframes)
 
 
 class InertialStart:
@@ -244,7 +251,7 @@ class InertialStart:
 
     def _begin(self, ctx: FrameContext, imu: ImuPrior) -> InParts[InertialMap | None] | None:
         """An attempt with the window that ends with this keyframe; None while none is due."""
-        config, keyframes = self._config.inertial_start, list(self._tracks.keyframes)
+        config, keyframes = self._config.inertial_start, tuple(self._tracks.keyframes)
         span_s = (ctx.t_ns - keyframes[0].t_ns) * 1e-9
         wait_s = max(_ATTEMPT_S, _ATTEMPT_SHARE * span_s, _BEHIND_SHARE * self.waiting.span_s)
         waited = self._tried_ns is None or (ctx.t_ns - self._tried_ns) * 1e-9 >= wait_s
@@ -262,35 +269,33 @@ class InertialStart:
         rows = None
         if self._shutter is not None and self._shutter.rolls:
             rows = self._rows(samples, imu.offset, self._shutter)
-        return self._attempting(ctx, keyframes, _Imu(samples, prior, imu.offset, imu.clock, rows))
+        return self._attempting(ctx, _Window(keyframes, samples, prior, imu.offset, imu.clock, rows))
 
     def _rows(self, samples: WindowSamples, offset: TimeOffset, shutter: ShutterStage) -> RollingRows:
         """Rows of the shutter in a window. offset: where no window before this one tells it."""
         offset = offset if self._before is None else self._before.solution.offset
         return RollingRows(samples.stamps_s, samples.rates(offset.offset_s), shutter.at_rest)
 
-    def _attempting(
-        self, ctx: FrameContext, keyframes: list[TrackedKeyframe], imu: _Imu
-    ) -> InParts[InertialMap | None]:
+    def _attempting(self, ctx: FrameContext, window: _Window) -> InParts[InertialMap | None]:
         """Solve the window; align its landmarks again and solve it once more when the scale seems to be known."""
         all_corners = self._tracks.observations()
         if len(all_corners.ids) < self._config.local_map.first_points:
             return None
         columns = corner_tracks.covering(all_corners, _LANDMARKS, _LANDMARKS_EACH)
         observations = all_corners.part(columns)
-        before, stamps = self._before, tuple(k.t_ns for k in keyframes)
-        self._noise.measure(imu.samples.at(imu.offset.offset_s) or [], self._buffer.density[0])
+        before, stamps = self._before, window.t_ns
+        self._noise.measure(window.samples.at(window.offset.offset_s) or [], self._buffer.density[0])
         warm = None if before is None else before.warm_start(stamps, observations.ids)
-        found = None if warm is None else (yield from self._solve(observations, imu, warm))
+        found = None if warm is None else (yield from self._solve(observations, window, warm))
         if found is None or not found.solution.fits:
-            warm, found = None, (yield from self._solve(observations, imu, None))
+            warm, found = None, (yield from self._solve(observations, window, None))
         if found is None:
-            self._doubt(imu.clock)
+            self._doubt(window.clock)
             self._before = None
             wrong_turns = self._structure_px > _STRUCTURE_PX
             self._note_contradiction(ctx.t_ns, contradicts=True if wrong_turns else None)
             return None
-        if (yield from self._finds_readout(found, observations, imu)):
+        if (yield from self._finds_readout(found, observations, window)):
             return None
         solution, modelled = found.solution, self._noise.now
         noise, sigma = self._noise.seen(solution)
@@ -298,15 +303,15 @@ class InertialStart:
         if joint_sigma(sigma, length) < _NEARLY * _SCALE_SIGMA:
             self._work.alignments += int(np.count_nonzero(observations.seen))
             aligned = realigned(
-                keyframes, observations, solution.state, found.xyz, found.first, self._camera, imu.rows
+                window.keyframes, observations, solution.state, found.xyz, found.first, self._camera, window.rows
             )
             all_corners = corner_tracks.with_found(all_corners, columns, aligned)
             yield
             keep = aligned.seen.sum(axis=0) >= _MIN_VIEWS
             self._noise.now = noise
-            again = self._bundle(aligned.part(keep), imu, length)
+            again = self._bundle(aligned.part(keep), window, length)
             warmer = WarmStart(solution.state, found.xyz[keep])
-            solution = (yield from self._counted(again.solving(warmer), len(keyframes))) or solution
+            solution = (yield from self._counted(again.solving(warmer), len(window.keyframes))) or solution
             noise, sigma = self._noise.seen(solution)
         self._before = SolvedWindow(stamps, observations.ids, found.xyz, solution)
         (wrong, by_imu), fits = self._contradicts(solution, noise), solution.converged and solution.fits
@@ -314,34 +319,34 @@ class InertialStart:
             self._contradiction.note_lengths(sigma, _SCALE_SIGMA, self._noise.vibration_m_s2)
         self._note_contradiction(ctx.t_ns, contradicts=wrong if wrong or fits else None, by_imu=by_imu)
         if not fits:
-            self._doubt(imu.clock)
+            self._doubt(window.clock)
         known = fits and sigma < _SCALE_SIGMA and not wrong
         agrees = before is not None and before.lengths_apart(self._before) < _AGREEMENT  # later frames confirm it
         self._noise.now = modelled
         if known and agrees and warm is not None:
-            if not (yield from self._is_lowest(found, observations, imu)):
+            if not (yield from self._is_lowest(found, observations, window)):
                 return None
         self._noise.now = noise
         if not known or not agrees:
             return None
-        bundle = self._bundle(all_corners, imu)
-        placed = yield from self._counted(bundle.placing_landmarks(solution.state), len(keyframes))
+        bundle = self._bundle(all_corners, window)
+        placed = yield from self._counted(bundle.placing_landmarks(solution.state), len(window.keyframes))
         points = None if placed is None else window_points(ctx, all_corners, placed, self._camera)
         if points is None or len(points.sigma_rho) < self._config.local_map.first_points:
             self._tried_ns = None  # the next keyframe may see more of the landmarks
             return None
         if self._by_stamps:
-            imu.clock.refute()
+            window.clock.refute()
         cov = _STATE_INFLATION**2 * solution.cov
         duration_s = (stamps[-1] - stamps[0]) * 1e-9
         self._lens_info = np.asarray(np.linalg.inv(solution.lens_cov), np.float64)
         lens = solution.state.lens
         accel_noise = noise.accel * max(self._noise.level_now, 1.0)
-        shutters = self._shutters(solution, imu.rows)
+        shutters = self._shutters(solution, window.rows)
         if shutters:
             ctx, points = replace(ctx, shutter=shutters[-1]), points.at_frame(shutters[-1], self._camera)
         return InertialMap(
-            ctx, points, solution, cov, solution.scale_sigma, duration_s, accel_noise, lens, tuple(keyframes),
+            ctx, points, solution, cov, solution.scale_sigma, duration_s, accel_noise, lens, window.keyframes,
             all_corners, shutters,
         )  # fmt: skip
 
@@ -351,13 +356,13 @@ class InertialStart:
             return ()
         return tuple(replace(rows.shutter, twist=twist) for twist in rows.twists(solution.state, self._camera.T_b_c))
 
-    def _finds_readout(self, found: _Solved, corners: CornerObservations, imu: _Imu) -> InParts[bool]:
+    def _finds_readout(self, found: _Solved, corners: CornerObservations, window: _Window) -> InParts[bool]:
         """True if this window tells the read-out of a rolling shutter. A map waits until the next one confirms it."""
         if self._shutter is None or not (self._shutter.is_unknown and found.solution.fits):
             return False
         asking = self._readout.asking(
-            found.bundle, found.solution, lambda rows: self._bundle(corners, replace(imu, rows=rows)),
-            self._rows(imu.samples, imu.offset, self._shutter), self._config.inertial_start.bundle.sigma_px,
+            found.bundle, found.solution, lambda rows: self._bundle(corners, replace(window, rows=rows)),
+            self._rows(window.samples, window.offset, self._shutter), self._config.inertial_start.bundle.sigma_px,
         )  # fmt: skip
         told = yield from self._counted(asking, len(corners.seen))
         if told is None:
@@ -370,8 +375,8 @@ class InertialStart:
         """Place the frames of the next window otherwise: by the camera's rate, or by their stamps."""
         self._by_stamps = clock.jitter_s > 0.0 and not self._by_stamps
 
-    def _solve(self, corners: CornerObservations, imu: _Imu, warm: WarmStart | None) -> InParts[_Solved | None]:
-        bundle = self._bundle(corners, imu)
+    def _solve(self, corners: CornerObservations, window: _Window, warm: WarmStart | None) -> InParts[_Solved | None]:
+        bundle = self._bundle(corners, window)
         solution = yield from self._counted(bundle.solving(warm), len(corners.seen))
         self._structure_px = bundle.structure_px
         return None if solution is None else _Solved(solution, bundle, *bundle.landmarks_of(solution.state))
@@ -386,12 +391,12 @@ class InertialStart:
                 return end.value  # type: ignore[no-any-return]
             yield
 
-    def _is_lowest(self, found: _Solved, corners: CornerObservations, imu: _Imu) -> InParts[bool]:
+    def _is_lowest(self, found: _Solved, corners: CornerObservations, window: _Window) -> InParts[bool]:
         """True if a solution from nothing has no lower cost, or the same scale.
 
         A warm start may stay in a wrong minimum. If so, the other solution is the one to start from.
         """
-        cold = yield from self._solve(corners, imu, None)
+        cold = yield from self._solve(corners, window, None)
         if cold is None or cold.solution.cost > found.solution.cost - _LOWER_COST:
             return True
         apart = lengths_apart(found.solution.state.p, cold.solution.state.p)
@@ -410,11 +415,13 @@ class InertialStart:
     def _note_contradiction(self, t_ns: int, *, contradicts: bool | None, by_imu: bool = True) -> None:
         self._warnings += self._contradiction.note(t_ns, contradicts=contradicts, by_imu=by_imu)
 
-    def _bundle(self, corners: CornerObservations, imu: _Imu, length: KnownLength | None = None) -> InertialBundle:
+    def _bundle(
+        self, corners: CornerObservations, window: _Window, length: KnownLength | None = None
+    ) -> InertialBundle:
         return InertialBundle(
-            corners, imu.samples.at, self._calibration, self._camera.T_b_c, self._camera.fx,
-            self._config.inertial.gravity_m_s2, imu.prior, self._config.inertial_start.bundle,
-            self._noise.now, self._lens_info, imu.offset, length, imu.rows,
+            corners, window.samples.at, self._calibration, self._camera.T_b_c, self._camera.fx,
+            self._config.inertial.gravity_m_s2, window.prior, self._config.inertial_start.bundle,
+            self._noise.now, self._lens_info, window.offset, length, window.rows,
         )  # fmt: skip
 
     def _default_prior(self) -> BiasPrior:

@@ -3,6 +3,8 @@
 Optical flow drifts from keyframe to keyframe; an alignment with one template, warped by the geometry, does not.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from kiteline_agent.imaging import alignment_kernels
@@ -23,7 +25,7 @@ _MAX_SCALE = 3.0  # of areas
 
 
 def realigned(
-    keyframes: list[TrackedKeyframe], observations: CornerObservations, state: WindowState, xyz: F64, first: I64,
+    keyframes: Sequence[TrackedKeyframe], observations: CornerObservations, state: WindowState, xyz: F64, first: I64,
     camera: RectifiedCamera, rolling: RollingRows | None = None,
 ) -> CornerObservations:  # fmt: skip
     """Observations by alignment. xyz: (P,3) m landmarks in w. first: (P,) keyframe that saw each first.
@@ -68,7 +70,7 @@ def realigned(
     return CornerObservations(xy, seen, observations.ids)
 
 
-def _templates(keyframes: list[TrackedKeyframe], uv: F64, first: I64) -> U8:
+def _templates(keyframes: Sequence[TrackedKeyframe], uv: F64, first: I64) -> U8:
     """Templates (P,3,21,21) of the landmarks, each from the keyframe that saw it first, there at uv (P,2)."""
     templates = np.zeros((len(uv), TEMPLATE_LEVELS, TEMPLATE, TEMPLATE), np.uint8)
     for k, keyframe in enumerate(keyframes):

@@ -211,7 +211,7 @@ def test_a_window_begins_after_the_samples_that_are_missing(monkeypatch: pytest.
     )  # fmt: skip
     start.add_samples(ctx)
     solved: list[int] = []
-    monkeypatch.setattr(start, "_attempting", lambda _ctx, keyframes, *_: iter([solved.append(len(keyframes))]))
+    monkeypatch.setattr(start, "_attempting", lambda _ctx, window: iter([solved.append(len(window.keyframes))]))
     start.add(ctx, EXACT)
     assert [k.t_ns for k in start._tracks.keyframes] == [250_000_000 * k for k in range(3, 20)]  # 0.5 s are bridged
     start.add(ctx, EXACT)
