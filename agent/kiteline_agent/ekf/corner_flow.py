@@ -12,7 +12,7 @@ from kiteline_agent.imaging import alignment_kernels, features, optical_flow
 from kiteline_agent.imaging.alignment_kernels import ALIGN_ITERATIONS, MIN_NCC, TEMPLATE, TEMPLATE_LEVELS
 from kiteline_agent.imaging.features import DetectorConfig, Pyramid
 from kiteline_agent.imaging.optical_flow import Flow
-from kiteline_agent.tracking.frame_images import NO_GRID
+from kiteline_agent.imaging.raw_grid import NO_GRID
 from kiteline_core.arrays import F64, I64, U8, Bool
 from kiteline_core.geometry.cameras import RectifiedCamera
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from kiteline_agent.imaging import row_kernels
+from kiteline_agent.imaging.raw_grid import grid_for_kernels
 from kiteline_core.arrays import F64, U8
 from kiteline_core.geometry.cameras import Rectifier
 
@@ -89,13 +90,13 @@ class RowAlignment:
 
         left: rectified pyramid; right: raw. disparity: as measured.
         """
-        config, grid = self._config, self._rectifier.right_grid
+        config = self._config
         if not config.on:
             return 0
         offset, found = np.zeros(len(uv)), np.zeros(len(uv), np.bool_)
         row_kernels.measure_rows(
-            left, right, np.zeros((0, 0, 2), np.float32) if grid is None else grid, uv, octave, disparity,
-            _ITERATIONS, _MAX_PX, _MIN_NCC, offset, found,
+            left, right, grid_for_kernels(self._rectifier.right_grid), uv, octave, disparity, _ITERATIONS, _MAX_PX,
+            _MIN_NCC, offset, found,
         )  # fmt: skip
         count = int(np.count_nonzero(found))
         if count < _MIN_POINTS:

@@ -9,11 +9,11 @@ import numpy as np
 
 from kiteline_agent.imaging import alignment_kernels
 from kiteline_agent.imaging.alignment_kernels import ALIGN_ITERATIONS, MIN_NCC, TEMPLATE, TEMPLATE_LEVELS
+from kiteline_agent.imaging.raw_grid import NO_GRID
 from kiteline_agent.initialisation.corner_tracks import CornerObservations, TrackedKeyframe
 from kiteline_agent.initialisation.window import lens_correction
 from kiteline_agent.initialisation.window.rolling_rows import RollingRows, shifts
 from kiteline_agent.initialisation.window.window_state import WindowState
-from kiteline_agent.tracking.frame_images import NO_GRID
 from kiteline_core.arrays import F64, I64, U8
 from kiteline_core.geometry.cameras import RectifiedCamera
 

@@ -12,13 +12,14 @@ from kiteline_agent.governor.cost_model import Work
 from kiteline_agent.imaging import alignment_kernels, features
 from kiteline_agent.imaging.alignment_kernels import ALIGN_ITERATIONS, FINE_STEP_PX, MIN_NCC
 from kiteline_agent.imaging.optical_flow import Flow
+from kiteline_agent.imaging.raw_grid import NO_GRID
 from kiteline_agent.initialisation.frame_flow import FrameFlow
 from kiteline_agent.initialisation.two_view import MIN_POINTS, two_view
 from kiteline_agent.keyframes.depth_from_motion import triangulated_sigma
 from kiteline_agent.keyframes.new_landmarks import NewPoints
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.tracking.frame_context import FrameContext
-from kiteline_agent.tracking.frame_images import NO_GRID, FrameImages
+from kiteline_agent.tracking.frame_images import FrameImages
 from kiteline_agent.tracking.pose_state import scaled
 from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3

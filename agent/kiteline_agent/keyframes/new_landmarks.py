@@ -6,7 +6,8 @@ import numpy as np
 
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.imaging import features, stereo_kernels
-from kiteline_agent.tracking.frame_images import NO_GRID, FrameImages, depth_at
+from kiteline_agent.imaging.raw_grid import NO_GRID
+from kiteline_agent.tracking.frame_images import FrameImages, depth_at
 from kiteline_agent.tracking.shutter.rolling_shutter import RollingShutter
 from kiteline_core.arrays import F64, I64, U8, Bool
 from kiteline_core.geometry.cameras import RectifiedCamera

@@ -11,6 +11,7 @@ from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_agent.imaging.alignment_kernels import TEMPLATE, TEMPLATE_LEVELS
 from kiteline_agent.imaging.epipolar_kernels import search_segments
 from kiteline_agent.imaging.features import build_pyramid
+from kiteline_agent.imaging.raw_grid import NO_GRID
 from kiteline_agent.initialisation.two_view import two_view
 from kiteline_agent.initialisation.window.window_kernels import add_observations
 from kiteline_agent.keyframes.seed_kernels import intersect, seed_segments
@@ -20,7 +21,6 @@ from kiteline_agent.scans.local_grid import LocalGrid
 from kiteline_agent.scans.range_error import RangeError
 from kiteline_agent.scans.scan_stage import Scanned
 from kiteline_agent.step import Identity, StepInput
-from kiteline_agent.tracking.frame_images import NO_GRID
 from kiteline_agent.tracking.shutter.readout_kernels import readout_equation
 from kiteline_core.arrays import F64, U8
 from kiteline_core.frame import Frame, ImuBatch, ImuCalibration

@@ -9,18 +9,13 @@ import numpy as np
 from kiteline_agent.config import PyramidConfig
 from kiteline_agent.imaging import stereo_kernels
 from kiteline_agent.imaging.features import Pyramid, build_pyramid
+from kiteline_agent.imaging.raw_grid import NO_GRID, grid_for_kernels
 from kiteline_core.arrays import F32, F64, U8, Bool
 from kiteline_core.frame import Frame
 from kiteline_core.geometry.cameras import Rectifier
 
-NO_GRID = np.zeros((0, 0, 2), np.float32)  # the image needs no rectification
 _MIN_NCC = 0.85  # correlation of the two patches; lower at occlusions and depth edges
 _ITERATIONS = 6  # Gauss-Newton steps; it converges in 3
-
-
-def grid_for_kernels(grid: F32 | None) -> F32:
-    """A rectifier's grid of raw pixels (h,w,2) as kernels take it: NO_GRID where it has none."""
-    return NO_GRID if grid is None else grid
 
 
 class RightImage:
@@ -90,7 +85,7 @@ class RightImage:
 class FrameImages:
     """Images of one frame.
 
-    sampled: pyramid of the left one: rectified, or raw where `grid` is its grid of raw pixels and not (0,0,2).
+    sampled: pyramid of the left one: rectified, or raw where `grid` is its grid of raw pixels and not NO_GRID.
     depth_m: (h,w) float32 aligned with left, or None. first: finest level in use. rectifier: of raw images.
     """
 
@@ -123,10 +118,9 @@ class FrameImages:
         return self.left if self.rectifier is None else (self.left[0], *self._halves(self.rectifier))
 
     def rectified_by(self, rectifier: Rectifier) -> "FrameImages":
-        """The same frame, read through a rectifier that has changed."""
-        grid = rectifier.left_grid
-        used = None if grid is None else rectifier
-        return FrameImages(self.sampled, self.right, self.depth_m, self.first, grid_for_kernels(grid), used)
+        """The same frame, read through a rectifier after `correct_left`."""
+        assert rectifier.left_grid is not None
+        return FrameImages(self.sampled, self.right, self.depth_m, self.first, rectifier.left_grid, rectifier)
 
     def raw_half(self) -> U8:
         """Level 1 of the left image as it came."""

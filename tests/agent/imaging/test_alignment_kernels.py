@@ -6,7 +6,7 @@ import pytest
 
 from kiteline_agent.imaging import alignment_kernels as kernels
 from kiteline_agent.imaging.features import build_pyramid
-from kiteline_agent.tracking.frame_images import NO_GRID
+from kiteline_agent.imaging.raw_grid import NO_GRID
 from kiteline_core.arrays import F64, U8, Bool
 from kiteline_core.geometry.cameras import CameraModel, CameraRig, Lens, Rectifier
 from tests.core.helpers_from_python import from_python

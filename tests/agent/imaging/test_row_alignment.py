@@ -9,12 +9,12 @@ import pytest
 
 from kiteline_agent.imaging import row_kernels
 from kiteline_agent.imaging.features import build_pyramid
+from kiteline_agent.imaging.raw_grid import grid_for_kernels
 from kiteline_agent.imaging.row_alignment import RowAlignment, RowConfig, terms
 from kiteline_core.arrays import F64, U8, Bool
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraModel, CameraRig, Lens, Rectifier
 
-NO_GRID = np.zeros((0, 0, 2), np.float32)
 LEVELS = 4  # as in flights: kernels are compiled for each number of levels
 WIDTH, HEIGHT, FOCAL, DEPTH_M = 640, 400, 420.0, 3.0
 T_C_R = se3.from_rt(np.eye(3), np.array([0.11, 0.0, 0.0]))
@@ -63,7 +63,7 @@ def flight(lens: Lens, turned: F64) -> tuple[Rectifier, U8, U8]:
 def measured(rectifier: Rectifier, left: U8, right: U8) -> tuple[F64, Bool]:
     """Row offsets of UV."""
     eyes = [build_pyramid(eye, LEVELS) for eye in (rectifier.left(left), right)]
-    grid = NO_GRID if rectifier.right_grid is None else rectifier.right_grid
+    grid = grid_for_kernels(rectifier.right_grid)
     disparity = np.full(len(UV), rectifier.camera.bf / DEPTH_M)
     offset, found = np.zeros(len(UV)), np.zeros(len(UV), np.bool_)
     octave = np.zeros(len(UV), np.uint8)

@@ -8,6 +8,7 @@ from scipy.ndimage import map_coordinates
 from kiteline_agent.imaging import alignment_kernels, slant_kernels
 from kiteline_agent.imaging.alignment_kernels import PATCH, PATCH_RADIUS, TEMPLATE, TEMPLATE_LEVELS
 from kiteline_agent.imaging.features import build_pyramid
+from kiteline_agent.imaging.raw_grid import NO_GRID
 from kiteline_agent.local_map import projection_kernels
 from kiteline_core.arrays import F64, U8
 from kiteline_core.geometry import se3
@@ -16,7 +17,6 @@ from kiteline_core.geometry.cameras import CameraModel, CameraRig, Lens, Rectifi
 F = 300.0
 CAMERA = np.array([F, F, 160.0, 120.0, 30.0])
 SHAPE = (240, 320)
-RECTIFIED = np.zeros((0, 0, 2), np.float32)
 UV = np.array([[float(x), float(y)] for y in range(50, 200, 18) for x in range(50, 280, 18)])
 LEVELS = 4
 NORMAL = np.array([0.12, -0.25, 0.2])  # of the plane NORMAL X = 1 in the first camera
@@ -68,7 +68,7 @@ class Views:
         warp, _ = self.seen_with(slant)
         uv, found, ncc = self.true_uv.copy(), np.zeros(self.n, np.bool_), np.zeros(self.n)
         alignment_kernels.align(
-            self.second, RECTIFIED, self.templates, np.arange(self.n), self.octave, warp, uv, 0, 0, 8, 3.0, 0.6,
+            self.second, NO_GRID, self.templates, np.arange(self.n), self.octave, warp, uv, 0, 0, 8, 3.0, 0.6,
             found, ncc,
         )  # fmt: skip
         return uv, found
@@ -77,7 +77,7 @@ class Views:
         warp, parallax = self.seen_with(slant)
         out = np.empty((self.n, 5))
         slant_kernels.measure_slants(
-            self.second, RECTIFIED, self.templates, np.arange(self.n), self.octave, warp, parallax, uv, F, F, 1.0,
+            self.second, NO_GRID, self.templates, np.arange(self.n), self.octave, warp, parallax, uv, F, F, 1.0,
             out,
         )  # fmt: skip
         return out
@@ -164,7 +164,7 @@ def test_nothing_is_measured_without_parallax_or_texture_or_at_the_border() -> N
     views.templates[2] = 90
     out = np.empty((views.n, 5))
     slant_kernels.measure_slants(
-        views.second, RECTIFIED, views.templates, np.arange(views.n), views.octave, warp, parallax, uv, F, F, 1.0,
+        views.second, NO_GRID, views.templates, np.arange(views.n), views.octave, warp, parallax, uv, F, F, 1.0,
         out,
     )  # fmt: skip
     assert (out[:3] == 0.0).all() and (out[3:, 0] > 0.0).mean() > 0.9
@@ -211,7 +211,7 @@ def test_contrast_and_focal_lengths_change_equations_as_they_change_shears() -> 
     warp, parallax = views.seen_with(flat)
     longer = np.empty((views.n, 5))
     slant_kernels.measure_slants(
-        views.second, RECTIFIED, views.templates, np.arange(views.n), views.octave, warp, parallax, uv, F, 2.0 * F,
+        views.second, NO_GRID, views.templates, np.arange(views.n), views.octave, warp, parallax, uv, F, 2.0 * F,
         1.0, longer,
     )  # fmt: skip
     np.testing.assert_allclose(longer, dim * [1.0, 0.5, 0.25, 1.0, 0.5], rtol=1e-9)

@@ -5,12 +5,12 @@ import numpy as np
 
 from kiteline_agent.imaging import stereo_kernels
 from kiteline_agent.imaging.features import build_pyramid
+from kiteline_agent.imaging.raw_grid import NO_GRID
 from kiteline_core.arrays import U8
 from kiteline_core.geometry.cameras import CameraModel, CameraRig, Lens, Rectifier
 from kiteline_core.geometry.se3 import from_rt, so3_exp
 
 RADIUS = stereo_kernels.RADIUS
-RECTIFIED = np.zeros((0, 0, 2), np.float32)
 LEVELS = 4  # as in flights: kernels are compiled for each number of levels
 
 
@@ -39,9 +39,7 @@ def test_search_then_refinement_recover_the_disparity() -> None:
         found_px, found = np.empty(len(UV)), np.zeros(len(UV), np.bool_)
         stereo_kernels.search_rows(left, right, UV, octave, 80.0, 1.15, found_px)
         assert (found_px >= 0).mean() > 0.9
-        stereo_kernels.refine_rows(
-            left, RECTIFIED, right, RECTIFIED, UV, octave, SURE, FLAT, 6, 3.0, 0.85, found_px, found
-        )
+        stereo_kernels.refine_rows(left, NO_GRID, right, NO_GRID, UV, octave, SURE, FLAT, 6, 3.0, 0.85, found_px, found)
         assert found.mean() > 0.85
         assert abs(np.median(found_px[found]) - disparity) < 0.04
         assert np.percentile(np.abs(found_px[found] - disparity), 90) < 0.15
@@ -81,7 +79,7 @@ def test_unrelated_rows_are_not_refined() -> None:
     _, right = pair(8, 10.0)
     guess, found = np.full(len(UV), 10.0), np.zeros(len(UV), np.bool_)
     stereo_kernels.refine_rows(
-        build_pyramid(left, LEVELS), RECTIFIED, build_pyramid(right, LEVELS), RECTIFIED, UV,
+        build_pyramid(left, LEVELS), NO_GRID, build_pyramid(right, LEVELS), NO_GRID, UV,
         np.zeros(len(UV), np.uint8), SURE, FLAT, 6, 3.0, 0.85, guess, found,
     )  # fmt: skip
     assert found.mean() < 0.05
@@ -97,11 +95,11 @@ def test_strips_of_the_raw_image_say_what_the_rectified_one_says() -> None:
     octave = (np.arange(len(UV)) % 2).astype(np.uint8)
     results = []
     for right, grid in (
-        (build_pyramid(rectifier.right(raw_right), LEVELS), RECTIFIED),
+        (build_pyramid(rectifier.right(raw_right), LEVELS), NO_GRID),
         (build_pyramid(raw_right, LEVELS), rectifier.right_grid),
     ):
         guess, found = np.full(len(UV), 12.0), np.zeros(len(UV), np.bool_)
-        stereo_kernels.refine_rows(left, RECTIFIED, right, grid, UV, octave, SURE, FLAT, 6, 3.0, 0.8, guess, found)
+        stereo_kernels.refine_rows(left, NO_GRID, right, grid, UV, octave, SURE, FLAT, 6, 3.0, 0.8, guess, found)
         results.append((guess, found))
     (whole, whole_found), (strips, strips_found) = results
     both = whole_found & strips_found
@@ -118,9 +116,9 @@ def test_a_raw_left_image_says_what_the_rectified_one_says() -> None:
     raw_left, raw_right = pair(9, 12.4)
     whole, right = (build_pyramid(i, LEVELS) for i in (rectifier.left(raw_left), rectifier.right(raw_right)))
     octave, results = np.zeros(len(UV), np.uint8), []
-    for left, grid in ((whole, RECTIFIED), (build_pyramid(raw_left, LEVELS), rectifier.left_grid)):
+    for left, grid in ((whole, NO_GRID), (build_pyramid(raw_left, LEVELS), rectifier.left_grid)):
         guess, found = np.full(len(UV), 12.0), np.zeros(len(UV), np.bool_)
-        stereo_kernels.refine_rows(left, grid, right, RECTIFIED, UV, octave, SURE, FLAT, 6, 3.0, 0.8, guess, found)
+        stereo_kernels.refine_rows(left, grid, right, NO_GRID, UV, octave, SURE, FLAT, 6, 3.0, 0.8, guess, found)
         results.append((guess, found))
     both = results[0][1] & results[1][1]
     assert results[0][1].sum() > 0.5 * len(UV) and both.sum() > 0.95 * results[0][1].sum()
@@ -144,7 +142,7 @@ def test_slopes_of_the_disparity_take_the_error_of_slanted_surfaces_away() -> No
         for slopes in (FLAT, np.tile([slope_x, slope_y], (len(UV), 1))):
             guess, found = true.copy(), np.zeros(len(UV), np.bool_)
             stereo_kernels.refine_rows(
-                left, RECTIFIED, right, RECTIFIED, UV, octave, SURE, slopes, 6, 3.0, 0.8, guess, found
+                left, NO_GRID, right, NO_GRID, UV, octave, SURE, slopes, 6, 3.0, 0.8, guess, found
             )
             errors.append(np.abs(guess - true)[found])
         assert len(errors[1]) > 0.85 * len(UV) and len(errors[1]) >= len(errors[0])
@@ -160,11 +158,11 @@ def test_a_raw_left_image_is_sampled_along_the_same_slopes() -> None:
     raw_left, raw_right = slanted_pair(0.06, 0.2, 25.0)
     whole, right = (build_pyramid(i, LEVELS) for i in (rectifier.left(raw_left), rectifier.right(raw_right)))
     slopes, results = np.tile([0.06, 0.2], (len(UV), 1)), []
-    for left, grid in ((whole, RECTIFIED), (build_pyramid(raw_left, LEVELS), rectifier.left_grid)):
+    for left, grid in ((whole, NO_GRID), (build_pyramid(raw_left, LEVELS), rectifier.left_grid)):
         guess, found = np.full(len(UV), 25.0), np.zeros(len(UV), np.bool_)
         near = np.abs(0.06 * (UV[:, 0] - 160.0) + 0.2 * (UV[:, 1] - 100.0)) < 5.0
         octave = np.zeros(len(UV), np.uint8)
-        stereo_kernels.refine_rows(left, grid, right, RECTIFIED, UV, octave, SURE, slopes, 6, 6.0, 0.7, guess, found)
+        stereo_kernels.refine_rows(left, grid, right, NO_GRID, UV, octave, SURE, slopes, 6, 6.0, 0.7, guess, found)
         results.append((guess, found & near))
     both = results[0][1] & results[1][1]
     assert both.sum() > 20 and both.sum() > 0.9 * results[0][1].sum()
@@ -177,7 +175,7 @@ def test_slanted_patches_that_reach_over_the_border_are_not_measured() -> None:
     image = build_pyramid(pair(12, 0.0)[0], LEVELS)
     uv = np.array([[x, 100.0] for x in (6.0, 8.0, 314.0, 312.0, 160.0)])
     steep, sure, octave = np.tile([0.5, 0.2], (5, 1)), np.ones(5, np.bool_), np.zeros(5, np.uint8)
-    for grid in (RECTIFIED, rectifier.left_grid):
+    for grid in (NO_GRID, rectifier.left_grid):
         guess, found = np.full(5, 0.5), np.zeros(5, np.bool_)
-        stereo_kernels.refine_rows(image, grid, image, RECTIFIED, uv, octave, sure, steep, 6, 3.0, -1.0, guess, found)
+        stereo_kernels.refine_rows(image, grid, image, NO_GRID, uv, octave, sure, steep, 6, 3.0, -1.0, guess, found)
         assert not found[:4].any()

@@ -6,8 +6,8 @@ import numpy as np
 from kiteline_agent.imaging import alignment_kernels
 from kiteline_agent.imaging.epipolar_kernels import search_segments
 from kiteline_agent.imaging.features import Pyramid, build_pyramid
+from kiteline_agent.imaging.raw_grid import NO_GRID
 from kiteline_agent.keyframes.seed_kernels import intersect, seed_segments
-from kiteline_agent.tracking.frame_images import NO_GRID
 from kiteline_core.arrays import F64, I8, U8
 from kiteline_core.geometry import se3
 from kiteline_core.geometry.cameras import CameraModel, CameraRig, Lens, Rectifier

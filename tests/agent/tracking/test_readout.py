@@ -8,9 +8,9 @@ import pytest
 from kiteline_agent.agent import Agent
 from kiteline_agent.config import AgentConfig
 from kiteline_agent.exchange.no_base import NoBaseChannel
+from kiteline_agent.imaging.raw_grid import NO_GRID
 from kiteline_agent.local_map.projection_kernels import views
 from kiteline_agent.step import Identity, StepInput
-from kiteline_agent.tracking.frame_images import NO_GRID
 from kiteline_agent.tracking.shutter.readout import BLOCK_SIGMA_S, MOST_S, ReadoutEstimate
 from kiteline_agent.tracking.shutter.readout_kernels import readout_equation, row_shift
 from kiteline_agent.tracking.shutter.rolling_shutter import RollingShutter

@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 
 from kiteline_agent.config import ReadoutConfig
+from kiteline_agent.imaging.raw_grid import grid_for_kernels
 from kiteline_agent.local_map import projection_kernels
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.tracking.frame_context import FrameContext
-from kiteline_agent.tracking.frame_images import grid_for_kernels
 from kiteline_agent.tracking.shutter.readout import ReadoutEstimate
 from kiteline_agent.tracking.shutter.readout_kernels import readout_equation
 from kiteline_agent.tracking.shutter.rolling_shutter import RollingShutter
