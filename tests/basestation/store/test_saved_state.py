@@ -69,6 +69,24 @@ def test_a_submap_without_its_first_keyframe_is_restored_with_its_oldest(make_fl
     assert whole(other) == whole(station)
 
 
+def test_a_keyframe_that_has_no_pose_yet_merges_no_maps_after_a_restart(make_flight: MakeFlight, words: Any) -> None:
+    """Its parent is still to come. Two keyframes of one frame merge their maps by their poses; it has none yet."""
+    flight, later = make_flight(keyframes=8, turns=0.1), make_flight(keyframes=4, turns=0.1, start=0.5, submap=1)
+    header, *sections = flight.records[4]
+    parts = [*flight.records[:4], sections, *flight.records[5:]]
+    same = replace(later.records[0][0], t_ns=flight.records[7][0].t_ns)
+    agents = Agents([replace(flight, records=[*parts, [same, *later.records[0][1:]], *later.records[1:], [header]])])
+    station, other = new_station(words), new_station(words, 2)
+    agents.fly(station, 0, len(parts))
+    assert [station.mapper.map.pose(k) is not None for k in flight.keyframes] == [True] * 4 + [False] * 4
+    restore(other, snapshot(station, SavedMap()), agents.now_ns)
+    agents.base_died()
+    agents.fly(other, len(parts), len(parts) + 4)
+    assert other.mapper.counts.keyframes == 8 and other.mapper.summary()["merges"] == 0
+    agents.fly(other, len(parts) + 4, len(parts) + 40)
+    assert other.mapper.counts.keyframes == 12 and other.mapper.summary()["merges"] == 1
+
+
 def test_a_placement_that_was_not_sent_yet_is_sent_by_the_next_base(make_flight: MakeFlight, words: Any) -> None:
     """It waited for a batch that was under way. The next base had it, and sent it no more: nothing had changed."""
     flight = make_flight(keyframes=6, turns=0.1)
