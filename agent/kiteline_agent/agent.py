@@ -227,7 +227,7 @@ class Agent:
             self._loss.end()
             events += self._align_gravity(ctx)
             # 6. Measure a rolling shutter; update depths and slants of landmarks, and search those without a depth.
-            events += self._shutter.measure(ctx, by_images, self.submap)
+            events += self._shutter.measure(ctx, by_images, self.submap, camera.pose.T_o_m)
             if self._two_view_start is not None:
                 self._two_view_start.note_depths(track.depth_m[track.inlier])
             # By images: what a fused pose differs by is in all pixels alike, and would move all depths together.

@@ -1,24 +1,29 @@
 """A read-out that no calibration says: found from turning views, and never where the shutter is a global one."""
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from kiteline_agent.agent import Agent
-from kiteline_agent.config import AgentConfig
+from kiteline_agent.config import AgentConfig, LocalMapConfig, ReadoutConfig
 from kiteline_agent.exchange.no_base import NoBaseChannel
 from kiteline_agent.imaging.raw_grid import NO_GRID
+from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.local_map.projection_kernels import views
 from kiteline_agent.step import Identity, StepInput
 from kiteline_agent.tracking.shutter.readout import BLOCK_SIGMA_S, MOST_S, ReadoutEstimate
 from kiteline_agent.tracking.shutter.readout_kernels import readout_equation, row_shift
 from kiteline_agent.tracking.shutter.rolling_shutter import RollingShutter
+from kiteline_agent.tracking.shutter.shutter_stage import ShutterStage
+from kiteline_agent.tracking.track import track_without_landmarks
 from kiteline_core.arrays import F64
 from kiteline_core.frame import Frame, ImuBatch
 from kiteline_core.geometry import se3, tum
 from kiteline_core.geometry.cameras import RectifiedCamera, Rectifier
-from kiteline_core.ids import AgentId
+from kiteline_core.ids import AgentId, submap_id
 from kiteline_hw.sim.sensors.rig import make_rig
 from kiteline_hw.sim.source import open_sim
 
@@ -199,3 +204,21 @@ def test_a_flight_with_a_global_shutter_finds_none(turning: str) -> None:
 def test_a_calibrated_read_out_stays(turning: str) -> None:
     agent, _, _ = flown(turning, 0.02, 0.012, 2.0)
     assert agent.motion_reports()["readout"] is None
+
+
+def test_a_map_that_the_base_moves_is_no_motion_of_the_camera() -> None:
+    """A correction moves it by a pixel or two at once, as a fifth of a usual turn does in a frame."""
+    rectifier, step = Rectifier(make_rig()), se3.exp(np.array([0.02, -0.01, 0.03, 0.01, -0.02, 0.015]))
+    local_map, submap = LocalMap(rectifier.camera, LocalMapConfig()), submap_id(0, 1, 0)
+    stage = ShutterStage(local_map, rectifier, ReadoutConfig(), lambda *_: None, lambda: False)
+    T_o_c, T_o_m, twists = np.eye(4), np.eye(4), []
+    for number in range(6):
+        if number == 3:
+            T_o_m = se3.exp(np.array([0.02, 0.0, -0.01, 0.004, 0.003, -0.002]))
+        ctx: Any = SimpleNamespace(number=number, t_ns=50_000_000 * number)
+        track = track_without_landmarks(se3.inverse(T_o_c) @ T_o_m, 100)
+        assert stage.measure(ctx, track, submap, T_o_m) == []
+        twists.append(stage._measured)
+        T_o_c = T_o_c @ step
+    assert twists[0] is None
+    assert twists[1:] == [pytest.approx(se3.log(step) / 0.05)] * 5

@@ -58,7 +58,7 @@ class ShutterStage:
         )
         self._told_s = self._estimate.readout_s  # that the last event said
         self._motion_known = False  # in the last frame
-        self._last: tuple[int, SubmapId, F64] | None = None  # stamp, submap and T_m_c (4,4) of the last tracked frame
+        self._last: tuple[int, SubmapId, F64] | None = None  # stamp, submap and T_o_c (4,4) of the last tracked frame
         self._measured: F64 | None = None  # twist (6,) of this frame by images
         self._keyframe = local_map.keyframe.copy()
         self._twists = np.full((len(self._keyframe), 6), np.nan)  # of the images of keyframes
@@ -99,16 +99,19 @@ class ShutterStage:
         self._motion_known = True
         return shutter
 
-    def measure(self, ctx: FrameContext, track: Track, submap: SubmapId) -> list[str]:
-        """Take what a frame's pose by images tells of the read-out. Returns events."""
+    def measure(self, ctx: FrameContext, track: Track, submap: SubmapId, T_o_m: F64) -> list[str]:
+        """Take what a frame's pose by images tells of the read-out. Returns events.
+
+        T_o_m: (4,4) submap in the odometry frame, which stays where the base moves the map.
+        """
         if not self._estimated:
             return []
-        T_m_c, last = track.T_m_c, self._last
-        self._last = ctx.t_ns, submap, T_m_c
+        T_o_c, last = T_o_m @ track.T_m_c, self._last
+        self._last = ctx.t_ns, submap, T_o_c
         if last is None or last[1] != submap or (dt_s := (ctx.t_ns - last[0]) * 1e-9) > _MAX_GAP_S:
             return []
         # 1. How the camera moved since the last frame.
-        self._measured = twist = se3.log(se3.inverse(last[2]) @ T_m_c) / dt_s
+        self._measured = twist = se3.log(se3.inverse(last[2]) @ T_o_c) / dt_s
         still = float(np.linalg.norm(twist[3:])) * self._map.intrinsics[0] < _TURNING_PX
         if still or (self._estimate.settled and ctx.number % _SETTLED_EVERY):
             return []
