@@ -21,14 +21,14 @@ _EDGE = 64.0  # least strength of an edge, 8 grey levels a pixel: weaker ones ar
 _MOVED_PX = 8.0  # px by which an edge of the surroundings has moved across itself: four of the half image
 _ALIKE, _RATIO = 0.9, 1.7  # cosine of the directions and ratio of the strengths of an edge that is where it was
 _TELLING = 0.2  # share of the edges that tell; with fewer the older frame waits for more motion
-_EAGER, _CALM = 24, 5.0  # looks after which they are so many times rarer while nothing is found
-_CHANCE = 3  # cells that surroundings may have by chance
+_FIRST_LOOKS, _RARER = 24, 5.0  # after so many looks they are so many times rarer while nothing is found
+_BY_CHANCE = 3  # cells that may be found where nothing is fixed
 _EVERY_S = 0.3  # s between two looks at first, at least: each takes a quarter of a millisecond
 _LONGEST_S = 3.0  # s between the two frames: then a new pair begins
 _FROZEN = 0.5  # share of the edges that are where they were: the image is an old one, or the pose is wrong
-_MEMORY = 0.92  # share of what is known of a block that a pair leaves
-_LEAST = 4.5  # weight of the pairs that tell of a block, six: two seconds of turning
-_SHARE, _RELEASED = 0.5, 0.25  # share in which its edge was where it was; below the second one it shows surroundings
+_MEMORY = 0.92  # factor on what is known of a block with each pair of frames that tells of it
+_LEAST = 4.5  # least weight of these pairs for a fixed block: that of six, two seconds of turning
+_SHARE, _RELEASED = 0.5, 0.25  # share of the pairs with a still edge above which a block is fixed, and remains so
 _BORDER_PX = 2.0  # px of the raw image's border that interpolation reaches
 _MOST = 0.5  # share of all cells: where more stand still, something else is wrong
 
@@ -84,7 +84,7 @@ class FixedParts:
         if before is None:
             return self._config.on
         age_s = (t_ns - before.t_ns) * 1e-9
-        every_s = _EVERY_S * (1.0 if self._looks < _EAGER or int(self.cells.sum()) > _CHANCE else _CALM)
+        every_s = _EVERY_S * (1.0 if self._looks < _FIRST_LOOKS or int(self.cells.sum()) > _BY_CHANCE else _RARER)
         return age_s >= every_s and (self._turned_px(before, T_o_c) >= _MOVED_PX or age_s > _LONGEST_S)
 
     def look(self, t_ns: int, half: U8, T_o_c: F64, depths_m: F64) -> bool:
@@ -107,7 +107,7 @@ class FixedParts:
         return self._camera.fx * float(np.linalg.norm(se3.so3_log(T_o_c[:3, :3].T @ before.T_o_c[:3, :3])))
 
     def _compare(self, before: _Look, now: _Look, T_c_b: F64, nearest_m: float) -> bool | None:
-        """Count the edges of two frames that tell. None if these are too few; False if nothing has moved."""
+        """Count edges that tell: surroundings would have moved. None if they are too few; False if most are still."""
         at = self._strongest(before)
         a, b = (np.stack([look.x.reshape(-1)[at], look.y.reshape(-1)[at]]).astype(np.float64) for look in (before, now))
         size_a, size_b = np.hypot(*a), np.hypot(*b)
@@ -141,7 +141,7 @@ class FixedParts:
         camera, (v, u) = self._camera, np.divmod(at, -(-self._camera.width // 2))
         ray = np.stack([(2.0 * u - camera.cx) / camera.fx, (2.0 * v - camera.cy) / camera.fy, np.ones(len(at))])
         moved = []
-        for rho in (0.0, 1.0 / nearest_m):  # what lies between both moves by what lies between
+        for rho in (0.0, 1.0 / nearest_m):  # at any depth between these the motion is between theirs
             p = T_c_b[:3, :3] @ ray + T_c_b[:3, 3:] * rho
             step = (p[:2] / np.maximum(p[2], 0.1) - ray[:2]) * [[camera.fx], [camera.fy]]
             moved.append((step * across).sum(axis=0))

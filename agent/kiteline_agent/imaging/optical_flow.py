@@ -1,4 +1,4 @@
-"""Corners followed from one image to another by pyramidal optical flow, in changing light, too."""
+"""Follows corners from one image to another by pyramidal optical flow, also where light or exposure change."""
 
 from dataclasses import dataclass
 
@@ -32,7 +32,7 @@ def follow(before: U8, after: U8, uv: F64, flow: Flow, levels: int = 3, guess: F
     """
     found, good, error = _followed(before, after, uv, flow, levels, guess)
     lit = as_bright_as(before, after)
-    if lit is not after:  # by exposure, or by what else the image shows: what makes the windows more alike is right
+    if lit is not after:  # light has changed, or the image shows something else: the more similar windows are right
         other, good_there, error_there = _followed(before, lit, uv, flow, levels, guess)
         both = good & good_there
         likelier = error_there[both].sum() < error[both].sum() if both.any() else good_there.any()
@@ -44,7 +44,7 @@ def follow(before: U8, after: U8, uv: F64, flow: Flow, levels: int = 3, guess: F
 def _followed(
     before: U8, after: U8, uv: F64, flow: Flow, levels: int, guess: F64 | None
 ) -> tuple[F64, Bool, NDArray[np.float32]]:
-    """The same in images as they are, and the mean difference of the windows (n,), grey."""
+    """`follow` in images as they are, and the mean difference (n,) of the windows in grey levels."""
     size = {"winSize": (flow.window_px, flow.window_px), "maxLevel": levels}
     flags = 0 if guess is None else cv2.OPTFLOW_USE_INITIAL_FLOW
     start = uv.astype(np.float32)

@@ -48,8 +48,9 @@ class RowConfig:
 
 
 def terms(xy: F64) -> F64:
-    """1, x, y, x y, y^2 (n,5) of normalised image coordinates (n,2): pitch, roll, focal length and yaw of the right
-    camera, and pitch again, to second order.
+    """Terms (n,5) of a row offset at normalised image coordinates (n,2): 1, x, y, x y, y^2.
+
+    They come from pitch, roll, focal length and yaw of the right camera, and from pitch again, to second order.
     """
     x, y = xy[:, 0], xy[:, 1]
     return np.stack([np.ones(len(xy)), x, y, x * y, y * y], 1)
@@ -137,7 +138,7 @@ class RowAlignment:
         return True
 
     def apply(self) -> float:
-        """Read the right image at its rows if the last points are significantly off. Returns their rms px, or 0.
+        """Read the right image at other rows if the last points are significantly off. Returns their rms px, or 0.
 
         After `read_lower` any measured change is applied.
         """
@@ -159,7 +160,7 @@ class RowAlignment:
 
     @property
     def read(self) -> bool:
-        """True if the right image is read at its rows."""
+        """True if the right image is read at other rows than the calibration says."""
         return bool(self.applied_px.any())
 
     def begin_with(self, rows_px: F64, *, read: bool) -> None:

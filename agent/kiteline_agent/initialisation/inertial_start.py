@@ -360,11 +360,11 @@ class InertialStart:
         """True if this window tells the read-out of a rolling shutter. A map waits until the next one confirms it."""
         if self._shutter is None or not (self._shutter.is_unknown and found.solution.fits):
             return False
-        asking = self._readout.asking(
+        measuring = self._readout.measuring(
             found.bundle, found.solution, lambda rows: self._bundle(corners, replace(window, rows=rows)),
             self._rows(window.samples, window.offset, self._shutter), self._config.inertial_start.bundle.sigma_px,
         )  # fmt: skip
-        told = yield from self._counted(asking, len(corners.seen))
+        told = yield from self._counted(measuring, len(corners.seen))
         if told is None:
             return self._readout.waits
         self._warnings += self._shutter.take(*told)

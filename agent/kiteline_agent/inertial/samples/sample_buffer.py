@@ -17,8 +17,8 @@ _ATTACK = 4.0  # factor of variance above which new noise replaces the average a
 _BEFORE = 5  # samples before new ones, for their differences
 _STEP_GAIN = 0.1  # with which the usual time between samples follows
 _RECENT = 10  # samples whose mean is without vibration
-_EVEN = 1.5  # longest over shortest step of three samples whose second difference is used
-_GAP = 2.5  # of the usual step: a longer one misses samples
+EVEN = 1.5  # longest over shortest step of three samples whose second difference is used
+GAP = 2.5  # of the usual step: a longer one misses samples
 _GAP_GYRO_RAD_S, _GAP_ACCEL_M_S2 = 0.3, 2.0  # error of interpolation over missing samples
 _HELD_NS = 25_000_000  # for which the newest sample may stand in for those that have not come yet
 _FEW = 2.5  # usual steps for which it may where accelerations tell lengths
@@ -149,7 +149,7 @@ class SampleBuffer:
         """Noise density (n,2) of the steps (n,) in ns, between samples lo - 1 and hi."""
         out = np.empty((len(steps), 2))
         out[:] = self.density
-        missed = steps > _GAP * self._step_ns if self._step_ns else np.zeros(len(steps), np.bool_)
+        missed = steps > GAP * self._step_ns if self._step_ns else np.zeros(len(steps), np.bool_)
         if missed.any():
             dt_s = steps[missed] * 1e-9
             out[missed] = np.sqrt(out[missed] ** 2 + np.outer(dt_s, [_GAP_GYRO_RAD_S**2, _GAP_ACCEL_M_S2**2]))
@@ -180,7 +180,7 @@ class SampleBuffer:
         usual = median((t[1:] - t[:-1]).astype(np.float64))
         self._step_ns = usual if self._step_ns is None else self._step_ns + _STEP_GAIN * (usual - self._step_ns)
         sums = np.empty((2, 2))
-        count, pairs = imu_kernels.second_differences(t, values, self._step_ns, _EVEN, _GAP, sums)
+        count, pairs = imu_kernels.second_differences(t, values, self._step_ns, EVEN, GAP, sums)
         if count == 0:
             return
         share = 1.0 - float(np.exp(-count * self._step_ns * 1e-9 / _NOISE_MEMORY_S))

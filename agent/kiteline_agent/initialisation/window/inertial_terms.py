@@ -20,7 +20,7 @@ _PAIR = 2 * STATE  # unknowns of two keyframes
 _FLOOR = np.diag(np.repeat([2e-5, 5e-4, 2e-5], 3) ** 2)  # of an interval's covariance: rad, m/s, m
 NO_OFFSET = TimeOffset(0.0, 1e-6)  # for certain
 _ENDS_S = 0.012  # s of samples at the ends of an interval that tell the rate and force there: vibration averages out
-_FAR_S = 5e-4  # s; change of the time offset from which samples are cut anew
+_FAR_S = 5e-4  # s; from a change of the time offset by so much samples are cut anew
 
 CutSamples = Callable[[float], list[Samples] | None]  # K - 1 intervals at a time offset in s; None: samples are missing
 
@@ -32,7 +32,7 @@ class InertialTerms:
         self, cut: CutSamples, offset: TimeOffset, calibration: ImuCalibration, gravity_m_s2: float,
         prior: BiasPrior, config: InertialBundleConfig, noise: WindowNoise,
     ) -> None:  # fmt: skip
-        """offset: of time, known before, at which samples are there."""
+        """offset: time offset as known before the window; none of its samples is missing there."""
         self._cut, self._offset = cut, offset
         intervals = cut(self._offset.offset_s)
         assert intervals is not None
@@ -49,7 +49,7 @@ class InertialTerms:
             for level in vibration(intervals).levels
         ]
         self._walk = noise.walk * float(np.hypot(calibration.accel_walk, config.accel_walk))
-        self._length = gravity_m_s2
+        self._gravity_m_s2 = gravity_m_s2
         self._prior = prior
         self.motions: list[Preintegrated] = []
         self._later: list[F64] = []  # (9,) of each interval: its change by the time offset
@@ -172,7 +172,7 @@ class InertialTerms:
 
     def _tilt(self, state: WindowState) -> F64:
         """(3,2) by which the direction of gravity moves it."""
-        return np.asarray(self._length * tangent(state.gravity))
+        return np.asarray(self._gravity_m_s2 * tangent(state.gravity))
 
     def _jacobian(self, state: WindowState, e: F64, k: int, tilt: F64) -> F64:
         """(9,30) of interval k by its two keyframes and the shared unknowns. tilt: see `_tilt`."""

@@ -23,8 +23,9 @@ _LEAST_ACCEL_NOISE = 0.5  # times the noise of single samples: vibration average
 class NoiseOfWindows:
     """Call `measure` before a window is solved, and `seen` with its solution.
 
-    now: with which a window is solved. of_samples: of single samples, more than that of intervals, since much of it is
-    vibration and motion. From too much noise its true size is found, which from too little is taken for motion.
+    now: the noise with which a window is solved. of_samples: that of single samples, with which the first window is
+    solved. It is more than intervals have, since vibration and fast motion average out; from there the errors of a
+    solution show how much there is, while with too little a solution takes noise for motion.
     """
 
     def __init__(self, calibration: ImuCalibration, config: InertialBundleConfig) -> None:

@@ -11,7 +11,10 @@ from kiteline_core.arrays import F64
 
 @dataclass(frozen=True, slots=True)
 class RollingRows:
-    """Of K keyframes at stamps_s (K,). rate: (K,3) rad/s of the body by the gyro, with its bias. shutter: at rest."""
+    """When the rows of K keyframes were exposed, and how the camera moved then.
+
+    stamps_s: (K,). rate: (K,3) rad/s of the body by the gyro, with its bias. shutter: of a camera that does not move.
+    """
 
     stamps_s: F64
     rate: F64

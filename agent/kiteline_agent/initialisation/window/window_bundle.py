@@ -90,7 +90,8 @@ class InertialBundle:
         lens_info = lens_prior(config, focal_px) if lens_info is None else lens_info
         self._corners = CornerTerms(observations, T_b_c, focal_px, config, lens_info, rows)
         self._t_bc = T_b_c[:3, 3].copy()
-        self._length, self._known_length = gravity_m_s2, length
+        self._gravity_m_s2 = gravity_m_s2
+        self._known_length = length
         self._prior = prior
         self._converged = False
         self._keyframes, self._landmarks = observations.seen.shape
@@ -133,7 +134,10 @@ class InertialBundle:
         return self._solution(state, system, np.arange(6, len(still)))
 
     def readout_step(self, state: WindowState, rows: RollingRows) -> tuple[float, float]:
-        """By how much longer the read-out should be at a solution, in s, and its deviation. rows: of a short one."""
+        """By how much longer the read-out should be at a solution, in s, and its deviation.
+
+        rows: of a short read-out, for derivatives.
+        """
         system = self._linearise(state, inertial=True)
         second, first, by_unknowns = self._corners.by_readout(state, rows)
         column = np.zeros(len(system.b))
@@ -142,11 +146,6 @@ class InertialBundle:
         along = np.linalg.solve(h + np.diag(1e-9 * np.diag(h) + 1e-12), column[6:])
         information, gradient = second - float(column[6:] @ along), first - float(system.b[6:] @ along)
         return -gradient / information, float(np.sqrt(1.0 / information)) if information > 0.0 else np.inf
-
-    @property
-    def reprojection_px(self) -> float:
-        """Root mean square of the inliers, of the last state that was looked at."""
-        return self._corners.reprojection_px
 
     @property
     def _rows_of_corners(self) -> I64:
@@ -210,7 +209,9 @@ class InertialBundle:
         T_w_b[:, :3, :3], T_w_b[:, :3, 3] = state.R, state.p
         bias = np.concatenate([state.gyro_bias, self._prior.bias[3:]])
         self._terms.integrate(state)
-        found = initial_alignment.align(T_w_b, self._t_bc, self._terms.motions, bias, self._length, with_scale=True)
+        found = initial_alignment.align(
+            T_w_b, self._t_bc, self._terms.motions, bias, self._gravity_m_s2, with_scale=True
+        )
         if found is None:
             return None
         camera = state.p + state.R @ self._t_bc
@@ -315,8 +316,8 @@ class InertialBundle:
         R = np.array([r @ se3.so3_exp(phi) for r, phi in zip(state.R, x[:, :3], strict=True)])
         gravity = state.gravity
         if gravity.any():
-            gravity = gravity + self._length * tangent(gravity) @ shared[3:5]
-            gravity = self._length * gravity / np.linalg.norm(gravity)
+            gravity = gravity + self._gravity_m_s2 * tangent(gravity) @ shared[3:5]
+            gravity = self._gravity_m_s2 * gravity / np.linalg.norm(gravity)
         lens = step[STATE * n + SHARED :]
         landmark = system.corners.landmark_steps(np.append(x[:, :6].ravel(), lens))
         # A map that grows is the same to the camera, but a linear step of inverse depths is not: the growth in the step

@@ -1,4 +1,4 @@
-"""How noisy the IMU is in a window: beside its calibration, as errors show it, and by vibration in each interval."""
+"""How noisy the IMU is: in a window, by a solution's errors, and in each of its intervals, by vibration."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,12 +7,12 @@ import numpy as np
 
 from kiteline_agent.inertial import imu_kernels
 from kiteline_agent.inertial.preintegration import Samples
+from kiteline_agent.inertial.samples.sample_buffer import EVEN, GAP
 from kiteline_core.arrays import F64
 
 MOST = 25.0  # largest factor on a deviation
 LEAST = 0.2  # and the smallest
 _FEWEST = 12  # second differences that tell the noise of an interval, to a fifth
-_EVEN, _GAP = 1.5, 2.5  # as in SampleBuffer: steps that are compared
 _LEAST_LEVEL, _MOST_LEVEL = 0.1, 4.0  # motors are off, and a landing
 _BESIDE = 2  # intervals before and after, half a second each, over which levels are averaged: rotors beat
 _PRIOR = 6.0  # degrees of freedom of the calibrated noise beside those of a window
@@ -23,7 +23,8 @@ _NEWEST = 2  # intervals that tell the vibration now
 class WindowNoise:
     """Factors on the deviations of the inertial error model.
 
-    gyro, accel: of white noise. walk: of the accelerometer bias's walk, with which errors of scale and axes come.
+    gyro, accel: of white noise. walk: of the random walk of the accelerometer's bias, which also stands for errors of
+    its scale and axes.
     """
 
     gyro: float = 1.0
@@ -39,7 +40,7 @@ class NoiseEvidence:
     expected: F64
 
     def updated(self, noise: WindowNoise, least_accel: float = LEAST) -> WindowNoise:
-        """The factors that explain these errors, beside 1, which is expected.
+        """The factors that explain these errors, with 1 as prior.
 
         least_accel: smallest factor of the accelerometer's white noise that is believed.
         """
@@ -73,7 +74,7 @@ def vibration(intervals: Sequence[Samples]) -> Vibration:
     for k, samples in enumerate(intervals):
         values = np.concatenate([samples.gyro, samples.accel], axis=1)[1:-1]  # the ends are interpolated
         stamps = np.round(1e9 * samples.t_s[1:-1]).astype(np.int64)
-        count, pairs = imu_kernels.second_differences(stamps, values, 1e9 * usual_s, _EVEN, _GAP, sums)
+        count, pairs = imu_kernels.second_differences(stamps, values, 1e9 * usual_s, EVEN, GAP, sums)
         if count >= _FEWEST:
             by_pairs = sums[1, 1] / pairs if pairs >= _FEWEST else np.inf
             variance[k] = min(sums[0, 1] / count, by_pairs)

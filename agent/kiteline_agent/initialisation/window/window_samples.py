@@ -9,12 +9,12 @@ from kiteline_agent.inertial.preintegration import Samples
 from kiteline_agent.inertial.samples.sample_buffer import SampleBuffer, without_held
 from kiteline_core.arrays import F64
 
-_RATE_NS = 10_000_000  # about a stamp, over which rates are averaged: vibration is faster
+_RATE_NS = 10_000_000  # ns on each side of a stamp over which its rate is averaged: vibration is faster
 _MOST_S = 0.5  # s; change of the time offset: a solver that diverges asks for more
 
 
 class WindowSamples:
-    """Samples of K - 1 intervals. Those that come later do not count."""
+    """Samples of K - 1 intervals, of those in the buffer now: a solution goes on while others come."""
 
     def __init__(
         self, buffer: SampleBuffer, correct: Callable[[Samples], Samples], stamps_ns: Sequence[int], about_s: float

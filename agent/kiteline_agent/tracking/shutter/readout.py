@@ -12,8 +12,8 @@ MOST_S = 0.06  # s: longer than any camera takes at 20 images a second
 _LEAST_BLOCKS = 4  # before anything is said
 _KEPT_BLOCKS = 16  # newest that count: what has changed is found within as many
 _SCATTER_S = 0.002  # s between blocks, at least: errors of lens and depth of real cameras
-_SIGNIFICANCE = 5.0  # deviations that make a shutter a rolling one
-_REFINED = 3.0  # deviations from which a read-out that was found is corrected
+_SIGNIFICANCE = 5.0  # deviations from 0 above which a shutter is a rolling one
+_REFINED = 3.0  # deviations above which a read-out that was found is corrected
 _LEAST_S = 0.003  # s: a global shutter, for all that it matters
 
 
@@ -31,7 +31,7 @@ class ReadoutEstimate:
         self._used = 0 if sigma_s is None else _blocks_behind(sigma_s)
 
     def take(self, readout_s: float, sigma_s: float) -> float:
-        """Take a read-out that was found otherwise, and its deviation. Returns the change in s."""
+        """Take a read-out and its deviation that were found without equations. Returns the change in s."""
         change = readout_s - self.readout_s
         self.readout_s, self.sigma_s = readout_s, sigma_s
         self._used = _blocks_behind(sigma_s)
@@ -56,7 +56,7 @@ class ReadoutEstimate:
         return self._decide()
 
     def _decide(self) -> float:
-        """The change that the blocks ask for, if they are sure of it."""
+        """The change in s by which the blocks agree that the read-out is off; 0.0 if it is not significant."""
         blocks = np.array(self._blocks)
         if len(blocks) < _LEAST_BLOCKS:
             return 0.0

@@ -13,7 +13,7 @@ _LEAST = 12  # landmarks of a keyframe whose relative pose is an unknown
 
 @njit
 def _raw_row(u, v, grid):  # type: ignore[no-untyped-def]
-    """The row of the raw image that shows a rectified pixel; grid: of RollingShutter, empty without rectification."""
+    """The row of the raw image that shows a rectified pixel, as in RollingShutter. grid: NO_GRID if none is needed."""
     if grid.shape[0] == 0:
         return v
     column = min(max(int(np.rint(u / GRID_STEP)), 0), grid.shape[1] - 1)

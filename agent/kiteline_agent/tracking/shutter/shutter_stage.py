@@ -22,12 +22,12 @@ from kiteline_core.ids import SubmapId
 _STILL_PX = 0.3  # by which a rolling shutter moves pixels of a vehicle that stands still, at most
 _TURNING_PX = 20.0  # px/s at the image's centre: slower turns tell nothing of a read-out
 _SETTLED_EVERY = 8  # frames of which one is looked at once the read-out has settled
-_FOUND = (
+_FOUND_EVENT = (
     "rolling shutter: {:.0f} ms from the first row to the last, found in flight; a rig file, or readout_s: {:.3f} in "
     "the calibration, corrects it from the start"
 )
-_TOLD_S = 0.002  # s by which a read-out has changed until that is said again
-_SAME_MOTION_NS = 120_000_000  # in which a vehicle hardly moves otherwise
+_TOLD_S = 0.002  # s; least change of a read-out that is an event again
+_SAME_MOTION_NS = 120_000_000  # ns in which the motion of a vehicle hardly changes
 _MAX_GAP_S = 0.2  # s between two frames whose poses tell the motion of the second
 
 
@@ -43,10 +43,11 @@ class ShutterStage:
         has_motion_sensor: Callable[[], bool],
         known_s: tuple[float, ...] = (),
     ) -> None:
-        """twist: predicted (6,) of the camera at a stamp, and so many seconds after the last frame; None: unknown.
+        """twist: predicts that of the camera, (6,) [m/s, rad/s] in its own axes, from a frame's stamp in ns and the
+        time in s since the last frame; None: unknown.
 
-        has_motion_sensor: whether IMU or odometer help to tell that. known_s: read-out that an earlier flight found,
-        and its deviation; (): none.
+        has_motion_sensor: whether an IMU or odometer helps to predict it. known_s: read-out that an earlier flight
+        found, and its deviation; (): none.
         """
         self._map = local_map
         self._rectifier = rectifier
@@ -56,7 +57,7 @@ class ShutterStage:
         self._estimate = (
             ReadoutEstimate(*known_s) if self._estimated and known_s else ReadoutEstimate(rectifier.readout_s)
         )
-        self._told_s = self._estimate.readout_s  # that the last event said
+        self._told_s = self._estimate.readout_s  # as of the last event
         self._motion_known = False  # in the last frame
         self._last: tuple[int, SubmapId, F64] | None = None  # stamp, submap and T_o_c (4,4) of the last tracked frame
         self._measured: F64 | None = None  # twist (6,) of this frame by images
@@ -93,7 +94,7 @@ class ShutterStage:
         shutter = self._shutter(self._estimate.readout_s, twist)
         if not self._motion_known and shutter.largest_px() < _STILL_PX:
             self._map.rolled[:] = False  # the vehicle stood still when its motion was unknown
-        elif not self._motion_known and self._has_motion_sensor():  # it hardly moved otherwise in the frame before
+        elif not self._motion_known and self._has_motion_sensor():  # the newest keyframes were in the same motion
             for slot in np.flatnonzero(self._map.rolled & (self._keyframe_ns >= t_ns - _SAME_MOTION_NS)).tolist():
                 self._move(slot, shutter)
         self._motion_known = True
@@ -115,7 +116,7 @@ class ShutterStage:
         still = float(np.linalg.norm(twist[3:])) * self._map.intrinsics[0] < _TURNING_PX
         if still or (self._estimate.settled and ctx.number % _SETTLED_EVERY):
             return []
-        # 2. How the shutter should have moved what was found, and how far that lies from where the map has it.
+        # 2. How far observations are off where the map has them, beside what a rolling shutter would move them by.
         m, rows = self._map, track.rows
         warp, parallax = np.empty((len(rows), 2, 2)), np.empty((len(rows), 2))
         projection_kernels.views(
@@ -129,7 +130,7 @@ class ShutterStage:
                 m.T_m_k, m.bearing, m.rho, self._twists,
             )
         )  # fmt: skip
-        # 3. The map's pixels lie where a frame's stamp has them, by the read-out in use.
+        # 3. Pixels of the map's keyframes are at the stamps, by the read-out in use: they move with it.
         return self._changed(change_s)
 
     def end_frame(self, t_ns: int) -> None:
@@ -162,7 +163,7 @@ class ShutterStage:
         if abs(readout_s - self._told_s) < _TOLD_S:
             return []
         self._told_s = readout_s
-        return [_FOUND.format(1e3 * readout_s, readout_s)]
+        return [_FOUND_EVENT.format(1e3 * readout_s, readout_s)]
 
     def _move_map(self, change_s: float) -> None:
         """Move the pixels of landmarks in their keyframes, where the motion of these is known."""
@@ -184,6 +185,5 @@ class ShutterStage:
         m.rolled[slot] = False
 
     def _shutter(self, readout_s: float, twist: F64) -> RollingShutter:
-        camera = self._rectifier.camera
         r = self._rectifier
-        return RollingShutter(camera, readout_s, camera.height, r.left_grid, twist, r.right_grid)
+        return RollingShutter(r.camera, readout_s, r.camera.height, r.left_grid, twist, r.right_grid)

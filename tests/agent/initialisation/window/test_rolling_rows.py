@@ -68,17 +68,17 @@ def bundle(corners: CornerObservations, samples: WindowSamples, rows: RollingRow
     return InertialBundle(corners, samples.at, ImuCalibration(), T_B_C, CAMERA.fx, 9.81, prior, config, rows=rows)
 
 
-def asked(readout: WindowReadout, seed: int, row_s: float, lens: F64 | None = None) -> tuple[float, float] | None:
-    """What a window answers that is solved as if every row were taken at the stamp."""
+def measured(readout: WindowReadout, seed: int, row_s: float, lens: F64 | None = None) -> tuple[float, float] | None:
+    """What a window gives that is solved as if every row were taken at the stamp."""
     corners, samples, rows, _ = window(seed, row_s)
     if lens is not None:
         corners = replace(corners, xy=moved(corners.xy, lens))
     solver = bundle(corners, samples, None)
     found = solver.solve()
     assert found is not None
-    asking = readout.asking(solver, found, lambda r: bundle(corners, samples, r), rows.with_readout(0.0), 0.5)
+    measuring = readout.measuring(solver, found, lambda r: bundle(corners, samples, r), rows.with_readout(0.0), 0.5)
     with np.errstate(all="ignore"):
-        return finished(asking)
+        return finished(measuring)
 
 
 def length(p: F64) -> float:
@@ -131,8 +131,8 @@ def test_samples_are_corrected_before_rates_are_taken() -> None:
 @pytest.mark.parametrize("sign", [1.0, -1.0])  # -1: rows are read from the bottom up
 def test_two_windows_in_turn_tell_a_read_out(sign: float) -> None:
     readout = WindowReadout()
-    assert asked(readout, 0, sign * ROW_S) is None  # one alone is not believed
-    told = asked(readout, 1, sign * ROW_S)
+    assert measured(readout, 0, sign * ROW_S) is None  # one alone is not believed
+    told = measured(readout, 1, sign * ROW_S)
     assert told is not None
     assert told[0] == pytest.approx(sign * READOUT_S, abs=0.004)
     assert 0.0 < told[1] < 0.2 * READOUT_S
@@ -140,14 +140,14 @@ def test_two_windows_in_turn_tell_a_read_out(sign: float) -> None:
 
 def test_windows_that_disagree_tell_none() -> None:
     readout = WindowReadout()
-    asked(readout, 0, ROW_S)
-    assert asked(readout, 1, -ROW_S) is None
-    asked(readout, 0, ROW_S)
+    measured(readout, 0, ROW_S)
+    assert measured(readout, 1, -ROW_S) is None
+    measured(readout, 0, ROW_S)
     readout.clear()
-    assert asked(readout, 1, ROW_S) is None
+    assert measured(readout, 1, ROW_S) is None
 
 
 @pytest.mark.parametrize("lens", [None, np.array([0.003, 0.001, -0.001, -0.004, 0.003, -0.002, 0.002, 0.001])])
 def test_windows_of_a_global_shutter_tell_none(lens: F64 | None) -> None:
     readout = WindowReadout()
-    assert all(asked(readout, seed, 0.0, lens) is None for seed in range(6))
+    assert all(measured(readout, seed, 0.0, lens) is None for seed in range(6))
