@@ -30,12 +30,12 @@ from tests.agent.initialisation.window.test_window_bundle import CALIBRATION, FO
 
 CAMERA: Any = SimpleNamespace(fx=FOCAL, fy=FOCAL, cx=376.0, cy=240.0, width=752, height=480, T_b_c=T_B_C)
 
-
+GLOBAL: Any = SimpleNamespace(rolls=False, is_unknown=False)  # shutter; the gyro's rates are not taken for it
 EXACT = ImuPrior(None, TimeOffset(0.0, 1e-6), lambda samples: samples, FrameClock())
 
 
 class Recorded:
-    """The recorded samples between the first n keyframes."""
+    """The recorded samples between the first n keyframes; `rates` at their stamps are not to be asked for."""
 
     def __init__(self, cut: CutSamples, n: int) -> None:
         self._cut, self._n = cut, n
@@ -96,7 +96,7 @@ def begins_after(monkeypatch: pytest.MonkeyPatch, poor: int) -> tuple[float, flo
         config.inertial_start.bundle, lens_focal=1e-5, lens_centre_px=1e-2, lens_radial=1e-5, camera_turn_rad=1e-5
     )
     config = replace(config, inertial_start=replace(config.inertial_start, bundle=known))  # the scale is known sooner
-    start = InertialStart(CAMERA, CALIBRATION, config, Work())
+    start = InertialStart(CAMERA, CALIBRATION, config, Work(), shutter=GLOBAL)
     start._tracks = Tracks(corners)  # type: ignore[assignment]
     monkeypatch.setattr(inertial_start, "WindowSamples", lambda *args: Recorded(cut, len(args[2])))
     monkeypatch.setattr(start._noise, "measure", lambda *_: None)  # noise as calibrated
