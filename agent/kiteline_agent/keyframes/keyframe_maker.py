@@ -220,7 +220,7 @@ class KeyframeMaker:
         landmarks: points in `order`. Returns where the image shows them, (n,2) px.
         """
         uv, rho = landmarks.uv.astype(np.float64), landmarks.inv_depth.astype(np.float64)
-        seen_uv = uv if points.rows is None else uv + points.rows.roll_px[order]
+        seen_uv = uv if points.row_shift is None else uv + points.row_shift.shift_px[order]
         rho = np.where(rho > 0.0, np.maximum(rho - self._map.offset_px(uv) / self._camera.bf, _MIN_RHO), 0.0)
         octave, config = landmarks.octave, ctx.config
         side = alignment_kernels.TEMPLATE
@@ -237,11 +237,11 @@ class KeyframeMaker:
         )
         slot = self._map.add(header, T_m_k, new, ctx.number)
         self._map.rolled[slot] = ctx.shutter is None
-        if points.rows is None:
+        if points.row_shift is None:
             self._map.row_parallax.clear(slot)
         else:
-            shown = points.rows.part(order)
-            self._map.row_parallax.set(slot, shown.parallax_m, shown.rho)
+            shift = points.row_shift.part(order)
+            self._map.row_parallax.set(slot, shift.parallax_m, shift.rho)
         return seen_uv
 
 

@@ -20,25 +20,25 @@ _UNIQUENESS = 1.15  # second-best cost over best; below it the row repeats itsel
 class RowShift:
     """Where a rolling shutter's rows show landmarks.
 
-    roll_px: (n,2) from where they are at the frame's stamp. rho: (n,) 1/m, the inverse depths for which that holds.
+    shift_px: (n,2) from where they are at the frame's stamp. rho: (n,) 1/m, the inverse depths for which that holds.
     parallax_m: (n,2) by which x/z and y/z at the stamp change with the inverse depth.
     """
 
-    roll_px: F64
+    shift_px: F64
     rho: F64
     parallax_m: F64
 
     def part(self, keep: Bool | I64) -> "RowShift":
         """Those where `keep` (n,) is True, or those at these places."""
-        return RowShift(self.roll_px[keep], self.rho[keep], self.parallax_m[keep])
+        return RowShift(self.shift_px[keep], self.rho[keep], self.parallax_m[keep])
 
 
 @dataclass(frozen=True, slots=True)
 class NewPoints:
     """New landmarks of a keyframe, strongest first.
 
-    uv: (n,2) px. disparity: (n,) px, -1 unknown. octave: (n,). angle: (n,) 1/256 turns. descriptor: (n,32). rows: of a
-    rolling shutter; None: of a global one, or its motion is unknown.
+    uv: (n,2) px. disparity: (n,) px, -1 unknown. octave: (n,). angle: (n,) 1/256 turns. descriptor: (n,32). row_shift:
+    by a rolling shutter; None: by a global one, or its motion is unknown.
     """
 
     uv: F64
@@ -46,13 +46,13 @@ class NewPoints:
     octave: U8
     angle: U8
     descriptor: U8
-    rows: RowShift | None = None
+    row_shift: RowShift | None = None
 
     def part(self, keep: Bool) -> "NewPoints":
         """Those where `keep` (n,) is True."""
-        rows = None if self.rows is None else self.rows.part(keep)
+        shift = None if self.row_shift is None else self.row_shift.part(keep)
         return NewPoints(
-            self.uv[keep], self.disparity[keep], self.octave[keep], self.angle[keep], self.descriptor[keep], rows
+            self.uv[keep], self.disparity[keep], self.octave[keep], self.angle[keep], self.descriptor[keep], shift
         )  # fmt: skip
 
 
@@ -113,7 +113,7 @@ def moved_to_frame(
     moved, parallax_m = shutter.to_frame_with_parallax(points.uv, rho)
     uv = np.clip(moved[:, :2], 0.0, [camera.width - 1.0, camera.height - 1.0])
     disparity = np.where(has_depth, disparity * moved[:, 2], disparity)
-    return replace(points, uv=uv, disparity=disparity, rows=RowShift(points.uv - uv, rho, parallax_m))
+    return replace(points, uv=uv, disparity=disparity, row_shift=RowShift(points.uv - uv, rho, parallax_m))
 
 
 def shown_by_rows(points: NewPoints, camera: RectifiedCamera, shutter: RollingShutter) -> NewPoints:
@@ -121,7 +121,7 @@ def shown_by_rows(points: NewPoints, camera: RectifiedCamera, shutter: RollingSh
     rho = points.disparity / camera.bf
     shown = shutter.to_rows(points.uv, rho)[:, :2]
     _, parallax_m = shutter.to_frame_with_parallax(shown, rho)
-    return replace(points, rows=RowShift(shown - points.uv, rho, parallax_m))
+    return replace(points, row_shift=RowShift(shown - points.uv, rho, parallax_m))
 
 
 def nearby(uv: F64, places: F64, values: F64) -> F64:

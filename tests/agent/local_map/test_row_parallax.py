@@ -29,12 +29,12 @@ def test_a_landmark_whose_depth_is_found_later_is_where_it_had_been_with_that_de
     before, true = moved_to_frame(points(0.0), CAMERA, SHUTTER), moved_to_frame(points(0.4), CAMERA, SHUTTER)
     assert np.abs(before.uv - true.uv).max() > 1.0
     kept = RowParallax(3, N)
-    kept.set(1, before.rows.parallax_m, before.rows.rho)
+    kept.set(1, before.row_shift.parallax_m, before.row_shift.rho)
     rows = N + np.arange(N)
     change = kept.change(rows, np.full(N, 0.4))
     assert before.uv + change * FOCAL == pytest.approx(true.uv, abs=0.02)
     assert kept.change(rows, np.full(N, 0.4)) == pytest.approx(0.0)  # once
-    assert before.uv + before.rows.roll_px == pytest.approx(points(0.0).uv)
+    assert before.uv + before.row_shift.shift_px == pytest.approx(points(0.0).uv)
 
 
 def test_with_a_global_shutter_nothing_moves() -> None:
@@ -45,7 +45,7 @@ def test_with_a_global_shutter_nothing_moves() -> None:
 
 def test_a_slot_forgets_its_keyframe() -> None:
     kept, moved = RowParallax(2, N), moved_to_frame(points(0.0), CAMERA, SHUTTER)
-    kept.set(1, moved.rows.parallax_m, moved.rows.rho)
+    kept.set(1, moved.row_shift.parallax_m, moved.row_shift.rho)
     kept.clear(1)
     assert not kept.change(N + np.arange(N), np.ones(N)).any()
 
@@ -62,7 +62,7 @@ def test_a_keyframe_that_is_moved_later_keeps_what_its_depths_change() -> None:
 
 def test_a_bearing_that_the_base_refined_is_right_for_its_depth() -> None:
     kept, moved = RowParallax(2, N), moved_to_frame(points(0.0), CAMERA, SHUTTER)
-    kept.set(0, moved.rows.parallax_m, moved.rows.rho)
+    kept.set(0, moved.row_shift.parallax_m, moved.row_shift.rho)
     kept.refer(0, np.arange(N), np.full(N, 0.4))
     assert not kept.change(np.arange(N), np.full(N, 0.4)).any()
     assert kept.change(np.arange(N), np.full(N, 0.5)).any()
@@ -71,8 +71,8 @@ def test_a_bearing_that_the_base_refined_is_right_for_its_depth() -> None:
 def test_rows_show_a_landmark_of_the_stamp_where_it_came_from() -> None:
     moved = moved_to_frame(points(0.3), CAMERA, SHUTTER)
     again = shown_by_rows(moved, CAMERA, SHUTTER)
-    assert again.rows.roll_px == pytest.approx(moved.rows.roll_px, abs=0.35)  # of second order
-    assert again.rows.parallax_m * FOCAL == pytest.approx(moved.rows.parallax_m * FOCAL, abs=0.15)
+    assert again.row_shift.shift_px == pytest.approx(moved.row_shift.shift_px, abs=0.35)  # of second order
+    assert again.row_shift.parallax_m * FOCAL == pytest.approx(moved.row_shift.parallax_m * FOCAL, abs=0.15)
 
 
 def test_a_motion_in_another_unit_shows_the_same() -> None:
