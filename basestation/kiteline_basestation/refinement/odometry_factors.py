@@ -8,8 +8,9 @@ in one of the two images. It stands for those that the agent measured: with anot
 the same images mean another motion, so that a worn rig's steps follow the offset as it becomes known. While it is not,
 it biases rotations all in one direction: the weight decreases where rotations differ, and for rigs that are known to be
 worn. Images of a monocular submap in metres tell no scale: there weak points nearby hold the agent's, which rests on
-its IMU, or, where the map's own accelerations have corrected lengths, those that the map has there now. Inertial steps
-tie the first keyframe of a submap to the last one of the submap before.
+its IMU, or, where the map's own accelerations have corrected lengths, those that the map has there now. Between
+keyframes that look different ways the points lie between their views, off both images. Inertial steps tie the first
+keyframe of a submap to the last one of the submap before.
 """
 
 from collections.abc import Iterator
@@ -31,6 +32,7 @@ from kiteline_core.optimisation.bundle import BundleProblem, BundleResult
 _GRID = np.stack(np.meshgrid((-0.6, 0.0, 0.6), (-0.4, 0.4)), -1).reshape(-1, 2)  # x/z, y/z: as wide as a usual lens
 _PX_OF_ROTATION = 1.7  # factor from a rotation's error to the standard deviation of 6 far points, each observed twice
 _MIN_RUN = 5  # rotations for an estimate of their common error
+_WIDEST = float(np.hypot(*_GRID[0]))
 _ON_PLANE = np.column_stack([_GRID, np.ones(len(_GRID))])
 _DEPTHS = np.concatenate([0.7 * _ON_PLANE, 1.8 * _ON_PLANE])  # of the median depth: near points tell the translation
 _ROTATION_DEPTHS = 8.0 * _ON_PLANE  # the same for rotation alone
@@ -40,23 +42,27 @@ _LEAST_POINTS = 4  # synthetic points of a step
 _NO_DISPARITY, _NO_GROUP = -1.0, -1
 _ROTATION_SIGMA_PX = 0.1  # px; of each of 6 far synthetic points: together they hold rotation to 0.15 mrad
 _SCALE_SIGMA_PX = 2.0  # px; of each of 12 more in monocular submaps in metres, whose images tell no scale
+_WIDE_COS = 0.77  # of the angle between two views beyond which points lie between them: 40 degrees
+_STEEPEST_RAD = 1.3  # from an optical axis to such points: 75 degrees
+_LEAST_SPREAD = 0.1  # of these points, as a share of the usual one
 _RUN = 20  # keyframes; consecutive rotations whose common error is estimated together
 
 
 class _Step(NamedTuple):
-    """Synthetic points of the step from keyframe p of a window to k, of deviation sigma_px.
+    """Synthetic points of the step from keyframe p of a window to k.
 
-    in_k, in_p: (n,3) where both see them; terms: (n,5) of the disparity offset in k, zero where it does not count;
-    world: (n,3) positions.
+    in_k, in_p: (n,3) where both see them, of deviations sigma_k, sigma_p (n,) px; terms: (n,5) of the disparity offset
+    in k, zero where it does not count; world: (n,3) positions.
     """
 
     k: int
     p: int
     in_k: F64
     in_p: F64
+    sigma_k: F64
+    sigma_p: F64
     terms: F64
     world: F64
-    sigma_px: float
 
 
 def with_odometry_factors(sparse_map: SparseMap, window: BundleWindow, config: OdometryFactorConfig) -> BundleProblem:
@@ -66,12 +72,15 @@ def with_odometry_factors(sparse_map: SparseMap, window: BundleWindow, config: O
     border, of_camera = problem.border, _groups(problem)
     for step in _steps(sparse_map, window, config, of_camera):
         points.append(step.world)
-        k, p = (step.k, step.in_k, of_camera[step.k]), (step.p, step.in_p, _NO_GROUP)
-        (first, in_first, of_first), (second, in_second, of_second) = (p, k) if step.p < step.k else (k, p)
+        k = step.k, step.in_k, step.sigma_k, of_camera[step.k]
+        p = step.p, step.in_p, step.sigma_p, _NO_GROUP
+        (first, in_first, sigma_first, of_first), (second, in_second, sigma_second, of_second) = sorted(
+            (k, p), key=lambda seen: seen[0]
+        )
         n = len(step.world)
         camera += [first, second] * n
         measured.append(np.concatenate([in_first, in_second], axis=1).reshape(2 * n, 3))
-        sigma += [step.sigma_px] * (2 * n)
+        sigma.append(np.stack([sigma_first, sigma_second], axis=1).reshape(2 * n))
         group += [of_first, of_second] * n
         terms.append(np.repeat(step.terms, 2, axis=0))
     if not points:
@@ -90,7 +99,7 @@ def with_odometry_factors(sparse_map: SparseMap, window: BundleWindow, config: O
         ).astype(np.int32),
         camera=np.concatenate([problem.camera, np.array(camera, np.int32)]),
         measured=np.concatenate([problem.measured, *measured]),
-        sigma=np.concatenate([problem.sigma, np.repeat(np.array(sigma)[:, None], 2, axis=1)]),
+        sigma=np.concatenate([problem.sigma, np.repeat(np.concatenate(sigma)[:, None], 2, axis=1)]),
         border=border,
     )
 
@@ -125,13 +134,15 @@ def _steps(
             sets.append((_DEPTHS, _SCALE_SIGMA_PX))
         own = submap_of_keyframe(KeyframeId(int(table.id[window.rows[p]]))) == submap
         T_p_k = sim3.with_scaled_translation(T_p_k, float(units[k] if own else units[p]))
+        wide = T_p_k[2, 2] < _WIDE_COS
         for depths, sigma_px in sets:
-            synthetic = _synthetic_points(problem, k, p, T_p_k, depths, float(depth[k]))
-            if synthetic is None:
+            shape = _between_views(depths, T_p_k) if wide else depths
+            step = _synthetic_points(problem, k, p, T_p_k, shape, float(depth[k]), sigma_px)
+            if step is None:
                 continue
-            in_k, in_p, world = synthetic
-            step = _Step(k, p, in_k, in_p, np.zeros((len(in_k), disparity_offset.TERMS)), world, sigma_px)
-            if ranged and depths is _DEPTHS:
+            if wide:
+                step = _by_angle(problem, step)
+            elif ranged and depths is _DEPTHS:
                 change_px = sparse_map.offset_measured_with(keyframe) - _assumed(sparse_map, agent, of_camera[k])
                 step = _following_offset(problem.lens[k], step, change_px)
             yield step
@@ -149,7 +160,10 @@ def _following_offset(lens: F64, step: _Step, change_px: F64) -> _Step:
         return step
     in_k = np.column_stack([step.in_k[seen, :2], disparity[seen]])
     in_p = np.column_stack([step.in_p[seen, :2], np.full(len(in_k), _NO_DISPARITY)])
-    return step._replace(in_k=in_k, in_p=in_p, terms=terms[seen], world=step.world[seen])
+    return step._replace(
+        in_k=in_k, in_p=in_p, sigma_k=step.sigma_k[seen], sigma_p=step.sigma_p[seen], terms=terms[seen],
+        world=step.world[seen],
+    )  # fmt: skip
 
 
 def _groups(problem: BundleProblem) -> I32:
@@ -205,21 +219,40 @@ def median_depths(problem: BundleProblem) -> F64:
     return depth
 
 
-def _synthetic_points(
-    problem: BundleProblem, k: int, p: int, T_p_k: F64, depths: F64, typical: float
-) -> tuple[F64, F64, F64] | None:
-    """Observations (n,3) of synthetic points in keyframes k and p, and their positions (n,3); None if too few fit.
+def _between_views(shape: F64, T_p_k: F64) -> F64:
+    """Points (n,3) as they lie before a view, turned to the middle between the views of k and p, in k."""
+    middle = np.array([0.0, 0.0, 1.0]) + T_p_k[2, :3]
+    length = float(np.linalg.norm(middle))  # twice the cosine of half the angle
+    half_rad = float(np.arccos(min(0.5 * length, 1.0)))
+    across = np.array([-middle[1], middle[0], 0.0])
+    across /= max(float(np.linalg.norm(across)), 1e-9)
+    spread = np.clip(np.tan(_STEEPEST_RAD - half_rad) / _WIDEST, _LEAST_SPREAD, 1.0)
+    return np.asarray((shape * [spread, spread, 1.0]) @ se3.so3_exp(half_rad * across).T)
 
-    depths: (n,3) points in k at a `typical` depth of one.
-    """
-    local = typical * depths
+
+def _by_angle(problem: BundleProblem, step: _Step) -> _Step:
+    """A step whose deviations are angles: off an image's centre one covers more pixels."""
+    of_k, of_p = (
+        1.0 + np.square((seen[:, :2] - problem.lens[i, 2:4]) / problem.lens[i, :2]).sum(axis=1)
+        for i, seen in ((step.k, step.in_k), (step.p, step.in_p))
+    )
+    return step._replace(sigma_k=step.sigma_k * of_k, sigma_p=step.sigma_p * of_p)
+
+
+def _synthetic_points(
+    problem: BundleProblem, k: int, p: int, T_p_k: F64, shape: F64, typical: float, sigma_px: float
+) -> _Step | None:
+    """The step from keyframe p to k; None if both see too few points. shape: (n,3) in k at a `typical` depth of one."""
+    local = typical * shape
     in_parent = se3.transform(T_p_k, local)
-    ahead = in_parent[:, 2] > 0.1 * typical
+    ahead = np.minimum(in_parent[:, 2], local[:, 2]) > 0.1 * typical
     if np.count_nonzero(ahead) < _LEAST_POINTS:
         return None
     local, in_parent = local[ahead], in_parent[ahead]
     world = se3.transform(se3.inverse(problem.T_c_m[k]), local)
-    return _projected(problem.lens[k], local), _projected(problem.lens[p], in_parent), world
+    sigma, terms = np.full(len(local), sigma_px), np.zeros((len(local), disparity_offset.TERMS))
+    in_k, in_p = _projected(problem.lens[k], local), _projected(problem.lens[p], in_parent)
+    return _Step(k, p, in_k, in_p, sigma, sigma, terms, world)
 
 
 def _projected(lens: F64, xyz: F64) -> F64:

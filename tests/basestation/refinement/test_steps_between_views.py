@@ -1,0 +1,44 @@
+"""Steps of the agent between keyframes that look different ways hold what follows, as others do."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from kiteline_basestation.refinement.odometry_factors import with_odometry_factors
+from kiteline_core.geometry import se3
+from kiteline_core.optimisation.bundle import bundle
+from tests.basestation.refinement.test_odometry_factors import CONFIG, IDS, flight, window
+
+
+@pytest.mark.parametrize("axis", [(0.0, 1.0, 0.0), (0.8, -0.6, 0.0), (0.0, 0.96, 0.28)])
+@pytest.mark.parametrize("angle_rad", [0.3, 0.75, 1.2, 1.8, 2.4])
+def test_keyframes_after_a_turn_are_held_by_their_parent(angle_rad: float, axis: tuple[float, ...]) -> None:
+    sparse_map, _ = flight(noise_px=0.1, births=40, unseen=3)
+    turn = se3.from_rt(se3.so3_exp(angle_rad * np.array(axis)), np.zeros(3))
+    T_w_2, T_w_3 = sparse_map.pose(IDS[2]), sparse_map.pose(IDS[3])
+    assert T_w_2 is not None and T_w_3 is not None
+    sparse_map.keyframes.T_p_k[sparse_map.rows[IDS[3]]] = se3.inverse(T_w_2) @ T_w_3 @ turn
+    for keyframe in IDS[3:]:
+        T_3_k = se3.inverse(T_w_3) @ sparse_map.pose(keyframe)
+        sparse_map.set_world_pose(keyframe, T_w_3 @ turn @ T_3_k, carry=False)
+    linked = with_odometry_factors(sparse_map, window(sparse_map, IDS[3:]), CONFIG.odometry_factors)
+    expected = np.linalg.inv(linked.T_c_m)
+    together = se3.exp(np.array([0.02, -0.01, 0.015, 0.01, 0.02, -0.01]))  # 27 mm, 24 mrad
+    begin = linked.T_c_m.copy()
+    begin[1:] = begin[1:] @ se3.inverse(T_w_3 @ together @ se3.inverse(T_w_3))
+    result = np.linalg.inv(bundle(replace(linked, T_c_m=begin), CONFIG.bundle).T_c_m)
+    for T, held in zip(result[1:], expected[1:], strict=True):
+        error = se3.inverse(held) @ T
+        assert np.linalg.norm(error[:3, 3]) < 0.006
+        assert np.linalg.norm(se3.so3_log(error[:3, :3])) < 0.003
+
+
+def test_views_that_are_opposite_have_no_step() -> None:
+    sparse_map, _ = flight(noise_px=0.1, births=40, unseen=3)
+    row = sparse_map.rows[IDS[3]]
+    sparse_map.keyframes.T_p_k[row] = se3.from_rt(np.diag([-1.0, 1.0, -1.0]), np.array([0.1, 0.0, 0.0]))
+    part = window(sparse_map, IDS[3:])
+    links = with_odometry_factors(sparse_map, part, CONFIG.odometry_factors).camera[len(part.problem.camera) :]
+    assert 0 not in links.tolist()  # that of keyframe 2
+    assert {1, 2, 3} <= set(links.tolist())
