@@ -40,7 +40,7 @@ class OdometryFactorConfig:
     worn_px: float = (
         0.5  # px per sqrt(s) between them, for both: of a worn rig, whose disparity offset is counted apart
     )
-    sigma_px: float = 0.07  # px; of each of 12 synthetic points if the keyframe has no observations: 150 were tracked
+    sigma_px: float = 0.07  # px; of each of 12 synthetic points of 0.5 s without observations: 150 were tracked
 
 
 @dataclass(frozen=True, slots=True)

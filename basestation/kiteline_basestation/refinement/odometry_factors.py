@@ -43,16 +43,18 @@ _NO_DISPARITY, _NO_GROUP = -1.0, -1
 _ROTATION_SIGMA_PX = 0.1  # px; of each of 6 far synthetic points: together they hold rotation to 0.15 mrad
 _SCALE_SIGMA_PX = 2.0  # px; of each of 12 more in monocular submaps in metres, whose images tell no scale
 _WIDE_COS = 0.77  # of the angle between two views beyond which points lie between them: 40 degrees
-_STEEPEST_RAD = 1.3  # from an optical axis to such points: 75 degrees
-_LEAST_SPREAD = 0.1  # of these points, as a share of the usual one
+_STEEPEST_RAD = 1.3  # from an optical axis to such points, where the views leave room for it: 75 degrees
+_LEAST_SPREAD = 0.1  # of these points along the turn, as a share of the usual one
+_AHEAD, _WIDE_AHEAD = 0.1, 0.05  # of the median depth: least depth of synthetic points
+_USUAL_S = 0.5  # s of a usual step; over longer ones the agent drifts by more
 _RUN = 20  # keyframes; consecutive rotations whose common error is estimated together
 
 
 class _Step(NamedTuple):
     """Synthetic points of the step from keyframe p of a window to k.
 
-    in_k, in_p: (n,3) where both see them, of deviations sigma_k, sigma_p (n,) px; terms: (n,5) of the disparity offset
-    in k, zero where it does not count; world: (n,3) positions.
+    in_k, in_p: (n,3) where both see them; sigma_k, sigma_p: (n,2) px deviations of pixel and disparity; terms: (n,5) of
+    the disparity offset in k, zero where it does not count; world: (n,3) positions.
     """
 
     k: int
@@ -80,7 +82,7 @@ def with_odometry_factors(sparse_map: SparseMap, window: BundleWindow, config: O
         n = len(step.world)
         camera += [first, second] * n
         measured.append(np.concatenate([in_first, in_second], axis=1).reshape(2 * n, 3))
-        sigma.append(np.stack([sigma_first, sigma_second], axis=1).reshape(2 * n))
+        sigma.append(np.concatenate([sigma_first, sigma_second], axis=1).reshape(2 * n, 2))
         group += [of_first, of_second] * n
         terms.append(np.repeat(step.terms, 2, axis=0))
     if not points:
@@ -99,7 +101,7 @@ def with_odometry_factors(sparse_map: SparseMap, window: BundleWindow, config: O
         ).astype(np.int32),
         camera=np.concatenate([problem.camera, np.array(camera, np.int32)]),
         measured=np.concatenate([problem.measured, *measured]),
-        sigma=np.concatenate([problem.sigma, np.repeat(np.concatenate(sigma)[:, None], 2, axis=1)]),
+        sigma=np.concatenate([problem.sigma, *sigma]),
         border=border,
     )
 
@@ -127,22 +129,19 @@ def _steps(
         worn_px = config.worn_px * np.sqrt(gap_s) if agent in sparse_map.disparity_sigma_px else 0.0
         rotation_sigma = max(_ROTATION_SIGMA_PX, worn_px, difference_px)
         few = max(0.0, 1.0 - min(counts[k], counts[p]) / config.enough_observations)
-        point_sigma = 1.0 / np.hypot(few / max(config.sigma_px, worn_px), 1.0 / rotation_sigma)
+        drift_px = config.sigma_px * np.sqrt(max(1.0, gap_s / _USUAL_S))
+        point_sigma = 1.0 / np.hypot(few / max(drift_px, worn_px), 1.0 / rotation_sigma)
         ranged = sparse_map.measures_distances(agent)
         sets = [(_DEPTHS if few > 0.0 else _ROTATION_DEPTHS, point_sigma)]
         if not ranged:
             sets.append((_DEPTHS, _SCALE_SIGMA_PX))
         own = submap_of_keyframe(KeyframeId(int(table.id[window.rows[p]]))) == submap
         T_p_k = sim3.with_scaled_translation(T_p_k, float(units[k] if own else units[p]))
-        wide = T_p_k[2, 2] < _WIDE_COS
         for depths, sigma_px in sets:
-            shape = _between_views(depths, T_p_k) if wide else depths
-            step = _synthetic_points(problem, k, p, T_p_k, shape, float(depth[k]), sigma_px)
+            step = _synthetic_points(problem, k, p, T_p_k, depths, float(depth[k]), sigma_px)
             if step is None:
                 continue
-            if wide:
-                step = _by_angle(problem, step)
-            elif ranged and depths is _DEPTHS:
+            if ranged and depths is _DEPTHS and not _is_wide(T_p_k):
                 change_px = sparse_map.offset_measured_with(keyframe) - _assumed(sparse_map, agent, of_camera[k])
                 step = _following_offset(problem.lens[k], step, change_px)
             yield step
@@ -219,40 +218,52 @@ def median_depths(problem: BundleProblem) -> F64:
     return depth
 
 
-def _between_views(shape: F64, T_p_k: F64) -> F64:
-    """Points (n,3) as they lie before a view, turned to the middle between the views of k and p, in k."""
-    middle = np.array([0.0, 0.0, 1.0]) + T_p_k[2, :3]
-    length = float(np.linalg.norm(middle))  # twice the cosine of half the angle
-    half_rad = float(np.arccos(min(0.5 * length, 1.0)))
-    across = np.array([-middle[1], middle[0], 0.0])
-    across /= max(float(np.linalg.norm(across)), 1e-9)
-    spread = np.clip(np.tan(_STEEPEST_RAD - half_rad) / _WIDEST, _LEAST_SPREAD, 1.0)
-    return np.asarray((shape * [spread, spread, 1.0]) @ se3.so3_exp(half_rad * across).T)
-
-
-def _by_angle(problem: BundleProblem, step: _Step) -> _Step:
-    """A step whose deviations are angles: off an image's centre one covers more pixels."""
-    of_k, of_p = (
-        1.0 + np.square((seen[:, :2] - problem.lens[i, 2:4]) / problem.lens[i, :2]).sum(axis=1)
-        for i, seen in ((step.k, step.in_k), (step.p, step.in_p))
-    )
-    return step._replace(sigma_k=step.sigma_k * of_k, sigma_p=step.sigma_p * of_p)
-
-
 def _synthetic_points(
-    problem: BundleProblem, k: int, p: int, T_p_k: F64, shape: F64, typical: float, sigma_px: float
+    problem: BundleProblem, k: int, p: int, T_p_k: F64, depths: F64, typical: float, sigma_px: float
 ) -> _Step | None:
-    """The step from keyframe p to k; None if both see too few points. shape: (n,3) in k at a `typical` depth of one."""
-    local = typical * shape
+    """The step from keyframe p to k; None if both see too few points. depths: (n,3) in k at a `typical` one of 1."""
+    wide = _is_wide(T_p_k)
+    local = typical * (_between_views(depths, T_p_k) if wide else depths)
     in_parent = se3.transform(T_p_k, local)
-    ahead = np.minimum(in_parent[:, 2], local[:, 2]) > 0.1 * typical
+    ahead = np.minimum(in_parent[:, 2], local[:, 2]) > (_WIDE_AHEAD if wide else _AHEAD) * typical
     if np.count_nonzero(ahead) < _LEAST_POINTS:
         return None
     local, in_parent = local[ahead], in_parent[ahead]
     world = se3.transform(se3.inverse(problem.T_c_m[k]), local)
-    sigma, terms = np.full(len(local), sigma_px), np.zeros((len(local), disparity_offset.TERMS))
+    sigma, terms = np.full((len(local), 2), sigma_px), np.zeros((len(local), disparity_offset.TERMS))
     in_k, in_p = _projected(problem.lens[k], local), _projected(problem.lens[p], in_parent)
-    return _Step(k, p, in_k, in_p, sigma, sigma, terms, world)
+    step = _Step(k, p, in_k, in_p, sigma, sigma, terms, world)
+    return _by_angle(problem, step) if wide else step
+
+
+def _is_wide(T_p_k: F64) -> bool:
+    """True if two keyframes look so different ways that what is ahead of one may be behind the other."""
+    return float(T_p_k[2, 2]) < _WIDE_COS
+
+
+def _between_views(points: F64, T_p_k: F64) -> F64:
+    """Points (n,3) that lie before a view, turned to the middle between the views of k and p, in k.
+
+    The farther these are apart, the narrower the points are in the direction of the turn, so that both see them.
+    """
+    turn = T_p_k[2, :2] / max(float(np.linalg.norm(T_p_k[2, :2])), 1e-9)  # where p looks, seen from k
+    half_rad = 0.5 * float(np.arccos(np.clip(T_p_k[2, 2], -1.0, 1.0)))
+    spread = np.clip(np.tan(_STEEPEST_RAD - half_rad) / _WIDEST, _LEAST_SPREAD, 1.0)
+    narrow = points.copy()
+    narrow[:, :2] -= (1.0 - spread) * np.outer(points[:, :2] @ turn, turn)
+    return np.asarray(narrow @ se3.so3_exp(half_rad * np.array([-turn[1], turn[0], 0.0])).T)
+
+
+def _by_angle(problem: BundleProblem, step: _Step) -> _Step:
+    """A step whose deviations are angles and shares of distances: off an image's centre these cover more pixels."""
+    of_k, of_p = (
+        1.0 + np.square((seen[:, :2] - problem.lens[i, 2:4]) / problem.lens[i, :2]).sum(axis=1)
+        for i, seen in ((step.k, step.in_k), (step.p, step.in_p))
+    )
+    return step._replace(
+        sigma_k=step.sigma_k * np.stack([of_k, np.sqrt(of_k)], axis=1),
+        sigma_p=step.sigma_p * np.stack([of_p, np.sqrt(of_p)], axis=1),
+    )
 
 
 def _projected(lens: F64, xyz: F64) -> F64:

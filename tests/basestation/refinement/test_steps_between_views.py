@@ -1,4 +1,4 @@
-"""Steps of the agent between keyframes that look different ways hold what follows, as others do."""
+"""Steps of the agent between keyframes that look different ways, or over a longer time, hold what follows."""
 
 from dataclasses import replace
 
@@ -12,7 +12,7 @@ from tests.basestation.refinement.test_odometry_factors import CONFIG, IDS, flig
 
 
 @pytest.mark.parametrize("axis", [(0.0, 1.0, 0.0), (0.8, -0.6, 0.0), (0.0, 0.96, 0.28)])
-@pytest.mark.parametrize("angle_rad", [0.3, 0.75, 1.2, 1.8, 2.4])
+@pytest.mark.parametrize("angle_rad", [0.3, 0.75, 1.2, 1.8, 2.4, 2.9])
 def test_keyframes_after_a_turn_are_held_by_their_parent(angle_rad: float, axis: tuple[float, ...]) -> None:
     sparse_map, _ = flight(noise_px=0.1, births=40, unseen=3)
     turn = se3.from_rt(se3.so3_exp(angle_rad * np.array(axis)), np.zeros(3))
@@ -42,3 +42,17 @@ def test_views_that_are_opposite_have_no_step() -> None:
     links = with_odometry_factors(sparse_map, part, CONFIG.odometry_factors).camera[len(part.problem.camera) :]
     assert 0 not in links.tolist()  # that of keyframe 2
     assert {1, 2, 3} <= set(links.tolist())
+
+
+def test_steps_over_a_longer_time_hold_less() -> None:
+    sparse_map, _ = flight(noise_px=0.1, births=4)
+    part = window(sparse_map)
+
+    def sigma_px(step_s: float) -> float:
+        for k, keyframe in enumerate(IDS):
+            sparse_map.keyframes.t_ns[sparse_map.rows[keyframe]] = round(1e9 * step_s * k)
+        linked = with_odometry_factors(sparse_map, part, CONFIG.odometry_factors)
+        return float(np.median(linked.sigma[len(part.problem.camera) :]))
+
+    assert sigma_px(0.1) == sigma_px(0.5)
+    assert 1.2 * sigma_px(0.5) < sigma_px(2.0) < 2.0 * sigma_px(0.5)  # rotations are held as before
