@@ -45,6 +45,7 @@ _SCALE_SIGMA_PX = 2.0  # px; of each of 12 more in monocular submaps in metres, 
 _WIDE_COS = 0.77  # of the angle between two views beyond which points lie between them: 40 degrees
 _STEEPEST_RAD = 1.3  # from an optical axis to such points, where the views leave room for it: 75 degrees
 _LEAST_SPREAD = 0.1  # of these points along the turn, as a share of the usual one
+_FARTHER = (1.0, 2.0, 4.0, 8.0)  # times as far are such points until both views see all: the camera moved, too
 _AHEAD, _WIDE_AHEAD = 0.1, 0.05  # of the median depth: least depth of synthetic points
 _USUAL_S = 0.5  # s of a usual step; over longer ones the agent drifts by more
 _RUN = 20  # keyframes; consecutive rotations whose common error is estimated together
@@ -223,9 +224,13 @@ def _synthetic_points(
 ) -> _Step | None:
     """The step from keyframe p to k; None if both see too few points. depths: (n,3) in k at a `typical` one of 1."""
     wide = _is_wide(T_p_k)
-    local = typical * (_between_views(depths, T_p_k) if wide else depths)
-    in_parent = se3.transform(T_p_k, local)
-    ahead = np.minimum(in_parent[:, 2], local[:, 2]) > (_WIDE_AHEAD if wide else _AHEAD) * typical
+    shape = _between_views(depths, T_p_k) if wide else depths
+    for farther in _FARTHER if wide else (1.0,):
+        local = farther * typical * shape
+        in_parent = se3.transform(T_p_k, local)
+        ahead = np.minimum(in_parent[:, 2], local[:, 2]) > (_WIDE_AHEAD if wide else _AHEAD) * typical
+        if ahead.all():
+            break
     if np.count_nonzero(ahead) < _LEAST_POINTS:
         return None
     local, in_parent = local[ahead], in_parent[ahead]

@@ -11,11 +11,14 @@ from kiteline_core.optimisation.bundle import bundle
 from tests.basestation.refinement.test_odometry_factors import CONFIG, IDS, flight, window
 
 
+@pytest.mark.parametrize("moved_m", [(0.0, 0.0, 0.0), (1.5, 0.0, 1.0), (-2.0, 0.5, -1.0)])
 @pytest.mark.parametrize("axis", [(0.0, 1.0, 0.0), (0.8, -0.6, 0.0), (0.0, 0.96, 0.28)])
 @pytest.mark.parametrize("angle_rad", [0.3, 0.75, 1.2, 1.8, 2.4, 2.9])
-def test_keyframes_after_a_turn_are_held_by_their_parent(angle_rad: float, axis: tuple[float, ...]) -> None:
+def test_keyframes_after_a_turn_are_held_by_their_parent(
+    angle_rad: float, axis: tuple[float, ...], moved_m: tuple[float, ...]
+) -> None:
     sparse_map, _ = flight(noise_px=0.1, births=40, unseen=3)
-    turn = se3.from_rt(se3.so3_exp(angle_rad * np.array(axis)), np.zeros(3))
+    turn = se3.from_rt(se3.so3_exp(angle_rad * np.array(axis)), np.array(moved_m))
     T_w_2, T_w_3 = sparse_map.pose(IDS[2]), sparse_map.pose(IDS[3])
     assert T_w_2 is not None and T_w_3 is not None
     sparse_map.keyframes.T_p_k[sparse_map.rows[IDS[3]]] = se3.inverse(T_w_2) @ T_w_3 @ turn
