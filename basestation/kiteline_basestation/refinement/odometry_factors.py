@@ -8,7 +8,8 @@ in one of the two images. It stands for those that the agent measured: with anot
 the same images mean another motion, so that a worn rig's steps follow the offset as it becomes known. While it is not,
 it biases rotations all in one direction: the weight decreases where rotations differ, and for rigs that are known to be
 worn. Images of a monocular submap in metres tell no scale: there weak points nearby hold the agent's, which rests on
-its IMU, or, where the map's own accelerations have corrected lengths, those that the map has there now. Between
+its IMU, or, where the map's own accelerations have corrected lengths, those that the map has there now. In a submap in
+a unit of its own, steps with few observations tell rotations and directions: its scale drifts. Between
 keyframes that look different ways the points lie between their views, off both images. Inertial steps tie the first
 keyframe of a submap to the last one of the submap before.
 """
@@ -42,6 +43,8 @@ _LEAST_POINTS = 4  # synthetic points of a step
 _NO_DISPARITY, _NO_GROUP = -1.0, -1
 _ROTATION_SIGMA_PX = 0.1  # px; of each of 6 far synthetic points: together they hold rotation to 0.15 mrad
 _SCALE_SIGMA_PX = 2.0  # px; of each of 12 more in monocular submaps in metres, whose images tell no scale
+_OWN_UNIT_SIGMA_PX = 0.35  # px; of each of 12 points of 0.5 s without observations, in a submap in a unit of its own
+_LOOSE_DISPARITY_PX = 3.0  # px; of the disparities of these, 4 to 11 px
 _WIDE_COS = 0.77  # of the angle between two views beyond which points lie between them: 40 degrees
 _STEEPEST_RAD = 1.3  # from an optical axis to such points, where the views leave room for it: 75 degrees
 _LEAST_SPREAD = 0.1  # of these points along the turn, as a share of the usual one
@@ -124,17 +127,19 @@ def _steps(
         if p is None and (tie := sparse_map.inertial_steps.get(keyframe)) is not None:
             p, T_p_k = number.get(tie.since), moved_camera(sparse_map, tie)
         agent, submap = agent_of_keyframe(keyframe), submap_of_keyframe(keyframe)
-        if p is None or sparse_map.is_up_to_scale(submap) or not (problem.free[k] or problem.free[p]):
+        if p is None or not (problem.free[k] or problem.free[p]):
             continue
         gap_s = abs(float(table.t_ns[row] - table.t_ns[window.rows[p]])) * 1e-9
         worn_px = config.worn_px * np.sqrt(gap_s) if agent in sparse_map.disparity_sigma_px else 0.0
         rotation_sigma = max(_ROTATION_SIGMA_PX, worn_px, difference_px)
         few = max(0.0, 1.0 - min(counts[k], counts[p]) / config.enough_observations)
-        drift_px = config.sigma_px * np.sqrt(max(1.0, gap_s / _USUAL_S))
-        point_sigma = 1.0 / np.hypot(few / max(drift_px, worn_px), 1.0 / rotation_sigma)
-        ranged = sparse_map.measures_distances(agent)
+        longer = np.sqrt(max(1.0, gap_s / _USUAL_S))
+        point_sigma = 1.0 / np.hypot(few / max(longer * config.sigma_px, worn_px), 1.0 / rotation_sigma)
+        ranged, without_unit = sparse_map.measures_distances(agent), sparse_map.is_up_to_scale(submap)
         sets = [(_DEPTHS if few > 0.0 else _ROTATION_DEPTHS, point_sigma)]
-        if not ranged:
+        if without_unit:
+            sets = [(_DEPTHS, longer * _OWN_UNIT_SIGMA_PX / few)] if few > 0.0 else []
+        elif not ranged:
             sets.append((_DEPTHS, _SCALE_SIGMA_PX))
         own = submap_of_keyframe(KeyframeId(int(table.id[window.rows[p]]))) == submap
         T_p_k = sim3.with_scaled_translation(T_p_k, float(units[k] if own else units[p]))
@@ -142,10 +147,19 @@ def _steps(
             step = _synthetic_points(problem, k, p, T_p_k, depths, float(depth[k]), sigma_px)
             if step is None:
                 continue
-            if ranged and depths is _DEPTHS and not _is_wide(T_p_k):
+            if without_unit:
+                step = _without_lengths(step)
+            elif ranged and depths is _DEPTHS and not _is_wide(T_p_k):
                 change_px = sparse_map.offset_measured_with(keyframe) - _assumed(sparse_map, agent, of_camera[k])
                 step = _following_offset(problem.lens[k], step, change_px)
             yield step
+
+
+def _without_lengths(step: _Step) -> _Step:
+    """A step that tells its direction and rotation: its points' distances are hardly known, but no point runs off."""
+    sigma_k, sigma_p = step.sigma_k.copy(), step.sigma_p.copy()
+    sigma_k[:, 1] = sigma_p[:, 1] = _LOOSE_DISPARITY_PX
+    return step._replace(sigma_k=sigma_k, sigma_p=sigma_p)
 
 
 def _following_offset(lens: F64, step: _Step, change_px: F64) -> _Step:
