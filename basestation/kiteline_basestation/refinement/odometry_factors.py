@@ -43,7 +43,7 @@ _LEAST_POINTS = 4  # synthetic points of a step
 _NO_DISPARITY, _NO_GROUP = -1.0, -1
 _ROTATION_SIGMA_PX = 0.1  # px; of each of 6 far synthetic points: together they hold rotation to 0.15 mrad
 _SCALE_SIGMA_PX = 2.0  # px; of each of 12 more in monocular submaps in metres, whose images tell no scale
-_OWN_UNIT_SIGMA_PX = 0.35  # px; of each of 12 points of 0.5 s without observations, in a submap in a unit of its own
+_OWN_UNIT_SIGMA_PX = 0.25  # px; of each of 12 points of 0.5 s without observations, in a submap in a unit of its own
 _LOOSE_DISPARITY_PX = 3.0  # px; of the disparities of these, 4 to 11 px
 _WIDE_COS = 0.77  # of the angle between two views beyond which points lie between them: 40 degrees
 _STEEPEST_RAD = 1.3  # from an optical axis to such points, where the views leave room for it: 75 degrees
@@ -138,7 +138,8 @@ def _steps(
         ranged, without_unit = sparse_map.measures_distances(agent), sparse_map.is_up_to_scale(submap)
         sets = [(_DEPTHS if few > 0.0 else _ROTATION_DEPTHS, point_sigma)]
         if without_unit:
-            sets = [(_DEPTHS, longer * _OWN_UNIT_SIGMA_PX / few)] if few > 0.0 else []
+            sigma_px = max(longer * _OWN_UNIT_SIGMA_PX, 2.0 * difference_px)
+            sets = [(_DEPTHS, sigma_px / few)] if few > 0.0 else []
         elif not ranged:
             sets.append((_DEPTHS, _SCALE_SIGMA_PX))
         own = submap_of_keyframe(KeyframeId(int(table.id[window.rows[p]]))) == submap
