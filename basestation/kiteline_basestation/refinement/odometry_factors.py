@@ -27,7 +27,7 @@ from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.refinement.bundle_window import BundleWindow
 from kiteline_core.arrays import F64, I32
 from kiteline_core.geometry import disparity_offset, se3, sim3
-from kiteline_core.ids import AgentId, KeyframeId, agent_of_keyframe, submap_of_keyframe
+from kiteline_core.ids import AgentId, KeyframeId, SubmapId, agent_of_keyframe, agent_of_submap, submap_of_keyframe
 from kiteline_core.optimisation.bundle import BundleProblem, BundleResult
 
 _GRID = np.stack(np.meshgrid((-0.6, 0.0, 0.6), (-0.4, 0.4)), -1).reshape(-1, 2)  # x/z, y/z: as wide as a usual lens
@@ -44,6 +44,7 @@ _NO_DISPARITY, _NO_GROUP = -1.0, -1
 _ROTATION_SIGMA_PX = 0.1  # px; of each of 6 far synthetic points: together they hold rotation to 0.15 mrad
 _SCALE_SIGMA_PX = 2.0  # px; of each of 12 more in monocular submaps in metres, whose images tell no scale
 _OWN_UNIT_SIGMA_PX = 0.25  # px; of each of 12 points of 0.5 s without observations, in a submap in a unit of its own
+_STEPS_DIFFER = 2.0  # times the difference of rotations between map and steps, if that is more
 _LOOSE_DISPARITY_PX = 3.0  # px; of the disparities of these, 4 to 11 px
 _WIDE_COS = 0.77  # of the angle between two views beyond which points lie between them: 40 degrees
 _STEEPEST_RAD = 1.3  # from an optical axis to such points, where the views leave room for it: 75 degrees
@@ -130,18 +131,9 @@ def _steps(
         if p is None or not (problem.free[k] or problem.free[p]):
             continue
         gap_s = abs(float(table.t_ns[row] - table.t_ns[window.rows[p]])) * 1e-9
-        worn_px = config.worn_px * np.sqrt(gap_s) if agent in sparse_map.disparity_sigma_px else 0.0
-        rotation_sigma = max(_ROTATION_SIGMA_PX, worn_px, difference_px)
         few = max(0.0, 1.0 - min(counts[k], counts[p]) / config.enough_observations)
-        longer = np.sqrt(max(1.0, gap_s / _USUAL_S))
-        point_sigma = 1.0 / np.hypot(few / max(longer * config.sigma_px, worn_px), 1.0 / rotation_sigma)
         ranged, without_unit = sparse_map.measures_distances(agent), sparse_map.is_up_to_scale(submap)
-        sets = [(_DEPTHS if few > 0.0 else _ROTATION_DEPTHS, point_sigma)]
-        if without_unit:
-            sigma_px = max(longer * _OWN_UNIT_SIGMA_PX, 2.0 * difference_px)
-            sets = [(_DEPTHS, sigma_px / few)] if few > 0.0 else []
-        elif not ranged:
-            sets.append((_DEPTHS, _SCALE_SIGMA_PX))
+        sets = _point_sets(sparse_map, submap, config, few, gap_s, difference_px)
         own = submap_of_keyframe(KeyframeId(int(table.id[window.rows[p]]))) == submap
         T_p_k = sim3.with_scaled_translation(T_p_k, float(units[k] if own else units[p]))
         for depths, sigma_px in sets:
@@ -154,6 +146,27 @@ def _steps(
                 change_px = sparse_map.offset_measured_with(keyframe) - _assumed(sparse_map, agent, of_camera[k])
                 step = _following_offset(problem.lens[k], step, change_px)
             yield step
+
+
+def _point_sets(
+    sparse_map: SparseMap, submap: SubmapId, config: OdometryFactorConfig, few: float, gap_s: float,
+    difference_px: float,
+) -> list[tuple[F64, float]]:  # fmt: skip
+    """Shapes (n,3) of a step's synthetic points at a median depth of one, each with the points' deviation in px.
+
+    few: from 0, where observations are enough, to 1 without any. gap_s: of the step. difference_px: of rotations.
+    """
+    agent, longer = agent_of_submap(submap), np.sqrt(max(1.0, gap_s / _USUAL_S))
+    if sparse_map.is_up_to_scale(submap):
+        own_px = max(longer * _OWN_UNIT_SIGMA_PX, _STEPS_DIFFER * difference_px)
+        return [(_DEPTHS, own_px / few)] if few > 0.0 else []
+    worn_px = config.worn_px * np.sqrt(gap_s) if agent in sparse_map.disparity_sigma_px else 0.0
+    rotation_px = max(_ROTATION_SIGMA_PX, worn_px, difference_px)
+    point_px = 1.0 / np.hypot(few / max(longer * config.sigma_px, worn_px), 1.0 / rotation_px)
+    sets = [(_DEPTHS if few > 0.0 else _ROTATION_DEPTHS, point_px)]
+    if not sparse_map.measures_distances(agent):
+        sets.append((_DEPTHS, _SCALE_SIGMA_PX))
+    return sets
 
 
 def _without_lengths(step: _Step) -> _Step:
