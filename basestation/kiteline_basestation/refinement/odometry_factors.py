@@ -9,9 +9,9 @@ the same images mean another motion, so that a worn rig's steps follow the offse
 it biases rotations all in one direction: the weight decreases where rotations differ, and for rigs that are known to be
 worn. Images of a monocular submap in metres tell no scale: there weak points nearby hold the agent's, which rests on
 its IMU, or, where the map's own accelerations have corrected lengths, those that the map has there now. In a submap in
-a unit of its own, steps with few observations tell rotations and directions: its scale drifts. Between
-keyframes that look different ways the points lie between their views, off both images. Inertial steps tie the first
-keyframe of a submap to the last one of the submap before.
+a unit of its own, steps with few observations tell rotations and directions: its scale drifts. Between keyframes that
+look different ways the points lie between their views, off both images. Inertial steps tie the first keyframe of a
+submap to the last one of the submap before.
 """
 
 from collections.abc import Iterator
@@ -31,9 +31,9 @@ from kiteline_core.ids import AgentId, KeyframeId, SubmapId, agent_of_keyframe, 
 from kiteline_core.optimisation.bundle import BundleProblem, BundleResult
 
 _GRID = np.stack(np.meshgrid((-0.6, 0.0, 0.6), (-0.4, 0.4)), -1).reshape(-1, 2)  # x/z, y/z: as wide as a usual lens
+_WIDEST = float(np.hypot(*_GRID[0]))  # the farthest of these from the axis
 _PX_OF_ROTATION = 1.7  # factor from a rotation's error to the standard deviation of 6 far points, each observed twice
 _MIN_RUN = 5  # rotations for an estimate of their common error
-_WIDEST = float(np.hypot(*_GRID[0]))
 _ON_PLANE = np.column_stack([_GRID, np.ones(len(_GRID))])
 _DEPTHS = np.concatenate([0.7 * _ON_PLANE, 1.8 * _ON_PLANE])  # of the median depth: near points tell the translation
 _ROTATION_DEPTHS = 8.0 * _ON_PLANE  # the same for rotation alone

@@ -74,9 +74,11 @@ class Flown:
         except ValueError:
             return None
 
-    def ate_m(self, path: str, from_s: float = 0.0) -> float:
-        """ATE, SE3-aligned; infinite without poses."""
-        found = self.matched(path, from_s=from_s)
+    def ate_m(
+        self, path: str, from_s: float = 0.0, alignment: TrajectoryAlignment = TrajectoryAlignment.SE3
+    ) -> float:  # fmt: skip
+        """ATE after alignment; infinite without poses."""
+        found = self.matched(path, alignment, from_s)
         return float("inf") if found is None else float(np.sqrt(np.mean(metrics.position_errors(found) ** 2)))
 
     def rpe_mm(self, path: str) -> float:
