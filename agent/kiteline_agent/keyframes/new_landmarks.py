@@ -125,6 +125,11 @@ def shown_by_rows(points: NewPoints, camera: RectifiedCamera, shutter: RollingSh
 
 
 def nearby(uv: F64, places: F64, values: F64) -> F64:
-    """Values (n,) at pixels (n,2) from those (m,) at pixels places (m,2), weighted by the inverse square distance."""
+    """Values (n,) at pixels (n,2) from those (m,) at pixels places (m,2), weighted by the inverse square distance.
+
+    Zero if there are none.
+    """
+    if not len(places):
+        return np.zeros(len(uv))
     weight = 1.0 / (np.square(uv[:, None] - places[None]).sum(axis=2) + 1.0)
     return np.asarray(weight @ values / weight.sum(axis=1))

@@ -86,3 +86,9 @@ def test_depths_nearby_are_those_of_the_nearest() -> None:
     places = np.array([[0.0, 0.0], [300.0, 0.0]])
     found = nearby(np.array([[2.0, 0.0], [299.0, 0.0], [150.0, 0.0]]), places, np.array([1.0, 3.0]))
     assert found == pytest.approx([1.0, 3.0, 2.0], abs=1e-3)
+
+
+def test_without_a_depth_nearby_points_are_far_away() -> None:
+    """As in a keyframe of a frame that tracks no landmark."""
+    moved = moved_to_frame(points(0.0), CAMERA, SHUTTER, nearby(points(0.0).uv, np.zeros((0, 2)), np.zeros(0)))
+    assert np.array_equal(moved.uv, moved_to_frame(points(0.0), CAMERA, SHUTTER).uv)
