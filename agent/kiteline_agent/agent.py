@@ -345,8 +345,6 @@ class Agent:
     def _take_corrections(self, records: list[Record]) -> list[str]:
         """Apply the records of the base; the odometry frame does not move. Returns events."""
         last, anchor = self._last_track, None
-        if not self._has_depth:
-            self.map.holds_landmarks = self._camera.motion.running  # the IMU fixes the scale of the agent's own depths
         if records and last is not None:
             anchor = MapAnchor(self.map, last, self._config, inertial=self._camera.motion.running)
         moved, events = self._corrections.take(records, self._channel.take_removed(), anchor)

@@ -110,7 +110,7 @@ class LocalMapConfig:
     searched: int = 48  # keyframes whose landmarks are searched for: those seen last
     max_far_ratio: float = 400.0  # depth over baseline beyond which stereo gives no depth
     moved_px: float = 1.0  # px by which a keyframe's new pose moves landmarks at its typical depth, to be taken over
-    camera_px: float = 1.0  # px by which corrections move the camera in its own image, to be taken over (stereo)
+    camera_px: float = 1.0  # px by which corrections move the camera in its own image, to be taken over
     inertial_px: float = 2.0  # the same of an agent whose IMU runs: its poses err half as much, the base's do not
     first_points: int = 40  # landmarks with depth that the first keyframe of a submap needs
 

@@ -64,8 +64,7 @@ class Corrections:
         self._upright: GravityAlignment | None = None  # of the submap that began in motion
         self._most_tiles = most_tiles
         self.tiles: dict[tuple[int, int], GridTile] = {}
-        # A handler returns whether the local map moved.
-        self._handlers: Mapping[type[Record], Callable[[Any], bool]] = {
+        self._handlers: Mapping[type[Record], Callable[[Any], None]] = {
             KeyframePose: local_map.set_pose,
             RefinedLandmarks: local_map.refine,
             FusedLandmarks: self._fused.take,
@@ -87,13 +86,11 @@ class Corrections:
         anchor: what the last frame tracked, if it did. Corrections that move less than both maps' errors there wait.
         """
         self._events = []
-        moved = False
         for record in self._batches.take(records, removed):
             handler = self._handlers.get(type(record))
             if handler is not None:
-                moved |= handler(record)
-        if records:
-            moved |= self._apply_corrections(anchor)
+                handler(record)
+        moved = bool(records) and self._apply_corrections(anchor)
         self._cache.remove(removed)
         for key in removed:
             if key.kind == SubmapPlacement.KIND:
@@ -102,8 +99,6 @@ class Corrections:
                 column, row, storey = GridTile.place(key)
                 if (held := self.tiles.get((column, row))) is not None and held.storey == storey:
                     del self.tiles[column, row]
-        if moved:
-            self._map.compose_unplaced()
         return moved, self._events
 
     def _apply_corrections(self, anchor: MapAnchor | None) -> bool:
@@ -114,7 +109,7 @@ class Corrections:
         m.held.adapt(m.keyframe, m.parent, m.T_m_k, m.camera.bf, m.least_rho)
         slots = self._slots_of_active()
         poses = m.T_m_k[slots]
-        if anchor is not None and self._map.holds_landmarks:
+        if anchor is not None:
             before = self._map.save()
             self._map.try_corrections(anchor.keyframes)
             self._map.compose_unplaced()
@@ -135,9 +130,9 @@ class Corrections:
         slots = np.flatnonzero((m.keyframe != NO_KEYFRAME) & (m.keyframe >> SEQUENCE_BITS == m.active))
         return np.asarray(slots[np.argsort(m.last_seen[slots], kind="stable")])
 
-    def _place(self, record: SubmapPlacement) -> bool:
+    def _place(self, record: SubmapPlacement) -> None:
         if not record.recognised and self._contradicts_gravity(record.submap, record.S_w_m):
-            return False  # sent before the base knew of gravity; the upright placement follows
+            return  # sent before the base knew of gravity; the upright placement follows
         self._leave_own_world(record.submap, record.S_w_m)
         self._S_w_m[record.submap] = record.S_w_m
         self._scale_sigma[record.submap] = record.scale_sigma
@@ -150,7 +145,6 @@ class Corrections:
             self._recognised.add(record.submap)
         else:
             self._recognised.discard(record.submap)
-        return False
 
     def _withdraw(self, submap: SubmapId) -> None:
         """A submap has no place in w any more: its merge was undone, or its map is deleted.
@@ -164,16 +158,14 @@ class Corrections:
         if submap == self._map.active:
             self._clear_live()
 
-    def _take_calibration(self, record: DisparityCalibration) -> bool:
+    def _take_calibration(self, record: DisparityCalibration) -> None:
         if self._calibrate is not None:
             self._events += self._calibrate(record)
-        return False
 
-    def _add_tile(self, record: GridTile) -> bool:
+    def _add_tile(self, record: GridTile) -> None:
         self.tiles[record.column, record.row] = record
         if len(self.tiles) > self._most_tiles:  # the base sends what lies near: the farthest from that goes
             del self.tiles[max(self.tiles, key=lambda at: max(abs(at[0] - record.column), abs(at[1] - record.row)))]
-        return False
 
     def note_continued(self, submap: SubmapId) -> None:
         """A submap began in a tracked frame: odometry places it well, and its merge is a correction like others."""

@@ -91,8 +91,6 @@ class LocalMap:
         self.held = HeldCorrections()
         self._has_new_seeds = False  # some may not be initialised
         self.due = False  # some of these differ by more than both maps' errors
-        # True: landmarks to refine, add or remove wait, as poses do, until they move the image: own depths are good.
-        self.holds_landmarks = camera.stereo
         self.active = SubmapId(0)  # the submap that is tracked
         capacity = k * b
         self._facing = np.zeros((k, b, 2))  # slants
@@ -258,13 +256,12 @@ class LocalMap:
 
     # records of the base
 
-    def set_pose(self, record: KeyframePose) -> bool:
-        """Hold a keyframe's pose ready for `apply_corrections`. False: nothing moves yet."""
+    def set_pose(self, record: KeyframePose) -> None:
+        """Hold a keyframe's pose ready for `apply_corrections`."""
         slot = self.slot_of(record.keyframe)
         self.held.set_pose(record.keyframe, record.T_m_k, stored=slot >= 0)
         if slot >= 0:
             self.due |= self._shift_px(slot, record.T_m_k) >= self._config.moved_px
-        return False
 
     def apply_corrections(self) -> bool:
         """Take over all poses and landmarks that the base sent, if those of a keyframe move far enough.
@@ -318,45 +315,36 @@ class LocalMap:
         rho = self.rho[slot, self.usable[slot]]
         return float(self.camera.fx * (shift_m * (median(rho) if len(rho) else 0.0) + turn))
 
-    def remove(self, record: Removed) -> bool:
-        """Stop searching for landmarks that the base removed; held ready for `apply_corrections`."""
-        if not self.holds_landmarks:
-            return self._drop(record)
+    def remove(self, record: Removed) -> None:
+        """Hold landmarks that the base removed ready for `apply_corrections`: they are searched for until then."""
         if self.slot_of(record.keyframe) >= 0:
             self.held.removed[record.keyframe, record.KIND] = record
-        return False
 
-    def _drop(self, record: Removed) -> bool:
+    def _drop(self, record: Removed) -> None:
+        """Stop searching for landmarks that the base removed."""
         slot = self.slot_of(record.keyframe)
         if slot < 0:
-            return False
+            return
         index = record.index[record.index < self.shared[slot]].astype(np.int64)
         self.usable[slot, index] = self.seed[slot, index] = False
         self.removed[slot, index] = True
-        return True
 
-    def refine(self, record: RefinedLandmarks) -> bool:
-        """Hold landmarks ready for `apply_corrections`, or take them over at once if the map holds none."""
+    def refine(self, record: RefinedLandmarks) -> None:
+        """Hold refined landmarks ready for `apply_corrections`."""
         slot = self.slot_of(record.keyframe)
         if slot < 0:
-            return False
+            return
         keep = (record.index < self.shared[slot]) & (record.inv_depth > 0.0)
         index = record.index[keep].astype(np.int64)
         rho = record.inv_depth[keep].astype(np.float64)
         bearing = self._bearings(self.uv[slot, index] + record.offset[keep])
         self.held.landmarks.pop(record.keyframe, None)  # older ones, that waited
-        if not self.holds_landmarks:
-            fresh = self._is_fresh(slot, index)
-            self._set_landmarks(slot, index[~fresh], rho[~fresh], bearing[~fresh])
-            self._add_fresh(slot, index, rho, bearing)
-            return bool(len(index))
         if len(index):
             self.held.set_landmarks(record.keyframe, index, rho, bearing)
             turned = np.hypot(*(bearing - self.bearing[slot, index]).T) * self.camera.fx
             nearer = np.abs(rho - self.rho[slot, index]) * self.camera.bf
             px = np.maximum(turned, nearer)[~self._is_fresh(slot, index)]
             self.due |= len(px) > 0 and median(px) >= self._config.moved_px
-        return False
 
     def _is_fresh(self, slot: int, index: I64) -> Bool:
         """Which landmarks of a slot have no depth of their own: only the base could triangulate them.

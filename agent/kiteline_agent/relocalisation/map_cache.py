@@ -102,8 +102,8 @@ class MapCache:
     def __len__(self) -> int:
         return int(np.count_nonzero(self.keyframe != NO_KEYFRAME))
 
-    def store(self, record: CachedKeyframe | CachedLandmarks) -> bool:
-        """Take over the pose of a cached keyframe, or some of its landmarks. False: the local map does not move."""
+    def store(self, record: CachedKeyframe | CachedLandmarks) -> None:
+        """Take over the pose of a cached keyframe, or some of its landmarks."""
         slot = self._slot(record.keyframe)
         self._clock += 1
         self._touched[slot] = self._clock
@@ -113,7 +113,6 @@ class MapCache:
         else:
             self._parts[slot][record.part] = record
             self._fill(slot)
-        return False
 
     def remove(self, keys: Sequence[Key]) -> None:
         """Drop the cached keyframes that the base removed."""

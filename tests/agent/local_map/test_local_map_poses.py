@@ -47,7 +47,9 @@ def add(held: LocalMap, k: int, parent: int = NO_KEYFRAME) -> None:
 
 def told(held: LocalMap, k: int, shift_m: float, turn_rad: float = 0.0) -> None:
     T = se3.from_rt(se3.so3_exp(np.array([0.0, turn_rad, 0.0])), np.array([shift_m, 0.0, 0.0]))
-    assert not held.set_pose(KeyframePose(KeyframeId(k), T))  # nothing moves record by record
+    before = held.T_m_k.copy()
+    held.set_pose(KeyframePose(KeyframeId(k), T))
+    assert np.array_equal(held.T_m_k, before)  # nothing moves record by record
 
 
 def shifts(held: LocalMap, keyframes: int = 4) -> list[float]:
@@ -113,32 +115,23 @@ def test_the_order_of_records_does_not_matter(order: list[int], share: list[floa
     assert shifts(one) == shifts(other)
 
 
-def refined(held: LocalMap, k: int, offset_px: float) -> bool:
+def refined(held: LocalMap, k: int, offset_px: float) -> None:
     index = np.arange(20, dtype=np.uint16)
     offset = np.tile(np.array([offset_px, 0.0], np.float32), (20, 1))
-    return held.refine(RefinedLandmarks(KeyframeId(k), index, np.full(20, 1.0 / DEPTH_M, np.float32), offset))
+    held.refine(RefinedLandmarks(KeyframeId(k), index, np.full(20, 1.0 / DEPTH_M, np.float32), offset))
 
 
-@pytest.mark.parametrize("with_imu", [False, True])
-def test_a_monocular_camera_takes_refined_landmarks_at_once_unless_an_imu_holds_its_scale(with_imu: bool) -> None:
-    held = local_map(camera=replace(CAMERA, stereo=False))
-    held.holds_landmarks = held.holds_landmarks or with_imu
-    held.share(KeyframeId(0), 30)
-    before = held.bearing.copy()
-    assert refined(held, 0, 0.5 * CONFIG.local_map.moved_px) != with_imu
-    assert (np.abs(held.bearing - before)[held.slot_of(KeyframeId(0))].max() > 0.0) != with_imu
-
-
-def test_refined_landmarks_wait_with_the_poses() -> None:
-    held = local_map()
+@pytest.mark.parametrize("stereo", [False, True])
+def test_refined_landmarks_wait_with_the_poses(stereo: bool) -> None:
+    held = local_map(camera=replace(CAMERA, stereo=stereo))
     for k in range(4):
         held.share(KeyframeId(k), 30)
     before = held.bearing.copy()
-    assert not refined(held, 0, 0.5 * CONFIG.local_map.moved_px)
+    refined(held, 0, 0.5 * CONFIG.local_map.moved_px)
     told(held, 1, 0.5 * LEAST_M)
     assert not held.apply_corrections()
     assert np.array_equal(held.bearing, before)
-    assert not refined(held, 2, 1.5 * CONFIG.local_map.moved_px)  # these count, and bring all the others
+    refined(held, 2, 1.5 * CONFIG.local_map.moved_px)  # these count, and bring all the others
     assert held.apply_corrections()
     moved = np.abs(held.bearing - before).max(axis=(1, 2)) * CAMERA.fx / CONFIG.local_map.moved_px
     assert np.allclose(moved[:4], [0.5, 0.0, 1.5, 0.0])
@@ -147,24 +140,22 @@ def test_refined_landmarks_wait_with_the_poses() -> None:
 
 
 def test_landmarks_that_waited_do_not_come_after_newer_ones() -> None:
-    """An IMU that is no longer initialised ends the waiting of a monocular map."""
-    held = local_map(camera=replace(CAMERA, stereo=False))
-    held.holds_landmarks = True
+    held = local_map()
     held.share(KeyframeId(0), 30)
-    assert not refined(held, 0, 0.5 * CONFIG.local_map.moved_px)
-    held.holds_landmarks = False
-    assert refined(held, 0, 0.1 * CONFIG.local_map.moved_px)
-    newest = held.bearing.copy()
+    before = held.bearing.copy()
+    for share in (0.5, 0.1):
+        refined(held, 0, share * CONFIG.local_map.moved_px)
     told(held, 1, 2.0 * LEAST_M)
     assert held.apply_corrections()
-    assert np.array_equal(held.bearing, newest)
+    moved = np.abs(held.bearing - before).max(axis=(1, 2)) * CAMERA.fx / CONFIG.local_map.moved_px
+    assert np.allclose(moved[held.slot_of(0)], 0.1)
 
 
 def test_landmarks_that_only_the_base_could_triangulate_wait_with_the_others() -> None:
     held = local_map()
     held.share(KeyframeId(0), 30)
     held.usable[0, :5], held.seed[0, :5] = False, True
-    assert not refined(held, 0, 0.2)
+    refined(held, 0, 0.2)
     saved = held.save()
     held.try_corrections([KeyframeId(0)])  # nothing was tracked there: they tell nothing of the camera
     assert held.seed[0, :5].all()
@@ -177,29 +168,25 @@ def test_landmarks_that_only_the_base_could_triangulate_wait_with_the_others() -
     assert np.allclose(held.rho[0, :5], 1.0 / DEPTH_M)
 
 
-@pytest.mark.parametrize("holds", [False, True])
 @pytest.mark.parametrize("kind", [CulledLandmarks, RemovedObservations])
 def test_removed_landmarks_are_searched_until_corrections_matter(
-    kind: type[CulledLandmarks | RemovedObservations], holds: bool
+    kind: type[CulledLandmarks | RemovedObservations],
 ) -> None:
     held = local_map()
-    held.holds_landmarks = holds
     held.share(KeyframeId(0), 30)
     index = np.array([3, 4], np.uint16)
     culled = kind is CulledLandmarks
     record = CulledLandmarks(KeyframeId(0), index, 0) if culled else RemovedObservations(KeyframeId(0), index)
-    assert held.remove(record) != holds
-    assert held.usable[0, 3:5].all() == holds
+    held.remove(record)
+    assert held.usable[0, 3:5].all()
     told(held, 1, 2.0 * LEAST_M)
     assert held.apply_corrections()
     assert np.flatnonzero(~held.usable[0, :30]).tolist() == [3, 4]
 
 
-@pytest.mark.parametrize("holds", [False, True])
-def test_a_removed_landmark_stays_so_though_the_base_refines_it(holds: bool) -> None:
+def test_a_removed_landmark_stays_so_though_the_base_refines_it() -> None:
     """Others still observe it at the base, and the agent has never tracked it."""
     held = local_map()
-    held.holds_landmarks = holds
     held.share(KeyframeId(0), 30)
     held.usable[0, :5], held.seed[0, :5] = False, True
     refined(held, 0, 0.2)
@@ -234,17 +221,15 @@ def test_a_fused_landmark_is_dropped_once_the_base_has_set_both_poses() -> None:
     held.share(KeyframeId(2), 30)
     slot, roots = held.slot_of(2), np.array([1 << KEYPOINT_BITS | 7, 9 << KEYPOINT_BITS | 3])
     fused = FusedInMap(held)
-    assert not fused.take(FusedLandmarks(KeyframeId(2), np.array([4, 5], np.uint16), roots))
+    fused.take(FusedLandmarks(KeyframeId(2), np.array([4, 5], np.uint16), roots))
     assert held.usable[slot, :30].all()  # drift lies between the keyframes
     told(held, 2, 1.1 * LEAST_M)
     assert held.apply_corrections()
     fused.corrected()
     assert np.flatnonzero(~held.usable[slot, :30]).tolist() == [4]  # the other root is not stored here
-    later = FusedLandmarks(KeyframeId(2), np.array([4, 6], np.uint16), roots[[0, 0]])
-    assert not fused.take(later)  # waits with the next corrections that matter
-    assert held.usable[slot, 6]
-    held.holds_landmarks = False
-    assert fused.take(later)
+    fused.take(FusedLandmarks(KeyframeId(2), np.array([4, 6], np.uint16), roots[[0, 0]]))
+    assert held.usable[slot, 6]  # waits with the next corrections that matter
+    fused.corrected()
     assert not held.usable[slot, 6]
 
 

@@ -116,11 +116,12 @@ def test_a_keyframe_that_moves_without_its_landmarks_moves_nothing() -> None:
 @pytest.mark.parametrize("left", [10, 40])
 def test_culled_landmarks_do_not_count(left: int) -> None:
     local_map, track = scene()
-    local_map.holds_landmarks = False
     anchor = MapAnchor(local_map, track, CONFIG, inertial=False)
     move(local_map, 0, se3.exp(np.array([0.2, 0.0, 0.0, 0.0, 0.0, 0.0])))
     local_map.remove(CulledLandmarks(KeyframeId(0), np.arange(LANDMARKS, dtype=np.uint16), 0))
     local_map.remove(CulledLandmarks(KeyframeId(1), np.arange(left, LANDMARKS, dtype=np.uint16), 0))
+    local_map.due = True
+    assert local_map.apply_corrections()
     found = anchor.motion()
     if left < CONFIG.pose.min_inliers:
         assert found is None
