@@ -116,14 +116,14 @@ def test_a_loop_takes_back_the_drift_of_the_unit(make_flight: MakeFlight, ring: 
     assert np.median(drifted[-8:]) / np.median(drifted[:8]) > 1.0 + 36 * growth
     assert abs(np.median(mended[-8:]) / np.median(mended[:8]) - 1.0) < 0.04
     assert abs(np.median(mended[:8]) / np.median(drifted[:8]) - 1.0) < 0.05  # the world keeps its unit
-    # Where the agent flies nothing was stretched: its place says how long its unit has become.
+    # Where the agent flies nothing was stretched: its place says how long its unit has become, by twenty keyframes.
     submap = submap_of_keyframe(flight.keyframes[0])
     last = [r for r in published if isinstance(r, SubmapPlacement)][-1]
     assert np.allclose(last.S_w_m, mapper.placements[submap], atol=1e-5)
-    assert sim3.scale_of(last.S_w_m) < 1.0 - 30 * growth
+    assert sim3.scale_of(last.S_w_m) < 1.0 - 26 * growth  # between the middles of the first twenty and the last
     steps = [blind[-9:, :3, 3], np.array([mapper.map.pose(k)[:3, 3] for k in flight.keyframes[-9:]])]  # type: ignore[index]
     ours, theirs = (np.median(np.linalg.norm(np.diff(s, axis=0), axis=1)) for s in steps)
-    assert abs(theirs / ours - 1.0) < 0.015
+    assert abs(theirs / ours - 1.0) < 0.005 + 6 * growth  # from the middle of twenty to that of eight
 
 
 Met = tuple[Any, Any, Mapper, list[Record]]

@@ -6,6 +6,7 @@ import numpy as np
 
 from kiteline_basestation.config import PublishConfig
 from kiteline_basestation.exchange.publisher import Publisher
+from kiteline_basestation.inertial.units import unit_in
 from kiteline_basestation.map.map_tables import CULLED, LANDMARK, REFINED_POSE, REMOVED
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.refinement.bundle_window import BundleWindow
@@ -15,8 +16,7 @@ from kiteline_core.geometry import se3, sim3
 from kiteline_core.ids import KeyframeId, SubmapId
 from kiteline_core.optimisation.bundle import BundleResult
 
-_ENDS = 8  # keyframes at the begin or the end of a submap where the change of scale is measured
-_MIN_LANDMARKS = 20  # landmarks for that
+_ENDS = 20  # keyframes at the begin or the end of a submap whose steps tell its unit there: single steps may be torn
 _MIN_OBSERVATIONS = 2  # observations that must remain after the outlier test
 _MAX_OFFSET_PX = 8.0  # px at octave 0; from the keypoint to the refined projection: more is another landmark
 
@@ -113,66 +113,35 @@ def keep_scales(
 ) -> tuple[BundleResult, dict[SubmapId, float]]:  # fmt: skip
     """Set the units of monocular submaps to what a full bundle found.
 
-    A submap of unknown scale keeps the lengths of its newest keyframes, so that nothing changes for the agent there:
-    its unit takes on the change. If the whole map has no metric scale, lengths at the oldest keyframes do not change
-    in w. Agents take the unit of a submap in metres for a metre: once inertial steps tell lengths in w, it is one, and
-    these agents are told corrected lengths. Returns the result, and the factors by submap.
+    Agents tell their steps in the unit of their submap. Its placement has the length of that at the newest keyframes,
+    so that nothing changes for the agent there. If the whole map has no metric scale, lengths in w are those that were
+    told at its oldest keyframes. Neither is by what the map held before, or it would grow a little with each bundle:
+    values that a bundle hardly changes stay as they are, in the unit of before. Agents take the unit of a submap in
+    metres for a metre: once inertial steps tell lengths in w, it is one, and these agents are told corrected lengths.
+    Returns the result, and the factors by submap.
     """
     submaps = sparse_map.submaps_of_map(map_id)
-    own = [s for s in submaps if sparse_map.is_up_to_scale(s)]
-    factors = {s: _scale_change(sparse_map, sparse_map.submaps[s][-_ENDS:], window, result) for s in own}
-    root = sparse_map.map_id(map_id)
+    root, rows, T_c_m = sparse_map.map_id(map_id), window.rows, result.T_c_m
+    units = {
+        s: unit_in(sparse_map, sparse_map.submaps[s][-_ENDS:], rows, T_c_m) or sparse_map.scale(s)
+        for s in submaps
+        if sparse_map.is_up_to_scale(s)
+    }
     if sparse_map.is_up_to_scale(root):
-        whole = _scale_change(sparse_map, sparse_map.submaps[root][:_ENDS], window, result)
+        whole = unit_in(sparse_map, sparse_map.submaps[root][:_ENDS], rows, T_c_m) or 1.0
         centre = sim3.place(sparse_map.submap_pose(root), sparse_map.first_pose(root))[:3, 3]
-        poses = np.linalg.inv(result.T_c_m)
+        poses = np.linalg.inv(T_c_m)
         poses[:, :3, 3] = centre + (poses[:, :3, 3] - centre) / whole
         result = replace(result, T_c_m=np.linalg.inv(poses), points=centre + (result.points - centre) / whole)
-        factors = {submap: factor / whole for submap, factor in factors.items()}
+        units = {submap: unit / whole for submap, unit in units.items()}
     elif result.scale_sigma > 0.0:
         scaled = [s for s in submaps if sparse_map.has_metric_scale_by_imu(s)]
-        factors |= {s: 1.0 / sparse_map.scale(s) for s in scaled if sparse_map.scale(s) != 1.0}
+        units |= {s: 1.0 for s in scaled if sparse_map.scale(s) != 1.0}
         sparse_map.scaled_submaps.update(scaled)
+    factors = {submap: unit / sparse_map.scale(submap) for submap, unit in units.items()}
     for submap, factor in factors.items():
         sparse_map.scale_submap(submap, factor)
     return result, factors
-
-
-def _scale_change(
-    sparse_map: SparseMap, keyframes: list[KeyframeId], window: BundleWindow, result: BundleResult
-) -> float:
-    """Median factor by which a bundle changed depths in keyframes: of landmarks that began there, if enough did."""
-    table = sparse_map.keyframes
-    rows = [sparse_map.rows[k] for k in keyframes]
-    anchors = sparse_map.keypoints.row[window.points]
-    number = np.full(sparse_map.height, -1, np.int64)
-    number[window.rows] = np.arange(len(window.rows))
-    here = np.isin(anchors, rows) & (number[anchors] >= 0)
-    if np.count_nonzero(here) < _MIN_LANDMARKS:
-        return _observed_change(sparse_map, keyframes, window, result)
-    T = result.T_c_m[number[anchors[here]]]
-    after = np.einsum("nj,nj->n", T[:, 2, :3], result.points[here]) + T[:, 2, 3]
-    inverse = sparse_map.inverse_depths(window.points[here]) / table.scale[anchors[here]]
-    good = (after > 0.0) & (inverse > 0.0)
-    return float(np.median(after[good] * inverse[good])) if np.count_nonzero(good) >= _MIN_LANDMARKS else 1.0
-
-
-def _observed_change(
-    sparse_map: SparseMap, keyframes: list[KeyframeId], window: BundleWindow, result: BundleResult
-) -> float:
-    """Median factor by which a bundle changed depths of what keyframes observe; 1 if that is too little."""
-    problem = window.problem
-    rows = np.array([sparse_map.rows[k] for k in keyframes], np.int32)
-    camera = problem.camera[: len(window.slots)]
-    here = np.isin(window.rows[camera], rows) & result.inlier[: len(window.slots)]
-    camera = camera[here]
-    point = np.repeat(np.arange(len(window.points)), np.diff(problem.starts[: len(window.points) + 1]))[here]
-    before, after = (
-        np.einsum("nj,nj->n", T[camera, 2, :3], points[point]) + T[camera, 2, 3]
-        for T, points in ((problem.T_c_m, problem.points), (result.T_c_m, result.points))
-    )
-    good = (before > 0.0) & (after > 0.0)
-    return float(np.median(after[good] / before[good])) if np.count_nonzero(good) >= _MIN_LANDMARKS else 1.0
 
 
 def cull_landmarks(sparse_map: SparseMap, points: I32, publisher: Publisher) -> None:

@@ -9,9 +9,9 @@ the same images mean another motion, so that a worn rig's steps follow the offse
 it biases rotations all in one direction: the weight decreases where rotations differ, and for rigs that are known to be
 worn. Images of a monocular submap in metres tell no scale: there weak points nearby hold the agent's, which rests on
 its IMU, or, where the map's own accelerations have corrected lengths, those that the map has there now. In a submap in
-a unit of its own, steps with few observations tell rotations and directions: its scale drifts. Between keyframes that
-look different ways the points lie between their views, off both images. Inertial steps tie the first keyframe of a
-submap to the last one of the submap before.
+a unit of its own, which drifts, steps tell lengths by those that the steps around have in the map, where observations
+are few. Between keyframes that look different ways the points lie between their views, off both images. Inertial steps
+tie the first keyframe of a submap to the last one of the submap before.
 """
 
 from collections.abc import Iterator
@@ -38,14 +38,12 @@ _ON_PLANE = np.column_stack([_GRID, np.ones(len(_GRID))])
 _DEPTHS = np.concatenate([0.7 * _ON_PLANE, 1.8 * _ON_PLANE])  # of the median depth: near points tell the translation
 _ROTATION_DEPTHS = 8.0 * _ON_PLANE  # the same for rotation alone
 _MOST_PX = 1e5  # above any disparity, so that one sort orders by camera and disparity
-_UNKNOWN_DEPTH = 3.0  # where a keyframe has no disparities
+_UNKNOWN_DEPTH = 3.0  # where a keyframe observes nothing
 _LEAST_POINTS = 4  # synthetic points of a step
 _NO_DISPARITY, _NO_GROUP = -1.0, -1
 _ROTATION_SIGMA_PX = 0.1  # px; of each of 6 far synthetic points: together they hold rotation to 0.15 mrad
 _SCALE_SIGMA_PX = 2.0  # px; of each of 12 more in monocular submaps in metres, whose images tell no scale
-_OWN_UNIT_SIGMA_PX = 0.25  # px; of each of 12 points of 0.5 s without observations, in a submap in a unit of its own
-_STEPS_DIFFER = 2.0  # times the difference of rotations between map and steps, if that is more
-_LOOSE_DISPARITY_PX = 3.0  # px; of the disparities of these, 4 to 11 px
+_OWN_UNIT_SHARE = 0.005  # of its distance; deviation of that of a point without observations, in an own unit
 _WIDE_COS = 0.77  # of the angle between two views beyond which points lie between them: 40 degrees
 _STEEPEST_RAD = 1.3  # from an optical axis to such points, where the views leave room for it: 75 degrees
 _LEAST_SPREAD = 0.1  # of these points along the turn, as a share of the usual one
@@ -132,7 +130,7 @@ def _steps(
             continue
         gap_s = abs(float(table.t_ns[row] - table.t_ns[window.rows[p]])) * 1e-9
         few = max(0.0, 1.0 - min(counts[k], counts[p]) / config.enough_observations)
-        ranged, without_unit = sparse_map.measures_distances(agent), sparse_map.is_up_to_scale(submap)
+        ranged = sparse_map.measures_distances(agent)
         sets = _point_sets(sparse_map, submap, config, few, gap_s, difference_px)
         own = submap_of_keyframe(KeyframeId(int(table.id[window.rows[p]]))) == submap
         T_p_k = sim3.with_scaled_translation(T_p_k, float(units[k] if own else units[p]))
@@ -140,8 +138,8 @@ def _steps(
             step = _synthetic_points(problem, k, p, T_p_k, depths, float(depth[k]), sigma_px)
             if step is None:
                 continue
-            if without_unit:
-                step = _without_lengths(step)
+            if sparse_map.is_up_to_scale(submap):
+                step = _by_distance(step, few)
             elif ranged and depths is _DEPTHS and not _is_wide(T_p_k):
                 change_px = sparse_map.offset_measured_with(keyframe) - _assumed(sparse_map, agent, of_camera[k])
                 step = _following_offset(problem.lens[k], step, change_px)
@@ -156,24 +154,26 @@ def _point_sets(
 
     few: from 0, where observations are enough, to 1 without any. gap_s: of the step. difference_px: of rotations.
     """
-    agent, longer = agent_of_submap(submap), np.sqrt(max(1.0, gap_s / _USUAL_S))
-    if sparse_map.is_up_to_scale(submap):
-        own_px = max(longer * _OWN_UNIT_SIGMA_PX, _STEPS_DIFFER * difference_px)
-        return [(_DEPTHS, own_px / few)] if few > 0.0 else []
+    agent, own_unit = agent_of_submap(submap), sparse_map.is_up_to_scale(submap)
+    if own_unit and few <= 0.0:
+        return []  # the images tell more of its drift than the steps do
+    longer = np.sqrt(max(1.0, gap_s / _USUAL_S))
     worn_px = config.worn_px * np.sqrt(gap_s) if agent in sparse_map.disparity_sigma_px else 0.0
     rotation_px = max(_ROTATION_SIGMA_PX, worn_px, difference_px)
     point_px = 1.0 / np.hypot(few / max(longer * config.sigma_px, worn_px), 1.0 / rotation_px)
     sets = [(_DEPTHS if few > 0.0 else _ROTATION_DEPTHS, point_px)]
-    if not sparse_map.measures_distances(agent):
+    if not (own_unit or sparse_map.measures_distances(agent)):
         sets.append((_DEPTHS, _SCALE_SIGMA_PX))
     return sets
 
 
-def _without_lengths(step: _Step) -> _Step:
-    """A step that tells its direction and rotation: its points' distances are hardly known, but no point runs off."""
-    sigma_k, sigma_p = step.sigma_k.copy(), step.sigma_p.copy()
-    sigma_k[:, 1] = sigma_p[:, 1] = _LOOSE_DISPARITY_PX
-    return step._replace(sigma_k=sigma_k, sigma_p=sigma_p)
+def _by_distance(step: _Step, few: float) -> _Step:
+    """A step in a unit of its own, of which no baseline is known: disparities deviate by a share of themselves."""
+    share = _OWN_UNIT_SHARE / few
+    return step._replace(
+        sigma_k=np.column_stack([step.sigma_k[:, 0], share * step.in_k[:, 2]]),
+        sigma_p=np.column_stack([step.sigma_p[:, 0], share * step.in_p[:, 2]]),
+    )
 
 
 def _following_offset(lens: F64, step: _Step, change_px: F64) -> _Step:
@@ -234,9 +234,17 @@ def _rotation_difference_px(sparse_map: SparseMap, window: BundleWindow, number:
 
 
 def median_depths(problem: BundleProblem) -> F64:
-    """The median depth (k,) that each camera observes, by its disparities."""
-    seen = problem.measured[:, 2] > 0.0
-    camera, disparity = problem.camera[seen], problem.measured[seen, 2]
+    """The median depth (k,) that each camera observes, by its disparities; if it has none, by those in the map."""
+    camera, disparity = problem.camera, problem.measured[:, 2]
+    seen = disparity > 0.0
+    without = np.bincount(camera, seen, minlength=len(problem.T_c_m)) == 0
+    if without.any():
+        point, T = problem.points[np.repeat(np.arange(len(problem.points)), np.diff(problem.starts))], problem.T_c_m
+        z = np.einsum("nj,nj->n", T[camera, 2, :3], point) + T[camera, 2, 3]
+        ahead = without[camera] & (z > 0.0)
+        disparity = np.divide(problem.lens[camera, 4], z, out=disparity.copy(), where=ahead)
+        seen = seen | ahead
+    camera, disparity = camera[seen], disparity[seen]
     disparity = np.sort(camera * _MOST_PX + disparity) - np.sort(camera) * _MOST_PX  # by camera, then by disparity
     count = np.bincount(camera, minlength=len(problem.T_c_m))
     known = count > 0

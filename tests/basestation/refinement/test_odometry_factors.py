@@ -291,16 +291,21 @@ def test_a_keyframe_without_observations_stays_tied_to_its_parent() -> None:
     assert {0, 1} <= set(added.tolist())
 
 
-def test_median_depths_are_those_of_each_camera_s_disparities() -> None:
+def test_median_depths_are_those_of_each_camera_s_disparities_or_else_of_the_map() -> None:
     sparse_map, _ = flight(0.3, 40, unseen=3)
     part = window(sparse_map)
     problem = part.problem
     measured = problem.measured.copy()
     measured[problem.camera == 2, 2] = -1.0
     depth = median_depths(replace(problem, measured=measured))
+    of = np.repeat(np.arange(len(problem.points)), np.diff(problem.starts))
     for k in range(KEYFRAMES):
         disparity = measured[(problem.camera == k) & (measured[:, 2] > 0), 2]
-        assert depth[k] == pytest.approx(CAMERA.bf / np.median(disparity) if k != 2 else 3.0, rel=1e-9)
+        by_map = se3.transform(problem.T_c_m[k], problem.points[of[problem.camera == k]])[:, 2]
+        expected = CAMERA.bf / np.median(CAMERA.bf / by_map if k == 2 else disparity)
+        assert depth[k] == pytest.approx(expected, rel=1e-6)
+    nothing = replace(problem, points=problem.points - [0.0, 0.0, 100.0], measured=np.full_like(measured, -1.0))
+    assert np.array_equal(median_depths(nothing), np.full(KEYFRAMES, 3.0))  # all behind
 
 
 def test_a_map_with_another_unit_that_no_accelerations_corrected_is_held_to_it() -> None:
