@@ -67,8 +67,19 @@ def table(report: Report) -> str:
             f"{counted(base['loops'], 'loop')}, {counted(base['merges'], 'merge')}, digests {digests}, "
             f"bundle {base['timing']['bundle_ms']['p50']:.1f} ms, {base['timing']['rss_mib']:.0f} MiB"
         )
-    lines.extend(f"note: {note}" for note in (*report.get("notes", ()), *_agent_notes(report["agents"])))
+    notes = (*report.get("notes", ()), *_link_notes(report), *_agent_notes(report["agents"]))
+    lines.extend(f"note: {note}" for note in notes)
     return "\n".join(lines)
+
+
+def _link_notes(report: Report) -> Iterator[str]:
+    """What became of the map on its way to the base, if not all of it has arrived."""
+    base, drained = report.get("base"), report.get("drain", {}).get("base", {})
+    if base and base["digest_equal"] is False and not base.get("agents_lost") and "flight_ms" in drained:
+        yield (
+            f"{drained['flight_ms'] / 1000:.0f} s after the last frame the link had not carried the whole map yet; "
+            "a link with more bytes a second does (--link-bytes)"
+        )
 
 
 def _agent_notes(agents: Sequence[Report]) -> Iterator[str]:

@@ -183,6 +183,15 @@ def test_the_table_shows_what_counts(folder: Path) -> None:
     assert "digests equal" in lines[2]
 
 
+def test_the_table_tells_why_digests_differ_at_the_end(folder: Path) -> None:
+    report = json.loads((folder / "report.json").read_text())
+    assert "link" not in table(report)
+    report["base"]["digest_equal"], report["drain"]["base"]["flight_ms"] = False, 30050
+    assert "note: 30 s after the last frame the link had not carried the whole map yet; " in table(report)
+    report["base"]["agents_lost"] = [0]
+    assert "note: 30 s" not in table(report)
+
+
 def test_the_table_tells_what_was_skipped_and_what_to_check() -> None:
     timing = {"cpu_ms_per_frame": statistic([]), "rss_mib": 1.0}
     agent = {
