@@ -345,6 +345,7 @@ class Agent:
     def _take_corrections(self, records: list[Record]) -> list[str]:
         """Apply the records of the base; the odometry frame does not move. Returns events."""
         last, anchor = self._last_track, None
+        self.map.in_own_unit = not self._camera.motion.in_metres
         if records and last is not None:
             anchor = MapAnchor(self.map, last, self._config, inertial=self._camera.motion.running)
         moved, events = self._corrections.take(records, self._channel.take_removed(), anchor)

@@ -29,6 +29,7 @@ _SEED_DEPTH_M = 1e4  # stands for infinity in landmarks without depth
 _MIN_TRIES = 12  # frames that must have searched a landmark before it is given up
 _TRIES_A_HIT = 5  # frames that search a landmark for one that finds it; with more it is given up
 _REFINED_SIGMA_PX = 0.08  # px: virtual disparity error of a depth that the base refined
+_USUAL_DEPTH = 4.0  # units; median depth with which a map begins in a unit of its own
 _FLOOR_PX = 0.06  # px: smallest virtual disparity error of the filter
 _MAX_SCALE = 2.5  # change of distance since the template was cut, as a factor
 
@@ -92,6 +93,7 @@ class LocalMap:
         self._has_new_seeds = False  # some may not be initialised
         self.due = False  # some of these differ by more than both maps' errors
         self.active = SubmapId(0)  # the submap that is tracked
+        self.in_own_unit = False  # lengths in it are in a unit of its own, and not in metres
         capacity = k * b
         self._facing = np.zeros((k, b, 2))  # slants
         self._row = np.zeros(capacity, np.int64)
@@ -342,7 +344,7 @@ class LocalMap:
         if len(index):
             self.held.set_landmarks(record.keyframe, index, rho, bearing)
             turned = np.hypot(*(bearing - self.bearing[slot, index]).T) * self.camera.fx
-            nearer = np.abs(rho - self.rho[slot, index]) * self.camera.bf
+            nearer = np.abs(rho - self.rho[slot, index]) * self._virtual_bf(slot)
             px = np.maximum(turned, nearer)[~self._is_fresh(slot, index)]
             self.due |= len(px) > 0 and median(px) >= self._config.moved_px
 
@@ -364,7 +366,15 @@ class LocalMap:
         self.rho[slot, index], self.bearing[slot, index] = rho, bearing
         self.row_parallax.refer(slot, index, rho)
         self.measured[slot, index] = False
-        self.sigma_rho[slot, index] = _REFINED_SIGMA_PX / self.camera.bf
+        self.sigma_rho[slot, index] = _REFINED_SIGMA_PX / self._virtual_bf(slot)
+
+    def _virtual_bf(self, slot: int) -> float:
+        """Focal length in px times baseline, by which depths in a keyframe are compared in px of disparity.
+
+        In a unit of its own the same baseline is a centimetre here and a metre there: as wide as where a map begins.
+        """
+        rho = self.rho[slot, self.usable[slot]] if self.in_own_unit else np.zeros(0)
+        return self.camera.bf / (_USUAL_DEPTH * median(rho)) if len(rho) else self.camera.bf
 
     def offset_px(self, uv: F64) -> F64:
         """Error (n,) of stereo disparities at pixels (n,2)."""

@@ -13,10 +13,11 @@ from kiteline_basestation.refinement.bundle_window import BundleWindow
 from kiteline_codec.schema import CulledLandmarks, KeyframePose, RefinedLandmarks, RemovedObservations
 from kiteline_core.arrays import F64, I32, Bool
 from kiteline_core.geometry import se3, sim3
-from kiteline_core.ids import KeyframeId, SubmapId
+from kiteline_core.ids import KeyframeId, SubmapId, submap_of_keyframe
 from kiteline_core.optimisation.bundle import BundleResult
 
 _ENDS = 20  # keyframes at the begin or the end of a submap whose steps tell its unit there: single steps may be torn
+_USUAL_DEPTH = 4.0  # units; median depth with which agents begin a map in a unit of its own
 _MIN_OBSERVATIONS = 2  # observations that must remain after the outlier test
 _MAX_OFFSET_PX = 8.0  # px at octave 0; from the keypoint to the refined projection: more is another landmark
 
@@ -97,15 +98,32 @@ def _points(
     too_far = ~ahead | (np.abs(offset).max(axis=1, initial=0.0) > _MAX_OFFSET_PX * np.exp2(table.octave[points]))
     cull_landmarks(sparse_map, points[too_far], publisher)
     points, inv, offset = points[~too_far], inv[~too_far], offset[~too_far]
-    bf = sparse_map.keyframes.camera[table.row[points], 4]
     change = np.maximum(
-        np.abs(inv - sparse_map.inverse_depths(points)) * bf,
+        np.abs(inv - sparse_map.inverse_depths(points)) * _virtual_bf(sparse_map, points),
         np.abs(offset - table.offset[points]).max(axis=1, initial=0.0),
     )
     moved = points[change > publish.depth_px]
     if len(moved):
         sparse_map.set_depths(moved, inv[change > publish.depth_px], offset[change > publish.depth_px])
         publisher.mark_changed_slots(RefinedLandmarks.KIND, moved)
+
+
+def _virtual_bf(sparse_map: SparseMap, points: I32) -> F64:
+    """Focal length in px times baseline, by which depths of landmarks (n,) are compared in px of disparity.
+
+    In a unit of its own the same baseline is a centimetre here and a metre there: as wide as where a map begins, in a
+    keyframe whose landmarks are that far away.
+    """
+    table, keyframes = sparse_map.keypoints, sparse_map.keyframes
+    rows = table.row[points]
+    bf: F64 = keyframes.camera[rows, 4].copy()
+    for row in np.unique(rows).tolist():
+        if sparse_map.is_up_to_scale(submap_of_keyframe(KeyframeId(int(keyframes.id[row])))):
+            here = rows == row
+            inverse = sparse_map.inverse_depths(points[here])
+            if (known := inverse > 0.0).any():
+                bf[here] /= _USUAL_DEPTH * np.median(inverse[known])
+    return bf
 
 
 def keep_scales(

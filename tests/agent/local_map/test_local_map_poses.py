@@ -139,6 +139,23 @@ def test_refined_landmarks_wait_with_the_poses(stereo: bool) -> None:
     assert not held.apply_corrections()  # once
 
 
+@pytest.mark.parametrize("units", [0.2, 1.0, 40.0])
+def test_depths_in_a_unit_of_its_own_count_alike_in_any_unit(units: float) -> None:
+    """A map that began a hand's breadth above a floor has its walls at a hundred units."""
+    held = local_map(camera=replace(CAMERA, stereo=False))
+    held.in_own_unit = True
+    held.share(KeyframeId(0), 30)
+    held.rho[held.rho > 0.0] = 1.0 / (DEPTH_M * units)
+    index, offset = np.arange(20, dtype=np.uint16), np.zeros((20, 2), np.float32)
+    for growth, counts in ((1.02, False), (1.2, True)):
+        inverse = np.full(20, 1.0 / (growth * DEPTH_M * units), np.float32)
+        held.refine(RefinedLandmarks(KeyframeId(0), index, inverse, offset))
+        assert held.due == counts
+    assert held.apply_corrections()
+    slot = held.slot_of(KeyframeId(0))
+    assert np.allclose(held.sigma_rho[slot, :20] / held.rho[slot, :20], 0.08 * 4.0 / CAMERA.bf, rtol=0.3)
+
+
 def test_landmarks_that_waited_do_not_come_after_newer_ones() -> None:
     held = local_map()
     held.share(KeyframeId(0), 30)

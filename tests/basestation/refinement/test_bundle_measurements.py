@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from kiteline_basestation.exchange.publisher import Publisher
+from kiteline_basestation.map.map_tables import REFINED
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.refinement.apply_bundle import apply_bundle, keep_scales
 from kiteline_basestation.refinement.bundle_window import BundleWindow, measurements
-from kiteline_core.geometry import se3
-from kiteline_core.ids import NO_KEYFRAME, AgentId, keyframe_id
+from kiteline_core.geometry import se3, sim3
+from kiteline_core.ids import NO_KEYFRAME, AgentId, KeyframeId, keyframe_id
 from kiteline_core.optimisation.bundle import BundleResult
 from tests.basestation.refinement.test_odometry_factors import CAMERA, CONFIG, IDS, SUBMAP, flight, window
 from tests.basestation.refinement.test_steps_between_views import flight_of_one_camera
@@ -78,6 +79,27 @@ def test_a_map_without_metres_does_not_grow_with_the_bundles_of_it() -> None:
     lengths = np.linalg.norm(np.diff([sparse_map.world_pose(k)[:3, 3] for k in IDS], axis=0), axis=1)  # type: ignore[index]
     np.testing.assert_allclose(lengths, 0.15, rtol=1e-3)
     assert abs(sparse_map.scale(SUBMAP) - 1.0) < 1e-6
+
+
+@pytest.mark.parametrize("units", [1.0, 40.0])
+def test_depths_in_a_unit_of_its_own_are_told_alike_in_any_unit(units: float) -> None:
+    sparse_map = flight_of_one_camera(births=40, turn_rad=0.1)
+    sparse_map.keyframes.T_p_k[:, :3, 3] *= units
+    table = sparse_map.keypoints
+    table.inv_depth[table.inv_depth > 0.0] /= units
+    for row in map(int, [sparse_map.rows[k] for k in IDS]):
+        T_w_k = sim3.with_scaled_translation(sparse_map.keyframes.T_w_k[row], units)
+        sparse_map.set_world_pose(KeyframeId(int(sparse_map.keyframes.id[row])), T_w_k, carry=False)
+    part, publisher = window(sparse_map), Publisher(sparse_map, CONFIG.publish)
+    points = part.problem.points.copy()
+    points[::2] *= 1.05  # 5 % farther from the first keyframe, where most of them began
+    inlier = np.ones(len(part.problem.camera), np.bool_)
+    apply_bundle(
+        sparse_map, part, BundleResult(part.problem.T_c_m, points, inlier, 0.0, 0.0, 1, 1), publisher, CONFIG.publish
+    )
+    told = table.flags[part.points] & REFINED != 0
+    assert told[::2].mean() > 0.9
+    assert not told[1::2].any()
 
 
 def test_a_unit_that_drifted_is_that_of_the_newest_keyframes() -> None:
