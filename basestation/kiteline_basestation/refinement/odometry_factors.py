@@ -25,7 +25,7 @@ from kiteline_basestation.inertial.ties import moved_camera
 from kiteline_basestation.inertial.units import units_of
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.refinement.bundle_window import BundleWindow
-from kiteline_core.arrays import F64, I32
+from kiteline_core.arrays import F64, I32, Bool
 from kiteline_core.geometry import disparity_offset, se3, sim3
 from kiteline_core.ids import AgentId, KeyframeId, SubmapId, agent_of_keyframe, agent_of_submap, submap_of_keyframe
 from kiteline_core.optimisation.bundle import BundleProblem, BundleResult
@@ -38,7 +38,7 @@ _ON_PLANE = np.column_stack([_GRID, np.ones(len(_GRID))])
 _DEPTHS = np.concatenate([0.7 * _ON_PLANE, 1.8 * _ON_PLANE])  # of the median depth: near points tell the translation
 _ROTATION_DEPTHS = 8.0 * _ON_PLANE  # the same for rotation alone
 _MOST_PX = 1e5  # above any disparity, so that one sort orders by camera and disparity
-_UNKNOWN_DEPTH = 3.0  # where a keyframe observes nothing
+_UNKNOWN_DEPTH = 3.0  # m; where a keyframe has no disparities
 _LEAST_POINTS = 4  # synthetic points of a step
 _NO_DISPARITY, _NO_GROUP = -1.0, -1
 _ROTATION_SIGMA_PX = 0.1  # px; of each of 6 far synthetic points: together they hold rotation to 0.15 mrad
@@ -117,7 +117,8 @@ def _steps(
     counts = np.bincount(problem.camera, minlength=len(window.rows))
     number = {int(table.id[row]): i for i, row in enumerate(window.rows.tolist())}
     difference_px = _PX_OF_ROTATION * _rotation_difference_px(sparse_map, window, number, _RUN)
-    depth, units = median_depths(problem), units_of(sparse_map, window.rows, _RUN)
+    own_unit = np.array([sparse_map.is_up_to_scale(submap_of_keyframe(KeyframeId(k))) for k in number], np.bool_)
+    depth, units = median_depths(problem, own_unit), units_of(sparse_map, window.rows, _RUN)
     for k, row in enumerate(window.rows.tolist()):
         keyframe = KeyframeId(int(table.id[row]))
         if agent_of_keyframe(keyframe) not in sparse_map.cameras:
@@ -138,7 +139,7 @@ def _steps(
             step = _synthetic_points(problem, k, p, T_p_k, depths, float(depth[k]), sigma_px)
             if step is None:
                 continue
-            if sparse_map.is_up_to_scale(submap):
+            if own_unit[k]:
                 step = _by_distance(step, few)
             elif ranged and depths is _DEPTHS and not _is_wide(T_p_k):
                 change_px = sparse_map.offset_measured_with(keyframe) - _assumed(sparse_map, agent, of_camera[k])
@@ -233,15 +234,14 @@ def _rotation_difference_px(sparse_map: SparseMap, window: BundleWindow, number:
     return max(each, together) * float(np.median(window.problem.lens[k, 0]))
 
 
-def median_depths(problem: BundleProblem) -> F64:
-    """The median depth (k,) that each camera observes, by its disparities; if it has none, by those in the map."""
+def median_depths(problem: BundleProblem, own_unit: Bool) -> F64:
+    """The median depth (k,) that each camera observes, by its disparities; in an own_unit (k,), as the map has it."""
     camera, disparity = problem.camera, problem.measured[:, 2]
     seen = disparity > 0.0
-    without = np.bincount(camera, seen, minlength=len(problem.T_c_m)) == 0
-    if without.any():
+    if own_unit.any():
         point, T = problem.points[np.repeat(np.arange(len(problem.points)), np.diff(problem.starts))], problem.T_c_m
         z = np.einsum("nj,nj->n", T[camera, 2, :3], point) + T[camera, 2, 3]
-        ahead = without[camera] & (z > 0.0)
+        ahead = own_unit[camera] & (z > 0.0)
         disparity = np.divide(problem.lens[camera, 4], z, out=disparity.copy(), where=ahead)
         seen = seen | ahead
     camera, disparity = camera[seen], disparity[seen]

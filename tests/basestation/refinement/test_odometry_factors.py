@@ -291,13 +291,14 @@ def test_a_keyframe_without_observations_stays_tied_to_its_parent() -> None:
     assert {0, 1} <= set(added.tolist())
 
 
-def test_median_depths_are_those_of_each_camera_s_disparities_or_else_of_the_map() -> None:
+def test_median_depths_are_those_of_each_camera_s_disparities_or_in_a_unit_of_its_own_of_the_map() -> None:
     sparse_map, _ = flight(0.3, 40, unseen=3)
     part = window(sparse_map)
     problem = part.problem
     measured = problem.measured.copy()
     measured[problem.camera == 2, 2] = -1.0
-    depth = median_depths(replace(problem, measured=measured))
+    own_unit = np.arange(KEYFRAMES) == 2
+    depth = median_depths(replace(problem, measured=measured), own_unit)
     of = np.repeat(np.arange(len(problem.points)), np.diff(problem.starts))
     for k in range(KEYFRAMES):
         disparity = measured[(problem.camera == k) & (measured[:, 2] > 0), 2]
@@ -305,7 +306,8 @@ def test_median_depths_are_those_of_each_camera_s_disparities_or_else_of_the_map
         expected = CAMERA.bf / np.median(CAMERA.bf / by_map if k == 2 else disparity)
         assert depth[k] == pytest.approx(expected, rel=1e-6)
     nothing = replace(problem, points=problem.points - [0.0, 0.0, 100.0], measured=np.full_like(measured, -1.0))
-    assert np.array_equal(median_depths(nothing), np.full(KEYFRAMES, 3.0))  # all behind
+    assert np.array_equal(median_depths(nothing, own_unit), np.full(KEYFRAMES, 3.0))  # all behind
+    assert median_depths(replace(problem, measured=measured), np.zeros(KEYFRAMES, np.bool_))[2] == 3.0  # in metres
 
 
 def test_a_map_with_another_unit_that_no_accelerations_corrected_is_held_to_it() -> None:
