@@ -5,11 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from kiteline_basestation.inertial.units import units_of
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.refinement.odometry_factors import with_odometry_factors
 from kiteline_core.geometry import se3
-from kiteline_core.ids import NO_KEYFRAME, AgentId, keyframe_id
+from kiteline_core.ids import AgentId
 from kiteline_core.optimisation.bundle import bundle
 from tests.basestation.refinement.test_odometry_factors import CAMERA, CONFIG, IDS, SUBMAP, flight, window
 
@@ -90,16 +89,3 @@ def test_a_map_without_a_unit_that_sees_enough_is_left_to_its_images() -> None:
     sparse_map = flight_of_one_camera(births=90)
     part = window(sparse_map)
     assert with_odometry_factors(sparse_map, part, CONFIG.odometry_factors) is part.problem
-
-
-def test_steps_in_a_map_without_a_unit_are_as_long_as_those_around() -> None:
-    """Units of agents drift: that of the newest steps is 1.3 times the first, and the map has them as they are."""
-    sparse_map, n = SparseMap(), 60
-    sparse_map.set_camera(AgentId(0), replace(CAMERA, stereo=False))
-    for k in range(n):
-        step = se3.from_rt(np.eye(3), [0.5 * 1.3 ** (-k / n), 0.0, 0.0])
-        parent = keyframe_id(SUBMAP, k - 1) if k else NO_KEYFRAME
-        sparse_map.add_keyframe(keyframe_id(SUBMAP, k), k, parent, step if k else np.eye(4), 0)
-    rows = np.array([sparse_map.rows[keyframe_id(SUBMAP, k)] for k in range(n)], np.int32)
-    sparse_map.keyframes.T_w_k[rows, 0, 3] = 0.5 * np.arange(n)
-    assert np.allclose(units_of(sparse_map, rows, 20)[10:-10], 1.3 ** (np.arange(10, n - 10) / n), rtol=0.01)
