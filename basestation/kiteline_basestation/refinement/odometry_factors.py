@@ -155,15 +155,14 @@ def _point_sets(
 
     few: from 0, where observations are enough, to 1 without any. gap_s: of the step. difference_px: of rotations.
     """
-    agent, own_unit = agent_of_submap(submap), sparse_map.is_up_to_scale(submap)
-    if own_unit and few <= 0.0:
-        return []  # the images tell more of its drift than the steps do
-    longer = np.sqrt(max(1.0, gap_s / _USUAL_S))
+    agent, longer = agent_of_submap(submap), np.sqrt(max(1.0, gap_s / _USUAL_S))
+    if sparse_map.is_up_to_scale(submap):  # where observations are many, these tell more of its drift than steps do
+        return [(_DEPTHS, max(longer * config.sigma_px, difference_px) / few)] if few > 0.0 else []
     worn_px = config.worn_px * np.sqrt(gap_s) if agent in sparse_map.disparity_sigma_px else 0.0
     rotation_px = max(_ROTATION_SIGMA_PX, worn_px, difference_px)
     point_px = 1.0 / np.hypot(few / max(longer * config.sigma_px, worn_px), 1.0 / rotation_px)
     sets = [(_DEPTHS if few > 0.0 else _ROTATION_DEPTHS, point_px)]
-    if not (own_unit or sparse_map.measures_distances(agent)):
+    if not sparse_map.measures_distances(agent):
         sets.append((_DEPTHS, _SCALE_SIGMA_PX))
     return sets
 
