@@ -21,7 +21,7 @@ from kiteline_agent.local_map.row_parallax import RowParallax
 from kiteline_codec.schema import KeyframeHeader, KeyframePose, RefinedLandmarks
 from kiteline_core.arrays import F64, I64, Bool
 from kiteline_core.geometry import disparity_offset, se3
-from kiteline_core.geometry.cameras import RectifiedCamera
+from kiteline_core.geometry.cameras import RectifiedCamera, virtual_bf
 from kiteline_core.ids import KEYPOINT_BITS, NO_KEYFRAME, SEQUENCE_BITS, KeyframeId, SubmapId
 from kiteline_core.order_statistics import median
 
@@ -29,7 +29,6 @@ _SEED_DEPTH_M = 1e4  # stands for infinity in landmarks without depth
 _MIN_TRIES = 12  # frames that must have searched a landmark before it is given up
 _TRIES_A_HIT = 5  # frames that search a landmark for one that finds it; with more it is given up
 _REFINED_SIGMA_PX = 0.08  # px: virtual disparity error of a depth that the base refined
-_USUAL_DEPTH = 4.0  # units; median depth with which a map begins in a unit of its own
 _FLOOR_PX = 0.06  # px: smallest virtual disparity error of the filter
 _MAX_SCALE = 2.5  # change of distance since the template was cut, as a factor
 
@@ -369,12 +368,9 @@ class LocalMap:
         self.sigma_rho[slot, index] = _REFINED_SIGMA_PX / self._virtual_bf(slot)
 
     def _virtual_bf(self, slot: int) -> float:
-        """Focal length in px times baseline, by which depths in a keyframe are compared in px of disparity.
-
-        In a unit of its own the same baseline is a centimetre here and a metre there: as wide as where a map begins.
-        """
+        """Focal length in px times baseline, by which depths in a keyframe are compared in px of disparity."""
         rho = self.rho[slot, self.usable[slot]] if self.in_own_unit else np.zeros(0)
-        return self.camera.bf / (_USUAL_DEPTH * median(rho)) if len(rho) else self.camera.bf
+        return virtual_bf(self.camera.bf, rho) if len(rho) else self.camera.bf
 
     def offset_px(self, uv: F64) -> F64:
         """Error (n,) of stereo disparities at pixels (n,2)."""

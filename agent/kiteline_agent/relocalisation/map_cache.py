@@ -14,7 +14,7 @@ from kiteline_agent.relocalisation.frame_features import FrameFeatures
 from kiteline_codec.schema import CachedKeyframe, CachedLandmarks, Key
 from kiteline_core.arrays import F64, I64
 from kiteline_core.geometry import se3
-from kiteline_core.geometry.cameras import RectifiedCamera
+from kiteline_core.geometry.cameras import RectifiedCamera, virtual_bf
 from kiteline_core.ids import NO_KEYFRAME, KeyframeId, SubmapId
 from kiteline_core.imaging.descriptors import comparable
 from kiteline_core.imaging.matching import Matches, match, match_near
@@ -148,7 +148,8 @@ class MapCache:
         uv = np.concatenate([part.uv for part in parts]).astype(np.float64)[keep]
         self._bearing[slot, :n] = (uv - (c.cx, c.cy)) / (c.fx, c.fy)
         self._rho[slot, :n] = np.concatenate([part.inv_depth for part in parts])[keep]
-        self._sigma_rho[slot, :n] = self._config.sigma_px / c.bf
+        bf = c.bf if c.stereo or not n else virtual_bf(c.bf, self._rho[slot, :n])  # in any unit
+        self._sigma_rho[slot, :n] = self._config.sigma_px / bf
         self._usable[slot] = False
         self._usable[slot, :n] = True
         self._counts[slot] = n

@@ -13,11 +13,11 @@ from kiteline_basestation.refinement.bundle_window import BundleWindow
 from kiteline_codec.schema import CulledLandmarks, KeyframePose, RefinedLandmarks, RemovedObservations
 from kiteline_core.arrays import F64, I32, Bool
 from kiteline_core.geometry import se3, sim3
-from kiteline_core.ids import KeyframeId, SubmapId, submap_of_keyframe
+from kiteline_core.geometry.cameras import virtual_bf
+from kiteline_core.ids import SEQUENCE_BITS, KeyframeId, SubmapId
 from kiteline_core.optimisation.bundle import BundleResult
 
 _ENDS = 20  # keyframes at the begin or the end of a submap whose steps tell its unit there: single steps may be torn
-_USUAL_DEPTH = 4.0  # units; median depth with which agents begin a map in a unit of its own
 _MIN_OBSERVATIONS = 2  # observations that must remain after the outlier test
 _MAX_OFFSET_PX = 8.0  # px at octave 0; from the keypoint to the refined projection: more is another landmark
 
@@ -109,20 +109,16 @@ def _points(
 
 
 def _virtual_bf(sparse_map: SparseMap, points: I32) -> F64:
-    """Focal length in px times baseline, by which depths of landmarks (n,) are compared in px of disparity.
-
-    In a unit of its own the same baseline is a centimetre here and a metre there: as wide as where a map begins, in a
-    keyframe whose landmarks are that far away.
-    """
-    table, keyframes = sparse_map.keypoints, sparse_map.keyframes
-    rows = table.row[points]
+    """Focal length in px times baseline, by which depths of landmarks (n,) are compared in px of disparity."""
+    keyframes, rows = sparse_map.keyframes, sparse_map.keypoints.row[points]
     bf: F64 = keyframes.camera[rows, 4].copy()
-    for row in np.unique(rows).tolist():
-        if sparse_map.is_up_to_scale(submap_of_keyframe(KeyframeId(int(keyframes.id[row])))):
-            here = rows == row
-            inverse = sparse_map.inverse_depths(points[here])
-            if (known := inverse > 0.0).any():
-                bf[here] /= _USUAL_DEPTH * np.median(inverse[known])
+    submap = keyframes.id[rows] >> SEQUENCE_BITS
+    own = [s for s in np.unique(submap).tolist() if sparse_map.is_up_to_scale(SubmapId(s))]
+    for row in np.unique(rows[np.isin(submap, own)]).tolist():
+        here = rows == row
+        rho = sparse_map.inverse_depths(points[here])
+        if (known := rho > 0.0).any():
+            bf[here] = virtual_bf(float(keyframes.camera[row, 4]), rho[known])
     return bf
 
 
@@ -140,13 +136,14 @@ def keep_scales(
     """
     submaps = sparse_map.submaps_of_map(map_id)
     root, rows, T_c_m = sparse_map.map_id(map_id), window.rows, result.T_c_m
+    place = np.asarray(np.linalg.inv(T_c_m)[:, :3, 3], np.float64)
     units = {
-        s: unit_in(sparse_map, sparse_map.submaps[s][-_ENDS:], rows, T_c_m) or sparse_map.scale(s)
+        s: unit_in(sparse_map, sparse_map.submaps[s][-_ENDS:], rows, place) or sparse_map.scale(s)
         for s in submaps
         if sparse_map.is_up_to_scale(s)
     }
     if sparse_map.is_up_to_scale(root):
-        whole = unit_in(sparse_map, sparse_map.submaps[root][:_ENDS], rows, T_c_m) or 1.0
+        whole = unit_in(sparse_map, sparse_map.submaps[root][:_ENDS], rows, place) or 1.0
         centre = sim3.place(sparse_map.submap_pose(root), sparse_map.first_pose(root))[:3, 3]
         poses = np.linalg.inv(T_c_m)
         poses[:, :3, 3] = centre + (poses[:, :3, 3] - centre) / whole

@@ -14,9 +14,11 @@ from numpy.typing import NDArray
 from kiteline_core.arrays import F32, F64, I16, U8, U16
 from kiteline_core.errors import KitelineError
 from kiteline_core.geometry import se3
+from kiteline_core.order_statistics import median
 
 GRID_STEP = 4  # px between the points of a rectification grid: interpolation errors are below 0.01 px
 VIRTUAL_BASELINE_M = 0.1  # scale of coded inverse depths of cameras without a right image
+_USUAL_DEPTH = 4.0  # of the landmarks in a room, in m
 _MAX_SLOPE = 1.75  # x/z at the side of a rectified image, 60 degrees: more costs resolution in the middle
 _MIN_COSINE = 0.8  # between an optical axis and the rectified one: beyond 37 degrees the views hardly overlap
 
@@ -103,6 +105,15 @@ class RawSide:
     lens: CameraModel
     rotation: F64
     matrix: F64
+
+
+def virtual_bf(bf: float, rho: F64) -> float:
+    """Focal length times a baseline, by which inverse depths of a map without a unit are compared in px.
+
+    bf: of the camera. rho: (n,) inverse depths of landmarks in a keyframe, n >= 1. In a unit of its own a fixed
+    baseline is a centimetre here and a metre there. This one is as wide as if the landmarks were at a room's depth.
+    """
+    return bf / (_USUAL_DEPTH * median(rho))
 
 
 class Rectifier:

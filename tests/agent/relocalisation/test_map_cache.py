@@ -161,3 +161,20 @@ def test_cached_landmarks_wait_for_their_keyframe(world: World) -> None:
     assert box.match_landmarks(se3.inverse(true), HERE, world.seen(true, rng)) is None
     box.store(head)
     assert box.match_landmarks(se3.inverse(true), HERE, world.seen(true, rng)) is not None
+
+
+@pytest.mark.parametrize("units", [0.2, 1.0, 40.0])
+def test_landmarks_of_one_camera_are_known_to_the_same_share_of_their_depth_in_any_unit(
+    world: World, units: float
+) -> None:
+    """A search wider or narrower than in a room would miss them, or take others for them."""
+    alone = replace(CAMERA, stereo=False, baseline_m=0.1)
+    box = MapCache(alone, AgentConfig().map_cache, shipped_vocabulary())
+    keyframe = keyframe_id(THERE, 0)
+    for record in world.copy(keyframe, HERE, look(0.0)):
+        if isinstance(record, CachedLandmarks):
+            record = replace(record, inv_depth=(record.inv_depth / units).astype(np.float32))
+        box.store(record)
+    met = box._project(se3.inverse(look(0.0)), HERE, 0.0)
+    along = np.linalg.norm(met.ray, axis=1) / np.linalg.norm(met.xyz, axis=1)
+    assert np.median(along) == pytest.approx(0.15 * 4.0 / alone.bf, rel=0.5)
