@@ -2,16 +2,17 @@
 
 The agent tracked all frames in between, with an IMU if it has one, and with ten times the landmarks that a thin link
 carries. A relative pose is added as synthetic points that both keyframes observe exactly where that pose puts them. For
-a keyframe with enough observations these points are far away, so that they constrain only the rotation, which the
-agent measures best (0.1 to 0.2 mrad an axis between keyframes). Other keyframes observe points nearby, with a disparity
-in one of the two images. It stands for those that the agent measured: with another disparity offset than the agent had,
+a keyframe with enough observations these points are far away, so that they constrain only the rotation, which the agent
+measures best (0.1 to 0.2 mrad an axis between keyframes). Other keyframes observe points nearby, with a disparity in
+one of the two images. It stands for those that the agent measured: with another disparity offset than the agent had,
 the same images mean another motion, so that a worn rig's steps follow the offset as it becomes known. While it is not,
 it biases rotations all in one direction: the weight decreases where rotations differ, and for rigs that are known to be
-worn. Images of a monocular submap in metres tell no scale: there weak points nearby hold the agent's, which rests on
-its IMU, or, where the map's own accelerations have corrected lengths, those that the map has there now. In a submap in
-a unit of its own, which drifts, steps tell lengths by those that the steps around have in the map, where observations
-are few. Between keyframes that look different ways the points lie between their views, off both images. Inertial steps
-tie the first keyframe of a submap to the last one of the submap before.
+worn. Images of one camera tell no lengths: distances of its points are known as of a virtual baseline that suits the
+scene, to the same share in any unit and high above ground. In a submap in metres weak points hold the agent's lengths,
+which rest on its IMU, or, where the map's own accelerations have corrected them, those that the map has there now. In a
+submap in a unit of its own, which drifts, steps tell lengths by those that the steps around have in the map, where
+observations are few. Between keyframes that look different ways the points lie between their views, off both images.
+Inertial steps tie the first keyframe of a submap to the last one of the submap before.
 """
 
 from collections.abc import Iterator
@@ -38,12 +39,12 @@ _ON_PLANE = np.column_stack([_GRID, np.ones(len(_GRID))])
 _DEPTHS = np.concatenate([0.7 * _ON_PLANE, 1.8 * _ON_PLANE])  # of the median depth: near points tell the translation
 _ROTATION_DEPTHS = 8.0 * _ON_PLANE  # the same for rotation alone
 _MOST_PX = 1e5  # above any disparity, so that one sort orders by camera and disparity
-_UNKNOWN_DEPTH = 3.0  # m; where a keyframe has no disparities
+_USUAL_DEPTH = 3.0  # m; where none is known; disparities of one camera are compared as there
 _LEAST_POINTS = 4  # synthetic points of a step
 _NO_DISPARITY, _NO_GROUP = -1.0, -1
 _ROTATION_SIGMA_PX = 0.1  # px; of each of 6 far synthetic points: together they hold rotation to 0.15 mrad
-_SCALE_SIGMA_PX = 2.0  # px; of each of 12 more in monocular submaps in metres, whose images tell no scale
-_OWN_UNIT_SHARE = 0.005  # of its distance; deviation of that of a point without observations, in an own unit
+_SCALE_POINT_PX = 2.0  # px; of each of 12 more in monocular submaps in metres, whose images tell no scale
+_SCALE_SIGMA_PX = 1.0  # px; of their disparities, which hold lengths
 _WIDE_COS = 0.77  # of the angle between two views beyond which points lie between them: 40 degrees
 _STEEPEST_RAD = 1.3  # from an optical axis to such points, where the views leave room for it: 75 degrees
 _LEAST_SPREAD = 0.1  # of these points along the turn, as a share of the usual one
@@ -117,8 +118,8 @@ def _steps(
     counts = np.bincount(problem.camera, minlength=len(window.rows))
     number = {int(table.id[row]): i for i, row in enumerate(window.rows.tolist())}
     difference_px = _PX_OF_ROTATION * _rotation_difference_px(sparse_map, window, number, _RUN)
-    own_unit = np.array([sparse_map.is_up_to_scale(submap_of_keyframe(KeyframeId(k))) for k in number], np.bool_)
-    depth, units = median_depths(problem, own_unit), units_of(sparse_map, window.rows, _RUN)
+    single = np.array([not sparse_map.is_ranged(submap_of_keyframe(KeyframeId(k))) for k in number], np.bool_)
+    depth, units = median_depths(problem, single), units_of(sparse_map, window.rows, _RUN)
     for k, row in enumerate(window.rows.tolist()):
         keyframe = KeyframeId(int(table.id[row]))
         if agent_of_keyframe(keyframe) not in sparse_map.cameras:
@@ -131,17 +132,16 @@ def _steps(
             continue
         gap_s = abs(float(table.t_ns[row] - table.t_ns[window.rows[p]])) * 1e-9
         few = max(0.0, 1.0 - min(counts[k], counts[p]) / config.enough_observations)
-        ranged = sparse_map.measures_distances(agent)
         sets = _point_sets(sparse_map, submap, config, few, gap_s, difference_px)
         own = submap_of_keyframe(KeyframeId(int(table.id[window.rows[p]]))) == submap
         T_p_k = sim3.with_scaled_translation(T_p_k, float(units[k] if own else units[p]))
-        for depths, sigma_px in sets:
+        baseline = _USUAL_DEPTH / float(depth[k]) if single[k] else 1.0  # disparities of one camera are virtual
+        for depths, point_px, disparity_px in sets:
+            sigma_px = np.array([point_px, baseline * disparity_px])
             step = _synthetic_points(problem, k, p, T_p_k, depths, float(depth[k]), sigma_px)
             if step is None:
                 continue
-            if own_unit[k]:
-                step = _by_distance(step, few)
-            elif ranged and depths is _DEPTHS and not _is_wide(T_p_k):
+            if depths is _DEPTHS and not (single[k] or _is_wide(T_p_k)):
                 change_px = sparse_map.offset_measured_with(keyframe) - _assumed(sparse_map, agent, of_camera[k])
                 step = _following_offset(problem.lens[k], step, change_px)
             yield step
@@ -150,30 +150,23 @@ def _steps(
 def _point_sets(
     sparse_map: SparseMap, submap: SubmapId, config: OdometryFactorConfig, few: float, gap_s: float,
     difference_px: float,
-) -> list[tuple[F64, float]]:  # fmt: skip
-    """Shapes (n,3) of a step's synthetic points at a median depth of one, each with the points' deviation in px.
+) -> list[tuple[F64, float, float]]:  # fmt: skip
+    """Shapes (n,3) of a step's synthetic points at a median depth of one, with the deviations of pixel and disparity.
 
-    few: from 0, where observations are enough, to 1 without any. gap_s: of the step. difference_px: of rotations.
+    These are in px, of one camera's disparities at a usual depth. few: from 0, where observations are enough, to 1
+    without any. gap_s: of the step. difference_px: of rotations.
     """
     agent, longer = agent_of_submap(submap), np.sqrt(max(1.0, gap_s / _USUAL_S))
     if sparse_map.is_up_to_scale(submap):  # where observations are many, these tell more of its drift than steps do
-        return [(_DEPTHS, max(longer * config.sigma_px, difference_px) / few)] if few > 0.0 else []
+        point_px = max(longer * config.sigma_px, difference_px)
+        return [(_DEPTHS, point_px / few, config.sigma_px / few)] if few > 0.0 else []
     worn_px = config.worn_px * np.sqrt(gap_s) if agent in sparse_map.disparity_sigma_px else 0.0
     rotation_px = max(_ROTATION_SIGMA_PX, worn_px, difference_px)
     point_px = 1.0 / np.hypot(few / max(longer * config.sigma_px, worn_px), 1.0 / rotation_px)
-    sets = [(_DEPTHS if few > 0.0 else _ROTATION_DEPTHS, point_px)]
+    sets = [(_DEPTHS if few > 0.0 else _ROTATION_DEPTHS, point_px, point_px)]
     if not sparse_map.measures_distances(agent):
-        sets.append((_DEPTHS, _SCALE_SIGMA_PX))
+        sets.append((_DEPTHS, _SCALE_POINT_PX, _SCALE_SIGMA_PX))
     return sets
-
-
-def _by_distance(step: _Step, few: float) -> _Step:
-    """A step in a unit of its own, of which no baseline is known: disparities deviate by a share of themselves."""
-    share = _OWN_UNIT_SHARE / few
-    return step._replace(
-        sigma_k=np.column_stack([step.sigma_k[:, 0], share * step.in_k[:, 2]]),
-        sigma_p=np.column_stack([step.sigma_p[:, 0], share * step.in_p[:, 2]]),
-    )
 
 
 def _following_offset(lens: F64, step: _Step, change_px: F64) -> _Step:
@@ -233,14 +226,14 @@ def _rotation_difference_px(sparse_map: SparseMap, window: BundleWindow, number:
     return max(each, together) * float(np.median(window.problem.lens[k, 0]))
 
 
-def median_depths(problem: BundleProblem, own_unit: Bool) -> F64:
-    """The median depth (k,) that each camera observes, by its disparities; in an own_unit (k,), as the map has it."""
+def median_depths(problem: BundleProblem, single: Bool) -> F64:
+    """The median depth (k,) that each camera observes, by its disparities; of `single` ones (k,), as the map has it."""
     camera, disparity = problem.camera, problem.measured[:, 2]
     seen = disparity > 0.0
-    if own_unit.any():
+    if single.any():
         point, T = problem.points[np.repeat(np.arange(len(problem.points)), np.diff(problem.starts))], problem.T_c_m
         z = np.einsum("nj,nj->n", T[camera, 2, :3], point) + T[camera, 2, 3]
-        ahead = own_unit[camera] & (z > 0.0)
+        ahead = single[camera] & (z > 0.0)
         disparity = np.divide(problem.lens[camera, 4], z, out=disparity.copy(), where=ahead)
         seen = seen | ahead
     camera, disparity = camera[seen], disparity[seen]
@@ -249,15 +242,18 @@ def median_depths(problem: BundleProblem, own_unit: Bool) -> F64:
     known = count > 0
     start = np.cumsum(count)[known] - count[known]
     middle = 0.5 * (disparity[start + (count[known] - 1) // 2] + disparity[start + count[known] // 2])
-    depth = np.full(len(count), _UNKNOWN_DEPTH)
+    depth = np.full(len(count), _USUAL_DEPTH)
     depth[known] = problem.lens[known, 4] / middle
     return depth
 
 
 def _synthetic_points(
-    problem: BundleProblem, k: int, p: int, T_p_k: F64, depths: F64, typical: float, sigma_px: float
+    problem: BundleProblem, k: int, p: int, T_p_k: F64, depths: F64, typical: float, sigma_px: F64
 ) -> _Step | None:
-    """The step from keyframe p to k; None if both see too few points. depths: (n,3) in k at a `typical` one of 1."""
+    """The step from keyframe p to k; None if both see too few points.
+
+    depths: (n,3) in k at a `typical` one of 1. sigma_px: (2,) of pixel and disparity.
+    """
     wide = _is_wide(T_p_k)
     shape = _between_views(depths, T_p_k) if wide else depths
     for farther in _FARTHER if wide else (1.0,):
@@ -270,7 +266,7 @@ def _synthetic_points(
         return None
     local, in_parent = local[ahead], in_parent[ahead]
     world = se3.transform(se3.inverse(problem.T_c_m[k]), local)
-    sigma, terms = np.full((len(local), 2), sigma_px), np.zeros((len(local), disparity_offset.TERMS))
+    sigma, terms = np.tile(sigma_px, (len(local), 1)), np.zeros((len(local), disparity_offset.TERMS))
     in_k, in_p = _projected(problem.lens[k], local), _projected(problem.lens[p], in_parent)
     step = _Step(k, p, in_k, in_p, sigma, sigma, terms, world)
     return _by_angle(problem, step) if wide else step

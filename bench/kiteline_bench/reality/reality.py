@@ -3,7 +3,7 @@
 from kiteline_bench.agent import altitude, bent, rigs, slants
 from kiteline_bench.base import real_places
 from kiteline_bench.reality import base, cpu, difficult, fixed_parts, nees, people, shutter, street, worn
-from kiteline_bench.reality.one_camera import euroc, metric, own_unit, starts
+from kiteline_bench.reality.one_camera import euroc, high, metric, own_unit, starts
 from kiteline_bench.reality.sensors import imu, missing, motion
 
 PARTS = {
@@ -16,6 +16,7 @@ PARTS = {
     "sensors": ("Reality: sensors that come late, have holes, or end", missing.run),
     "base": ("Reality: the base beside the tracker alone", base.run),
     "own-unit": ("Reality: one camera without an IMU", own_unit.run),
+    "high": ("Reality: one camera high above ground, beside a base", high.run),
     "metric": ("Reality: metric said from a hundred starts", metric.run),
     "starts": ("Reality: random monocular starts, forward and backward", starts.run),
     "nees": ("Reality: consistent poses of worn rigs", nees.run),

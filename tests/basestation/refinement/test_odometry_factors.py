@@ -290,14 +290,14 @@ def test_a_keyframe_without_observations_stays_tied_to_its_parent() -> None:
     assert {0, 1} <= set(added.tolist())
 
 
-def test_median_depths_are_those_of_each_camera_s_disparities_or_in_a_unit_of_its_own_of_the_map() -> None:
+def test_median_depths_are_those_of_each_camera_s_disparities_or_of_the_map_where_it_has_none() -> None:
     sparse_map, _ = flight(0.3, 40, unseen=3)
     part = window(sparse_map)
     problem = part.problem
     measured = problem.measured.copy()
     measured[problem.camera == 2, 2] = -1.0
-    own_unit = np.arange(KEYFRAMES) == 2
-    depth = median_depths(replace(problem, measured=measured), own_unit)
+    single = np.arange(KEYFRAMES) == 2
+    depth = median_depths(replace(problem, measured=measured), single)
     of = np.repeat(np.arange(len(problem.points)), np.diff(problem.starts))
     for k in range(KEYFRAMES):
         disparity = measured[(problem.camera == k) & (measured[:, 2] > 0), 2]
@@ -305,8 +305,8 @@ def test_median_depths_are_those_of_each_camera_s_disparities_or_in_a_unit_of_it
         expected = CAMERA.bf / np.median(CAMERA.bf / by_map if k == 2 else disparity)
         assert depth[k] == pytest.approx(expected, rel=1e-6)
     nothing = replace(problem, points=problem.points - [0.0, 0.0, 100.0], measured=np.full_like(measured, -1.0))
-    assert np.array_equal(median_depths(nothing, own_unit), np.full(KEYFRAMES, 3.0))  # all behind
-    assert median_depths(replace(problem, measured=measured), np.zeros(KEYFRAMES, np.bool_))[2] == 3.0  # in metres
+    assert np.array_equal(median_depths(nothing, single), np.full(KEYFRAMES, 3.0))  # all behind
+    assert median_depths(replace(problem, measured=measured), np.zeros(KEYFRAMES, np.bool_))[2] == 3.0  # of pairs
 
 
 def test_inertial_steps_tie_a_keyframe_without_a_parent() -> None:
@@ -354,12 +354,16 @@ def test_links_of_a_worn_rig_loosen_with_the_root_of_the_time_between(gap_s: int
     assert sigma == pytest.approx(0.5 * np.sqrt(gap_s))
 
 
-def test_lengths_of_one_camera_are_held_weakly_in_the_unit_that_the_map_has() -> None:
+def metric_flight_of_one_camera() -> SparseMap:
     sparse_map, _ = flight(noise_px=0.1, turn_rad=0.1)
     sparse_map.set_camera(AgentId(0), replace(CAMERA, stereo=False))
     sparse_map.metric_submaps.add(SUBMAP)
     sparse_map.measures_depth.clear()
-    many = OdometryFactorConfig(enough_observations=5)
+    return sparse_map
+
+
+def test_lengths_of_one_camera_are_held_weakly_in_the_unit_that_the_map_has() -> None:
+    sparse_map, many = metric_flight_of_one_camera(), OdometryFactorConfig(enough_observations=5)
     for unit in (1.0, 1.5):
         if unit != 1.0:
             sparse_map.scale_submap(SUBMAP, unit)
@@ -367,3 +371,21 @@ def test_lengths_of_one_camera_are_held_weakly_in_the_unit_that_the_map_has() ->
         weak = sigma == 2.0
         assert np.count_nonzero(weak) == 2 * np.count_nonzero(~weak) > 0  # twelve points beside six
         assert np.abs(off).max() < 1e-6
+
+
+@pytest.mark.parametrize("enough", [5, 1000])
+def test_steps_of_one_camera_count_alike_however_far_its_landmarks_are(enough: int) -> None:
+    """A drone flies ten times as high, and ten times as far: the same images, and the same shares of lengths."""
+    found, config = list[tuple[np.ndarray, np.ndarray]](), OdometryFactorConfig(enough_observations=enough)
+    for times in (1.0, 10.0):
+        sparse_map = metric_flight_of_one_camera()
+        table = sparse_map.keyframes
+        table.T_w_k[: len(sparse_map), :3, 3] *= times
+        table.T_p_k[: len(sparse_map), :3, 3] *= times
+        sparse_map.keypoints.inv_depth[: sparse_map.slots] /= times
+        part = window(sparse_map)
+        linked, n = with_odometry_factors(sparse_map, part, config), len(part.problem.camera)
+        disparity = linked.measured[n:, 2]
+        found.append((linked.measured[n:, :2], np.column_stack([linked.sigma[n:, 0], linked.sigma[n:, 1] / disparity])))
+    for near, far in zip(*found, strict=True):
+        assert len(near) and np.allclose(near, far, rtol=1e-4)
