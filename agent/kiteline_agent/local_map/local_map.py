@@ -368,7 +368,10 @@ class LocalMap:
         self.sigma_rho[slot, index] = _REFINED_SIGMA_PX / self._virtual_bf(slot)
 
     def _virtual_bf(self, slot: int) -> float:
-        """Focal length in px times baseline, by which depths in a keyframe are compared in px of disparity."""
+        """Focal length in px times baseline, by which depths in a keyframe are compared in px of disparity.
+
+        In metres that of the camera; in a unit of its own see `virtual_bf`.
+        """
         rho = self.rho[slot, self.usable[slot]] if self.in_own_unit else np.zeros(0)
         return virtual_bf(self.camera.bf, rho) if len(rho) else self.camera.bf
 

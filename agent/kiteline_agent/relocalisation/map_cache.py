@@ -148,7 +148,8 @@ class MapCache:
         uv = np.concatenate([part.uv for part in parts]).astype(np.float64)[keep]
         self._bearing[slot, :n] = (uv - (c.cx, c.cy)) / (c.fx, c.fy)
         self._rho[slot, :n] = np.concatenate([part.inv_depth for part in parts])[keep]
-        bf = c.bf if c.stereo or not n else virtual_bf(c.bf, self._rho[slot, :n])  # in any unit
+        # without a right image lengths may be in any unit: errors are a share of the scene's depth
+        bf = c.bf if c.stereo or not n else virtual_bf(c.bf, self._rho[slot, :n])
         self._sigma_rho[slot, :n] = self._config.sigma_px / bf
         self._usable[slot] = False
         self._usable[slot, :n] = True

@@ -50,20 +50,20 @@ def unit_in(sparse_map: SparseMap, keyframes: Sequence[KeyframeId], rows: I32, p
     return unit if unit > 0.0 else None
 
 
-def _steps(sparse_map: SparseMap, of: I32, rows: I32, place: F64) -> tuple[I32, F64, F64]:
-    """An agent's steps to keyframes `of` (n,), each from the nearest one before it among `rows` (k,).
+def _steps(sparse_map: SparseMap, children: I32, rows: I32, place: F64) -> tuple[I32, F64, F64]:
+    """An agent's steps to keyframes in rows `children` (n,) from their parents, if these are among `rows` (k,).
 
-    of: rows, too. place: (k,3) in w. Returns number in `rows` (m,), length as told (m,) and in w (m,); steps without a
-    length are left out.
+    Culled parents are skipped. place: (k,3) in w. Returns the index into `rows` of each step's end (m,), its length as
+    told (m,) and in w (m,); steps without a length are left out.
     """
     table, number = sparse_map.keyframes, {row: i for i, row in enumerate(rows.tolist())}
     found, told, here = list[int](), list[float](), list[float]()
-    for row in of.tolist():
+    for row in children.tolist():
         above, T_a_k = sparse_map.rows.get(KeyframeId(int(table.parent[row]))), table.T_p_k[row]
-        while above is not None and above not in number:  # culled
+        while above is not None and above not in number and table.culled[above]:
             T_a_k = table.T_p_k[above] @ T_a_k
             above = sparse_map.rows.get(KeyframeId(int(table.parent[above])))
-        if above is not None and T_a_k[:3, 3].any():
+        if above in number and T_a_k[:3, 3].any():
             found.append(number[row])
             told.append(float(np.linalg.norm(T_a_k[:3, 3])))
             here.append(float(np.linalg.norm(place[number[row]] - place[number[above]])))

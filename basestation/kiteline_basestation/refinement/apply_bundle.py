@@ -109,7 +109,10 @@ def _points(
 
 
 def _virtual_bf(sparse_map: SparseMap, points: I32) -> F64:
-    """Focal length in px times baseline, by which depths of landmarks (n,) are compared in px of disparity."""
+    """Focal length in px times baseline, by which depths of landmarks (n,) are compared in px of disparity.
+
+    In metres that of the camera; in a unit of its own see `virtual_bf`.
+    """
     keyframes, rows = sparse_map.keyframes, sparse_map.keypoints.row[points]
     bf: F64 = keyframes.camera[rows, 4].copy()
     submap = keyframes.id[rows] >> SEQUENCE_BITS

@@ -3,16 +3,17 @@
 The agent tracked all frames in between, with an IMU if it has one, and with ten times the landmarks that a thin link
 carries. A relative pose is added as synthetic points that both keyframes observe exactly where that pose puts them. For
 a keyframe with enough observations these points are far away, so that they constrain only the rotation, which the agent
-measures best (0.1 to 0.2 mrad an axis between keyframes). Other keyframes observe points nearby, with a disparity in
-one of the two images. It stands for those that the agent measured: with another disparity offset than the agent had,
-the same images mean another motion, so that a worn rig's steps follow the offset as it becomes known. While it is not,
-it biases rotations all in one direction: the weight decreases where rotations differ, and for rigs that are known to be
-worn. Images of one camera tell no lengths: distances of its points are known as of a virtual baseline that suits the
-scene, to the same share in any unit and high above ground. In a submap in metres weak points hold the agent's lengths,
-which rest on its IMU, or, where the map's own accelerations have corrected them, those that the map has there now. In a
-submap in a unit of its own, which drifts, steps tell lengths by those that the steps around have in the map, where
-observations are few. Between keyframes that look different ways the points lie between their views, off both images.
-Inertial steps tie the first keyframe of a submap to the last one of the submap before.
+measures best (0.1 to 0.2 mrad an axis between keyframes). Other keyframes observe points nearby. Those of pairs have a
+disparity in one of the two images. It stands for those that the agent measured: with another disparity offset than the
+agent had, the same images mean another motion, so that a worn rig's steps follow the offset as it becomes known. While
+it is not, it biases rotations all in one direction: the weight decreases where rotations differ, and for rigs that are
+known to be worn. A camera that measures no depth sees its points at the median depth of its landmarks, and knows their
+distances to a share of them, so that a step counts alike in a room and high above ground. In a submap in metres a
+second, weak set holds the agent's lengths, which rest on its IMU, or, where the map's own accelerations have corrected
+them, those that the map has there now. In a submap in a unit of its own, which drifts, steps tell lengths by those that
+the steps around have in the map, where observations are few. Between keyframes that look different ways the points lie
+between their views, off both images. Inertial steps tie the first keyframe of a submap to the last one of the submap
+before.
 """
 
 from collections.abc import Iterator
@@ -37,14 +38,16 @@ _PX_OF_ROTATION = 1.7  # factor from a rotation's error to the standard deviatio
 _MIN_RUN = 5  # rotations for an estimate of their common error
 _ON_PLANE = np.column_stack([_GRID, np.ones(len(_GRID))])
 _DEPTHS = np.concatenate([0.7 * _ON_PLANE, 1.8 * _ON_PLANE])  # of the median depth: near points tell the translation
-_ROTATION_DEPTHS = 8.0 * _ON_PLANE  # the same for rotation alone
+_FAR = 8.0
+_ROTATION_DEPTHS = _FAR * _ON_PLANE  # the same for rotation alone
 _MOST_PX = 1e5  # above any disparity, so that one sort orders by camera and disparity
-_USUAL_DEPTH = 3.0  # m; where none is known; disparities of one camera are compared as there
+_UNKNOWN_DEPTH = 3.0  # m; where no depth is known
+_VIRTUAL_DISPARITY_PX = 14.0  # px; over it deviations in px are shares of distances, where images measure none
 _LEAST_POINTS = 4  # synthetic points of a step
 _NO_DISPARITY, _NO_GROUP = -1.0, -1
 _ROTATION_SIGMA_PX = 0.1  # px; of each of 6 far synthetic points: together they hold rotation to 0.15 mrad
 _SCALE_POINT_PX = 2.0  # px; of each of 12 more in monocular submaps in metres, whose images tell no scale
-_SCALE_SIGMA_PX = 1.0  # px; of their disparities, which hold lengths
+_SCALE_SIGMA_PX = 1.0  # px; of their virtual disparities, which hold lengths
 _WIDE_COS = 0.77  # of the angle between two views beyond which points lie between them: 40 degrees
 _STEEPEST_RAD = 1.3  # from an optical axis to such points, where the views leave room for it: 75 degrees
 _LEAST_SPREAD = 0.1  # of these points along the turn, as a share of the usual one
@@ -118,8 +121,8 @@ def _steps(
     counts = np.bincount(problem.camera, minlength=len(window.rows))
     number = {int(table.id[row]): i for i, row in enumerate(window.rows.tolist())}
     difference_px = _PX_OF_ROTATION * _rotation_difference_px(sparse_map, window, number, _RUN)
-    single = np.array([not sparse_map.is_ranged(submap_of_keyframe(KeyframeId(k))) for k in number], np.bool_)
-    depth, units = median_depths(problem, single), units_of(sparse_map, window.rows, _RUN)
+    unranged = np.array([not sparse_map.is_ranged(submap_of_keyframe(KeyframeId(k))) for k in number], np.bool_)
+    depth, units = median_depths(problem, unranged), units_of(sparse_map, window.rows, _RUN)
     for k, row in enumerate(window.rows.tolist()):
         keyframe = KeyframeId(int(table.id[row]))
         if agent_of_keyframe(keyframe) not in sparse_map.cameras:
@@ -128,6 +131,8 @@ def _steps(
         if p is None and (tie := sparse_map.inertial_steps.get(keyframe)) is not None:
             p, T_p_k = number.get(tie.since), moved_camera(sparse_map, tie)
         agent, submap = agent_of_keyframe(keyframe), submap_of_keyframe(keyframe)
+        if np.isnan(depth[k]):
+            depth[k] = depth[p] if unranged[k] and p is not None and depth[p] > 0.0 else _UNKNOWN_DEPTH
         if p is None or not (problem.free[k] or problem.free[p]):
             continue
         gap_s = abs(float(table.t_ns[row] - table.t_ns[window.rows[p]])) * 1e-9
@@ -135,13 +140,13 @@ def _steps(
         sets = _point_sets(sparse_map, submap, config, few, gap_s, difference_px)
         own = submap_of_keyframe(KeyframeId(int(table.id[window.rows[p]]))) == submap
         T_p_k = sim3.with_scaled_translation(T_p_k, float(units[k] if own else units[p]))
-        baseline = _USUAL_DEPTH / float(depth[k]) if single[k] else 1.0  # disparities of one camera are virtual
         for depths, point_px, disparity_px in sets:
-            sigma_px = np.array([point_px, baseline * disparity_px])
-            step = _synthetic_points(problem, k, p, T_p_k, depths, float(depth[k]), sigma_px)
+            step = _synthetic_points(problem, k, p, T_p_k, depths, float(depth[k]), point_px)
             if step is None:
                 continue
-            if depths is _DEPTHS and not (single[k] or _is_wide(T_p_k)):
+            if unranged[k]:
+                step = _by_distance(step, disparity_px / _VIRTUAL_DISPARITY_PX)
+            elif depths is _DEPTHS and not _is_wide(T_p_k):
                 change_px = sparse_map.offset_measured_with(keyframe) - _assumed(sparse_map, agent, of_camera[k])
                 step = _following_offset(problem.lens[k], step, change_px)
             yield step
@@ -153,8 +158,8 @@ def _point_sets(
 ) -> list[tuple[F64, float, float]]:  # fmt: skip
     """Shapes (n,3) of a step's synthetic points at a median depth of one, with the deviations of pixel and disparity.
 
-    These are in px, of one camera's disparities at a usual depth. few: from 0, where observations are enough, to 1
-    without any. gap_s: of the step. difference_px: of rotations.
+    These are in px, of disparities that images do not measure at `_VIRTUAL_DISPARITY_PX`. few: from 0, where
+    observations are enough, to 1 without any. gap_s: of the step. difference_px: of rotations.
     """
     agent, longer = agent_of_submap(submap), np.sqrt(max(1.0, gap_s / _USUAL_S))
     if sparse_map.is_up_to_scale(submap):  # where observations are many, these tell more of its drift than steps do
@@ -163,10 +168,18 @@ def _point_sets(
     worn_px = config.worn_px * np.sqrt(gap_s) if agent in sparse_map.disparity_sigma_px else 0.0
     rotation_px = max(_ROTATION_SIGMA_PX, worn_px, difference_px)
     point_px = 1.0 / np.hypot(few / max(longer * config.sigma_px, worn_px), 1.0 / rotation_px)
-    sets = [(_DEPTHS if few > 0.0 else _ROTATION_DEPTHS, point_px, point_px)]
+    sets = [(_DEPTHS, point_px, point_px) if few > 0.0 else (_ROTATION_DEPTHS, point_px, _FAR * point_px)]
     if not sparse_map.measures_distances(agent):
         sets.append((_DEPTHS, _SCALE_POINT_PX, _SCALE_SIGMA_PX))
     return sets
+
+
+def _by_distance(step: _Step, share: float) -> _Step:
+    """A step of a camera that measures no distances: those of its points are known to a share of themselves."""
+    return step._replace(
+        sigma_k=np.column_stack([step.sigma_k[:, 0], share * step.in_k[:, 2]]),
+        sigma_p=np.column_stack([step.sigma_p[:, 0], share * step.in_p[:, 2]]),
+    )
 
 
 def _following_offset(lens: F64, step: _Step, change_px: F64) -> _Step:
@@ -226,14 +239,16 @@ def _rotation_difference_px(sparse_map: SparseMap, window: BundleWindow, number:
     return max(each, together) * float(np.median(window.problem.lens[k, 0]))
 
 
-def median_depths(problem: BundleProblem, single: Bool) -> F64:
-    """The median depth (k,) that each camera observes, by its disparities; of `single` ones (k,), as the map has it."""
+def median_depths(problem: BundleProblem, unranged: Bool) -> F64:
+    """The median depth (k,) that each camera observes: by its disparities, or as the map has it if it is `unranged`
+    (k,), which measures none. nan without any.
+    """
     camera, disparity = problem.camera, problem.measured[:, 2]
     seen = disparity > 0.0
-    if single.any():
+    if unranged.any():
         point, T = problem.points[np.repeat(np.arange(len(problem.points)), np.diff(problem.starts))], problem.T_c_m
         z = np.einsum("nj,nj->n", T[camera, 2, :3], point) + T[camera, 2, 3]
-        ahead = single[camera] & (z > 0.0)
+        ahead = unranged[camera] & (z > 0.0)
         disparity = np.divide(problem.lens[camera, 4], z, out=disparity.copy(), where=ahead)
         seen = seen | ahead
     camera, disparity = camera[seen], disparity[seen]
@@ -242,18 +257,15 @@ def median_depths(problem: BundleProblem, single: Bool) -> F64:
     known = count > 0
     start = np.cumsum(count)[known] - count[known]
     middle = 0.5 * (disparity[start + (count[known] - 1) // 2] + disparity[start + count[known] // 2])
-    depth = np.full(len(count), _USUAL_DEPTH)
+    depth = np.full(len(count), np.nan)
     depth[known] = problem.lens[known, 4] / middle
     return depth
 
 
 def _synthetic_points(
-    problem: BundleProblem, k: int, p: int, T_p_k: F64, depths: F64, typical: float, sigma_px: F64
+    problem: BundleProblem, k: int, p: int, T_p_k: F64, depths: F64, typical: float, sigma_px: float
 ) -> _Step | None:
-    """The step from keyframe p to k; None if both see too few points.
-
-    depths: (n,3) in k at a `typical` one of 1. sigma_px: (2,) of pixel and disparity.
-    """
+    """The step from keyframe p to k; None if both see too few points. depths: (n,3) in k at a `typical` one of 1."""
     wide = _is_wide(T_p_k)
     shape = _between_views(depths, T_p_k) if wide else depths
     for farther in _FARTHER if wide else (1.0,):
@@ -266,7 +278,7 @@ def _synthetic_points(
         return None
     local, in_parent = local[ahead], in_parent[ahead]
     world = se3.transform(se3.inverse(problem.T_c_m[k]), local)
-    sigma, terms = np.tile(sigma_px, (len(local), 1)), np.zeros((len(local), disparity_offset.TERMS))
+    sigma, terms = np.full((len(local), 2), sigma_px), np.zeros((len(local), disparity_offset.TERMS))
     in_k, in_p = _projected(problem.lens[k], local), _projected(problem.lens[p], in_parent)
     step = _Step(k, p, in_k, in_p, sigma, sigma, terms, world)
     return _by_angle(problem, step) if wide else step

@@ -18,7 +18,7 @@ from kiteline_core.order_statistics import median
 
 GRID_STEP = 4  # px between the points of a rectification grid: interpolation errors are below 0.01 px
 VIRTUAL_BASELINE_M = 0.1  # scale of coded inverse depths of cameras without a right image
-_USUAL_DEPTH = 4.0  # of the landmarks in a room, in m
+_ROOM_DEPTH = 4.0  # of the landmarks in a room, in m
 _MAX_SLOPE = 1.75  # x/z at the side of a rectified image, 60 degrees: more costs resolution in the middle
 _MIN_COSINE = 0.8  # between an optical axis and the rectified one: beyond 37 degrees the views hardly overlap
 
@@ -111,9 +111,10 @@ def virtual_bf(bf: float, rho: F64) -> float:
     """Focal length times a baseline, by which inverse depths of a map without a unit are compared in px.
 
     bf: of the camera. rho: (n,) inverse depths of landmarks in a keyframe, n >= 1. In a unit of its own a fixed
-    baseline is a centimetre here and a metre there. This one is as wide as if the landmarks were at a room's depth.
+    baseline is a centimetre here and a metre there. By this one the median landmark has the disparity that it would
+    have at a room's depth.
     """
-    return bf / (_USUAL_DEPTH * median(rho))
+    return bf / (_ROOM_DEPTH * median(rho))
 
 
 class Rectifier:

@@ -54,3 +54,18 @@ def test_steps_in_a_map_without_a_unit_are_as_long_as_those_around() -> None:
     rows = np.array([sparse_map.rows[keyframe_id(SUBMAP, k)] for k in range(n)], np.int32)
     sparse_map.keyframes.T_w_k[rows, 0, 3] = 0.5 * np.arange(n)
     assert np.allclose(units_of(sparse_map, rows, 20)[10:-10], 1.3 ** (np.arange(10, n - 10) / n), rtol=0.01)
+
+
+def test_steps_over_keyframes_that_a_window_leaves_out_tell_no_unit() -> None:
+    """A window of old and new keyframes: the way between them is the agent's drift, and longer than all steps."""
+    sparse_map, n = SparseMap(), 60
+    sparse_map.set_camera(AgentId(0), replace(CAMERA, stereo=False))
+    for k in range(n):
+        parent = keyframe_id(SUBMAP, k - 1) if k else NO_KEYFRAME
+        sparse_map.add_keyframe(keyframe_id(SUBMAP, k), k, parent, se3.from_rt(np.eye(3), [0.5, 0.0, 0.0]), 0)
+    rows = np.array([sparse_map.rows[keyframe_id(SUBMAP, k)] for k in (*range(8), *range(50, n))], np.int32)
+    sparse_map.keyframes.T_w_k[rows, 0, 3] = 0.65 * np.r_[np.arange(8), np.arange(10) + 10.0]  # the way is much shorter
+    assert np.allclose(np.delete(units_of(sparse_map, rows, 20), (0, 8)), 1.3)  # those after their parents
+    sparse_map.cull_keyframe(keyframe_id(SUBMAP, 54))
+    rows = rows[rows != sparse_map.rows[keyframe_id(SUBMAP, 54)]]
+    assert np.allclose(np.delete(units_of(sparse_map, rows, 20), (0, 8)), 1.3)  # the step over it counts
