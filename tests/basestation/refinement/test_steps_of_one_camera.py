@@ -1,4 +1,4 @@
-"""Steps of a camera that measures no distances, in metres: by the median depth of its landmarks, and by shares of it."""
+"""Steps of a camera that measures no distances, in metres: they count alike however far its landmarks are."""
 
 from dataclasses import replace
 
