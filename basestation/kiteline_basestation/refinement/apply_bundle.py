@@ -139,7 +139,8 @@ def keep_scales(
     """
     submaps = sparse_map.submaps_of_map(map_id)
     root, rows, T_c_m = sparse_map.map_id(map_id), window.rows, result.T_c_m
-    place = np.asarray(np.linalg.inv(T_c_m)[:, :3, 3], np.float64)
+    poses = np.linalg.inv(T_c_m)
+    place = np.asarray(poses[:, :3, 3], np.float64)
     units = {
         s: unit_in(sparse_map, sparse_map.submaps[s][-_ENDS:], rows, place) or sparse_map.scale(s)
         for s in submaps
@@ -148,8 +149,7 @@ def keep_scales(
     if sparse_map.is_up_to_scale(root):
         whole = unit_in(sparse_map, sparse_map.submaps[root][:_ENDS], rows, place) or 1.0
         centre = sim3.place(sparse_map.submap_pose(root), sparse_map.first_pose(root))[:3, 3]
-        poses = np.linalg.inv(T_c_m)
-        poses[:, :3, 3] = centre + (poses[:, :3, 3] - centre) / whole
+        poses[:, :3, 3] = centre + (place - centre) / whole
         result = replace(result, T_c_m=np.linalg.inv(poses), points=centre + (result.points - centre) / whole)
         units = {submap: unit / whole for submap, unit in units.items()}
     elif result.scale_sigma > 0.0:

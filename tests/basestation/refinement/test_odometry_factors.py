@@ -306,9 +306,7 @@ def test_median_depths_are_those_of_each_camera_s_disparities_or_of_the_map_if_i
         assert depth[k] == pytest.approx(expected, rel=1e-6)
     nothing = replace(problem, points=problem.points - [0.0, 0.0, 100.0], measured=np.full_like(measured, -1.0))
     assert np.isnan(median_depths(nothing, unranged)).all()  # all behind
-    assert median_depths(replace(problem, measured=measured), np.zeros(KEYFRAMES, np.bool_))[2:3] == pytest.approx(
-        np.nan, nan_ok=True
-    )
+    assert np.isnan(median_depths(replace(problem, measured=measured), np.zeros(KEYFRAMES, np.bool_))[2])
 
 
 def test_inertial_steps_tie_a_keyframe_without_a_parent() -> None:

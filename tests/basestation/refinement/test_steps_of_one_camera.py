@@ -8,22 +8,13 @@ import pytest
 from kiteline_basestation.config import OdometryFactorConfig
 from kiteline_basestation.map.sparse_map import SparseMap
 from kiteline_basestation.refinement.odometry_factors import with_odometry_factors
-from kiteline_core.ids import AgentId
-from tests.basestation.refinement.test_odometry_factors import (
-    CAMERA,
-    KEYFRAMES,
-    SUBMAP,
-    flight,
-    residuals_of_steps,
-    window,
-)
+from tests.basestation.refinement.test_odometry_factors import BIRTHS, KEYFRAMES, SUBMAP, residuals_of_steps, window
+from tests.basestation.refinement.test_steps_between_views import flight_of_one_camera
 
 
 def metric_flight_of_one_camera() -> SparseMap:
-    sparse_map, _ = flight(noise_px=0.1, turn_rad=0.1)
-    sparse_map.set_camera(AgentId(0), replace(CAMERA, stereo=False))
+    sparse_map = flight_of_one_camera(BIRTHS, turn_rad=0.1)
     sparse_map.metric_submaps.add(SUBMAP)
-    sparse_map.measures_depth.clear()
     return sparse_map
 
 
