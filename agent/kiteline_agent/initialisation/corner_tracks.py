@@ -1,6 +1,9 @@
 """Corners followed by optical flow over a window of monocular keyframes, before there is a map."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import chain
+from typing import NamedTuple
 
 import numpy as np
 
@@ -9,6 +12,7 @@ from kiteline_agent.imaging.features import DetectorConfig, Pyramid
 from kiteline_agent.imaging.optical_flow import Flow, follow
 from kiteline_agent.inertial_start_config import CornerTracksConfig
 from kiteline_agent.initialisation.frame_flow import BadImages, FrameFlow
+from kiteline_agent.initialisation.hidden_corners import HiddenView, turned
 from kiteline_core.arrays import F64, I64, Bool
 from kiteline_core.geometry.cameras import RectifiedCamera
 
@@ -18,6 +22,11 @@ _FLOW = Flow(window_px=15, return_px=0.5)  # the smallest window that keeps hold
 _DRIFT_PX = 2.0  # px between flow over frames and flow from the last keyframe
 KEYFRAME_S = 0.24  # s between two keyframes: short enough for flow, long enough for parallax
 _THINNED_S = 0.6  # s; longest time between two keyframes after one was left out
+_HIDDEN = 0.5  # share of a keyframe's corners: with fewer left in the next one something hides the others
+_MANY = 60  # corners of a keyframe that shows enough to be found again
+_HIDDEN_S = 1.5  # s for which they are searched: after that flow hardly finds them, and the view may be another one
+_VIEWS = 3  # keyframes that see a corner, at least
+_LEAST_TIED = 8  # corners that tie a keyframe to those before it
 CORNERS = 200  # followed at once; a bundle of 100 long tracks is as accurate as one of 300
 
 
@@ -46,6 +55,13 @@ class CornerObservations:
         )
 
 
+class _Part(NamedTuple):
+    """Keyframes that corners with these ids connect."""
+
+    keyframes: list[TrackedKeyframe]
+    ids: set[int]
+
+
 class CornerTracks:
     """Follows corners from keyframe to keyframe. Frames between tell where to look or, with little CPU, the gyro.
 
@@ -68,6 +84,7 @@ class CornerTracks:
         self._uv = np.zeros((0, 2))  # in the last keyframe
         self._frames = FrameFlow(_FLOW)  # where they are in the last frame
         self._bad_keyframes = BadImages(1)
+        self._hidden: HiddenView | None = None  # the last keyframe that shows corners which something hides now
 
     def is_due(self, t_ns: int) -> bool:
         """True if a frame is to become a keyframe."""
@@ -84,10 +101,10 @@ class CornerTracks:
         self._uv, self._ids = self._uv[good], self._ids[good]
         return True
 
-    def add(self, t_ns: int, left: Pyramid, turn: F64 | None = None) -> bool:
+    def add(self, t_ns: int, left: Pyramid, turn_since: Callable[[int], F64 | None] = lambda t_ns: None) -> bool:
         """Follow the corners from the last keyframe into a new one, and find more. False if the image is left out.
 
-        turn: (3,3) rotation of this camera in that of the last keyframe; None: unknown. It counts if the corners were
+        turn_since: (3,3) rotation of this camera in that at a stamp; None: unknown. It counts if the corners were
         not followed into this frame.
         """
         near = self._frames.image is left[0]
@@ -98,14 +115,17 @@ class CornerTracks:
                 uv, good = follow(before, left[0], self._uv, _FLOW, _NEAR_LEVELS, self._frames.uv)
                 good &= np.linalg.norm(uv - self._frames.uv, axis=1) < _DRIFT_PX
             else:
-                guess = None if turn is None else self._turned(turn)
+                turn = turn_since(self.keyframes[-1].t_ns)
+                guess = None if turn is None else turned(self._uv, turn, self._camera)
                 uv, good = follow(before, left[0], self._uv, _FLOW, _LEVELS, guess)
                 if self._bad_keyframes.leaves_out(good):
                     return False
             self._uv, self._ids = uv[good], self._ids[good]
+        followed = self._ids
+        self._find_hidden(t_ns, left, turn_since)
         self._replenish(left)
         if near:
-            self._frames.replace(good, self._uv)
+            self._frames.replace(good, self._uv, np.searchsorted(self._ids, followed))
         else:
             self._frames.begin(left[0], self._uv)
         self.keyframes.append(TrackedKeyframe(t_ns, left, self._ids.copy(), self._uv.copy()))
@@ -119,6 +139,31 @@ class CornerTracks:
             close = [k for k, s in enumerate(apart_s, 1) if s < _THINNED_S]
             del kept[close[0] if close else 0]
         self.keyframes = kept
+
+    def keep_connected(self, least_s: float) -> bool:
+        """Forget what corners do not connect to the newest keyframe, before a solution from nothing.
+
+        Of a window whose newest part is shorter than this, other parts are kept. False if it is not to be solved now.
+        """
+        newest = set(self.keyframes[-1].ids.tolist())
+        if self._hidden is not None and len(newest.intersection(self._hidden.ids.tolist())) < _LEAST_TIED:
+            return False  # what hides its corners may go
+        parts = list[_Part]()
+        for keyframe in self.keyframes:
+            ids = set(keyframe.ids.tolist())
+            connected, apart = _Part([keyframe], ids), list[_Part]()
+            for part in parts:
+                if len(part.ids & ids) >= _LEAST_TIED:
+                    connected = _Part([*part.keyframes, *connected.keyframes], part.ids | connected.ids)
+                else:
+                    apart.append(part)
+            parts = [*apart, connected]
+        last = parts[-1].keyframes
+        if last[-1].t_ns - min(keyframe.t_ns for keyframe in last) >= least_s * 1e9:
+            parts = parts[-1:]
+        kept = [part.keyframes for part in parts if len(part.keyframes) >= _VIEWS or part is parts[-1]]
+        self.keyframes = sorted(chain.from_iterable(kept), key=lambda keyframe: keyframe.t_ns)
+        return len(last) >= _VIEWS
 
     def flow_px(self) -> float:
         """Median motion of corners since the oldest keyframe that has half of the newest one's; inf without one."""
@@ -140,13 +185,28 @@ class CornerTracks:
             seen[row, column] = True
         length = seen.sum(axis=0)
         order = np.argsort(-length, kind="stable")
-        return CornerObservations(xy, seen, ids).part(order[length[order] >= 3])
+        return CornerObservations(xy, seen, ids).part(order[length[order] >= _VIEWS])
 
-    def _turned(self, turn: F64) -> F64:
-        """Pixels (n,2) of the corners after a rotation of the camera alone."""
-        focal, centre = np.array([self._camera.fx, self._camera.fy]), np.array([self._camera.cx, self._camera.cy])
-        ray = np.column_stack([(self._uv - centre) / focal, np.ones(len(self._uv))]) @ turn
-        return np.asarray(ray[:, :2] / np.maximum(ray[:, 2:], 0.1) * focal + centre)
+    def _find_hidden(self, t_ns: int, left: Pyramid, turn_since: Callable[[int], F64 | None]) -> None:
+        """Search the corners that something hides since a keyframe, as far as the gyro tells where they are."""
+        last = self.keyframes[-1] if self.keyframes else None
+        if self._hidden is None and last is not None and len(last.ids) >= _MANY:
+            if len(self._ids) < _HIDDEN * len(last.ids):
+                self._hidden = HiddenView(last.t_ns, last.left, last.ids, last.uv, self._camera)
+        if self._hidden is None:
+            return
+        if (t_ns - self._hidden.t_ns) * 1e-9 > _HIDDEN_S:
+            self._hidden = None
+            return
+        turn = turn_since(self._hidden.t_ns)
+        if turn is None:
+            return
+        found, uv = self._hidden.find(left, self._ids, turn, _FLOW)
+        ids = np.concatenate([self._ids, found])
+        order = np.argsort(ids, kind="stable")
+        self._ids, self._uv = ids[order], np.concatenate([self._uv, uv])[order]
+        if np.count_nonzero(np.isin(self._hidden.ids, ids)) >= _HIDDEN * len(self._hidden.ids):
+            self._hidden = None
 
     def _replenish(self, left: Pyramid) -> None:
         """Find new corners where none is followed."""

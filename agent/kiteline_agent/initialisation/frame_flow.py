@@ -3,7 +3,7 @@
 import numpy as np
 
 from kiteline_agent.imaging.optical_flow import Flow, follow
-from kiteline_core.arrays import F64, U8, Bool
+from kiteline_core.arrays import F64, I64, U8, Bool
 
 _LEAST_FOLLOWED = 0.08  # share of the corners that an image must show: fewer, and it is black, covered or damaged
 _JUMP_PX = 8.0  # px by which the motion of a corner changes from image to image: parallax of no vehicle does
@@ -48,11 +48,11 @@ class FrameFlow:
         """Follow these corners (n,2) from this frame on."""
         self.image, self.uv, self._step, self.smooth = image, uv, np.full(uv.shape, np.nan), False
 
-    def replace(self, good: Bool, uv: F64) -> None:
-        """Of the corners keep the good ones (n,), at the first rows of uv (m,2) px; the others of uv are new."""
+    def replace(self, good: Bool, uv: F64, at: I64) -> None:
+        """Of the corners keep the good ones (n,), which are at these rows of uv (m,2) px; the others of uv are new."""
         step = self._step[good]
         self.uv, self._step = uv, np.full(uv.shape, np.nan)
-        self._step[: len(step)] = step
+        self._step[at] = step
 
     def follow(self, image: U8) -> Bool | None:
         """Follow the corners into the next frame. Returns those that are found (n,); None if the image is left out."""
@@ -76,7 +76,7 @@ class FrameFlow:
         if self.image is None or len(good) - len(lost) < _LEAST_KNOWN:
             return
         middle = self.uv[good].mean(axis=0)
-        fit = _linear_fit(self.uv[good] - middle, (uv - self.uv)[good])[0]
+        fit = linear_motion(self.uv[good] - middle, (uv - self.uv)[good])[0]
         guess = self.uv[lost] + np.column_stack([np.ones(len(lost)), self.uv[lost] - middle]) @ fit
         uv[lost], good[lost] = follow(self.image, image, self.uv[lost], self._flow, guess=guess)
 
@@ -92,11 +92,11 @@ def is_torn(uv: F64, change: F64) -> bool | None:
     known = np.isfinite(change).all(axis=1)
     if np.count_nonzero(known) < _LEAST_KNOWN:
         return None
-    _, off_px = _linear_fit(uv[known] - uv[known].mean(axis=0), change[known])
+    _, off_px = linear_motion(uv[known] - uv[known].mean(axis=0), change[known])
     return bool(np.mean(off_px > _JUMP_PX) > _TORN)
 
 
-def _linear_fit(uv: F64, motion: F64) -> tuple[F64, F64]:
+def linear_motion(uv: F64, motion: F64) -> tuple[F64, F64]:
     """The linear function (3,2) of 1 and the place (n,2) that most motions (n,2) follow, and how far each is off."""
     A = np.column_stack([np.ones(len(uv)), uv])
     off_px = np.linalg.norm(motion - np.median(motion, axis=0), axis=1)

@@ -206,8 +206,7 @@ class InertialStart:
         shows = not every or self._tracks.follow(ctx.images.left)
         if shows and self._tracks.is_due(ctx.t_ns):
             self._work.followed += 1
-            turn = None if every else self._turn(ctx.t_ns, imu)
-            if self._tracks.add(ctx.t_ns, ctx.images.left, turn):
+            if self._tracks.add(ctx.t_ns, ctx.images.left, lambda since_ns: self._turn(since_ns, ctx.t_ns, imu)):
                 self.odometry.add(ctx.t_ns)
                 self._bound_window(ctx.t_ns)
                 if self._attempt is None:
@@ -225,12 +224,10 @@ class InertialStart:
                 return end.value  # type: ignore[no-any-return]
         return None
 
-    def _turn(self, t_ns: int, imu: ImuPrior) -> F64 | None:
-        """(3,3) rotation of the camera since the last keyframe, by the gyro; None without samples."""
-        keyframes, offset = self._tracks.keyframes, imu.offset if self._before is None else self._before.solution.offset
-        if not keyframes:
-            return None
-        begin_ns, end_ns = (self._time_ns(t, imu) + round(offset.offset_s * 1e9) for t in (keyframes[-1].t_ns, t_ns))
+    def _turn(self, since_ns: int, t_ns: int, imu: ImuPrior) -> F64 | None:
+        """(3,3) rotation of the camera at t_ns in that at since_ns, by the gyro; None without samples."""
+        offset = imu.offset if self._before is None else self._before.solution.offset
+        begin_ns, end_ns = (self._time_ns(t, imu) + round(offset.offset_s * 1e9) for t in (since_ns, t_ns))
         samples = self._buffer.between(begin_ns, end_ns)
         if samples is None:
             return None
@@ -251,6 +248,8 @@ class InertialStart:
 
     def _begin(self, ctx: FrameContext, imu: ImuPrior) -> InParts[InertialMap | None] | None:
         """An attempt with the window that ends with this keyframe; None while none is due."""
+        if self._before is None and not self._tracks.keep_connected(_MIN_SPAN_S):
+            return None
         config, keyframes = self._config.inertial_start, tuple(self._tracks.keyframes)
         span_s = (ctx.t_ns - keyframes[0].t_ns) * 1e-9
         wait_s = max(_ATTEMPT_S, _ATTEMPT_SHARE * span_s, _BEHIND_SHARE * self.waiting.span_s)

@@ -13,6 +13,7 @@ from kiteline_agent.imaging import alignment_kernels
 from kiteline_agent.imaging.row_alignment import RowAlignment
 from kiteline_agent.keyframes.new_landmarks import EarlierView, NewPoints, moved_to_frame, nearby, new_points
 from kiteline_agent.keyframes.pair_search import Fault, PairSearch
+from kiteline_agent.keyframes.policy import coverage
 from kiteline_agent.local_map.keyframe_landmarks import KeyframeLandmarks
 from kiteline_agent.local_map.local_map import LocalMap
 from kiteline_agent.tracking.frame_context import FrameContext
@@ -50,13 +51,16 @@ class KeyframeMaker:
         """True if a frame of a stereo or depth camera came without its right or depth image."""
         return self._has_depth and ctx.images.right is None and ctx.images.depth_m is None
 
-    def first_points(self, ctx: FrameContext) -> NewPoints | None:
-        """New landmarks for a keyframe without a track; None if too few of them have a depth: `fault` says why."""
+    def first_points(self, ctx: FrameContext, least_cover: float = 0.0) -> NewPoints | None:
+        """New landmarks for a keyframe without a track; None if too few of them have a depth: `fault` says why.
+
+        least_cover: share of the image that they cover, see `coverage`.
+        """
         points = self._points(ctx, np.zeros((0, 2)))
-        least = ctx.config.local_map.first_points
-        if _with_depth(points) >= least:
+        least, covers = ctx.config.local_map.first_points, coverage(points.uv, self._camera) >= least_cover
+        if covers and _with_depth(points) >= least:
             return points
-        if len(points.uv) < least:
+        if not covers or len(points.uv) < least:
             self.fault = Fault.CORNERS
         elif ctx.images.right is None:
             self.fault = Fault.DEPTH

@@ -15,6 +15,7 @@ from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
 from kiteline_core.ids import MAX_KEYFRAMES, NO_KEYFRAME, KeyframeId, SubmapId, keyframe_id, submap_of_keyframe
 
+_COVER_S = 2.0  # s over which the usual cover is a mean
 _UNSHARED = 1024  # sequence numbers of keyframes that are not shared, used in turn: many times those in a local map
 _LAST = MAX_KEYFRAMES - _UNSHARED - 1  # the highest sequence number of a keyframe that is shared
 # Sequence number at which a submap is full, after 6 hours at 2.8 keyframes a second. Some are left for keyframes that
@@ -47,6 +48,8 @@ class ReferenceKeyframe:
         self._unshared = 0  # number of keyframes that were not shared
         self.keyframe: KeyframeId = NO_KEYFRAME
         self.T_k_c: F64 = np.eye(4)
+        self.usual_cover = 0.0  # share of coarse image cells with a tracked landmark, mean of the last seconds
+        self._covered_ns: int | None = None  # stamp of the newest frame in that mean
         self._rounding: F64 = np.eye(4)  # the keyframe as the base holds it, in the keyframe of the local map
 
     @property
@@ -78,6 +81,7 @@ class ReferenceKeyframe:
             return None  # no ids are left, in this submap and of further submaps
         unshared = self._newest.keyframe != self._shared.keyframe
         cover = coverage(track.observed[track.inlier, :2], self._map.camera)
+        self._note_cover(cover, ctx.t_ns)
         frames, of_base = ctx.number - self._newest.frame_number, self._of_base(track)
         if frames == 1:
             self._newest.inliers, self._newest.cover = track.inliers, cover
@@ -92,6 +96,11 @@ class ReferenceKeyframe:
         if need is None or not unshared:
             return need
         return replace(need, pressing=of_base < ctx.config.keyframe.min_share * self._shared.inliers)
+
+    def _note_cover(self, cover: float, t_ns: int) -> None:
+        dt_s = np.inf if self._covered_ns is None else (t_ns - self._covered_ns) * 1e-9
+        self.usual_cover += min(1.0, dt_s / _COVER_S) * (cover - self.usual_cover)
+        self._covered_ns = t_ns
 
     def _of_base(self, track: Track) -> int:
         """Number of tracked landmarks that are shared with the base."""

@@ -12,6 +12,9 @@ from kiteline_agent.tracking.track import Track
 from kiteline_core.arrays import F64
 from kiteline_core.geometry import se3
 
+_HIDDEN_S = 1.0  # s after which landmarks that cover little of the image are all that there is
+_LEAST_COVER = 0.6  # of what landmarks covered in the seconds before
+
 
 @dataclass(frozen=True, slots=True)
 class FrameOutcome:
@@ -42,20 +45,21 @@ class LossStage:
         self._governor = governor
         self._monocular = monocular
         self.failed_searches = 0
+        self._since_ns: int | None = None  # stamp of the first frame that was not tracked
 
     def end(self) -> None:
         """A frame was tracked."""
-        self.failed_searches = 0
+        self.failed_searches, self._since_ns = 0, None
 
     def handle(self, ctx: FrameContext, *, stuck: bool, was_lost: bool) -> FrameOutcome:
         """Place a frame that was not tracked. stuck: its image is an old one. was_lost: nor was the frame before."""
-        events: list[str] = []
+        events, least_cover = list[str](), self._least_cover(ctx.t_ns)
         # a. Dead reckoning places the camera, and extends the map while its covariance is small.
         bridged = self._camera.dead_reckon(ctx)
         if stuck:
             return FrameOutcome(bridged, bridged, 0, events)
         if bridged and not self._monocular:
-            extended, events = self._keyframes.extend_map_by_dead_reckoning(ctx)
+            extended, events = self._keyframes.extend_map_by_dead_reckoning(ctx, least_cover)
             if extended:
                 return FrameOutcome(True, True, 0, events)
         # b. Relocalise in the stored submaps.
@@ -68,7 +72,7 @@ class LossStage:
             T_o_n = T_o_m @ se3.inverse(self._camera.pose.T_o_m)
         # c. Open a new submap.
         if not placed and self._submaps.may_open(self.failed_searches):
-            opened = self._submaps.open(ctx)
+            opened = self._submaps.open(ctx, least_cover)
             if opened is not None:
                 self.failed_searches = 0
                 placed = opened.placed
@@ -78,6 +82,13 @@ class LossStage:
             self._camera.motion.restart(ctx.t_ns)
             bridged = False
         return FrameOutcome(placed or bridged, bridged, 0 if track is None else track.inliers, events, T_o_n)
+
+    def _least_cover(self, t_ns: int) -> float:
+        """Share of the image that new landmarks cover at least: what hides most of the view for a moment goes."""
+        self._since_ns = t_ns if self._since_ns is None else self._since_ns
+        if not self._camera.submaps.any or (t_ns - self._since_ns) * 1e-9 >= _HIDDEN_S:
+            return 0.0
+        return _LEAST_COVER * self._camera.reference.usual_cover
 
     def continue_start(self) -> tuple[FrameContext | None, FrameOutcome]:
         """Go on with the solution with which a monocular map begins, at the last frame; None while it does not."""

@@ -89,8 +89,11 @@ class SubmapStage:
         tried = failed_searches >= _FAILURES
         return tried and submaps.room and self._governor.may(Extra.SUBMAP)
 
-    def open(self, ctx: FrameContext) -> OpenedSubmap | None:
-        """Begin a submap with this frame; None if it shows too little."""
+    def open(self, ctx: FrameContext, least_cover: float = 0.0) -> OpenedSubmap | None:
+        """Begin a submap with this frame; None if it shows too little.
+
+        least_cover: share of the image that landmarks of a stereo or depth camera cover at least.
+        """
         inertial, motion = self._inertial_start, self._camera.motion
         if inertial is not None and motion.tracker is not None:
             if inertial.add_samples(ctx) and self.start_choice.awaits_window(ctx.t_ns):
@@ -98,7 +101,7 @@ class SubmapStage:
             inertial.clear()
         if self._two_view_start is not None:
             return self._open_from_two_views(ctx, self._two_view_start)
-        points = self._maker.first_points(ctx)
+        points = self._maker.first_points(ctx, least_cover)
         self._warnings += self._start_watch.note(ctx.t_ns, None if points is not None else self._maker.fault)
         if points is None:
             return None

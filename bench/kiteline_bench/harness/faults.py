@@ -14,7 +14,7 @@ Change = Callable[[Frame], Frame]
 Fault = Callable[[Recording], Recording]
 Spans = Sequence[tuple[float, float]]  # from and to, in s after the first frame
 
-_WALL_GREY, _BLACK_GREY = 120.0, 6.0
+_WALL_GREY, _BLACK_GREY, _NEAR_GREY = 120.0, 6.0, 70
 _NOISE_GREY = 1.3  # deviation of a camera's noise
 _SMEAR_PX = 25
 _GYRO, _STUCK = 3, 20  # axes of a gyro; samples that a stuck bus repeats
@@ -52,6 +52,20 @@ def gain(factor: float, offset: float = 0.0) -> Change:
 
 
 wall, black = blank(_WALL_GREY), blank(_BLACK_GREY)
+
+
+def hidden(share: float, side: int) -> Change:
+    """A dark surface out of focus close to the camera hides a share of the view. side: of 4, from which it comes."""
+
+    def change(image: U8) -> U8:
+        out = image.copy()
+        shown = np.rot90(out, side)[round(share * np.rot90(out, side).shape[0]) :]
+        kept = shown.copy()
+        out[:] = _NEAR_GREY
+        shown[:] = kept
+        return out
+
+    return images(change)
 
 
 def torn(frame: Frame) -> Frame:
@@ -160,6 +174,18 @@ def dark_between(recording: Recording, spans: Spans) -> Recording:
     first_ns = recording.items[0].frame.t_ns
     dark = within(np.array([(item.frame.t_ns - first_ns) * 1e-9 for item in recording.items]), spans)
     return _each(recording, lambda k, frame: black(frame) if dark[k] else frame)
+
+
+def hidden_at_times(recording: Recording, share: float, every_s: float, length_s: float, seed: int) -> Recording:
+    """Something hides a share of the view for some seconds in every so many; when at first and from where by chance."""
+    first_ns, rng = recording.items[0].frame.t_ns, np.random.default_rng(seed)
+    begin_s, sides = float(rng.uniform(0.5, every_s)), rng.integers(4, size=len(recording.items))
+
+    def change(_number: int, frame: Frame) -> Frame:
+        times, since_s = divmod((frame.t_ns - first_ns) * 1e-9 - begin_s, every_s)
+        return hidden(share, int(sides[int(times)]))(frame) if times >= 0 and since_s < length_s else frame
+
+    return _each(recording, change)
 
 
 def late_samples(recording: Recording, late_s: float) -> Recording:

@@ -67,6 +67,9 @@ class Tracks:
     def drop_before(self, t_ns: int) -> None:
         pass
 
+    def keep_connected(self, _least_s: float) -> bool:
+        return True
+
     def clear(self) -> None:
         raise AssertionError("samples are missing")
 
@@ -203,7 +206,8 @@ def test_a_window_begins_after_the_samples_that_are_missing(monkeypatch: pytest.
     monkeypatch.setattr(start._tracks, "is_due", lambda _t_ns: True)
     monkeypatch.setattr(start._tracks, "add", lambda *_: True)
     monkeypatch.setattr(start._tracks, "follow", lambda _left: True)
-    start._tracks.keyframes = [SimpleNamespace(t_ns=250_000_000 * k) for k in range(20)]  # type: ignore[misc]
+    ids = np.arange(20)
+    start._tracks.keyframes = [SimpleNamespace(t_ns=250_000_000 * k, ids=ids) for k in range(20)]  # type: ignore[misc]
     t_ns = np.arange(1_100_000_000, 4_800_000_000, 5_000_000)
     ctx: Any = SimpleNamespace(
         t_ns=4_750_000_000, images=SimpleNamespace(left=None),
@@ -248,7 +252,8 @@ def test_of_a_long_rest_a_window_holds_the_end(monkeypatch: pytest.MonkeyPatch, 
     monkeypatch.setattr(start._tracks, "add", lambda *_: True)
     monkeypatch.setattr(start._tracks, "follow", lambda _left: True)
     monkeypatch.setattr(start, "_attempting", lambda *_: None)
-    start._tracks.keyframes = [SimpleNamespace(t_ns=250_000_000 * k) for k in range(77)]  # type: ignore[misc]
+    ids = np.arange(20)
+    start._tracks.keyframes = [SimpleNamespace(t_ns=250_000_000 * k, ids=ids) for k in range(77)]  # type: ignore[misc]
     ctx: Any = SimpleNamespace(t_ns=19_000_000_000, images=SimpleNamespace(left=None))
     start.add(ctx, EXACT)
     assert len(start._tracks.keyframes) == kept
@@ -307,7 +312,7 @@ def test_corners_are_followed_over_a_turn_that_the_gyro_tells() -> None:
     def followed(told: F64 | None) -> int:
         tracks = CornerTracks(CAMERA, config.detector, config.inertial_start.corner_tracks)
         tracks.add(0, build_pyramid(image, 4))
-        if not tracks.add(SECOND // 4, build_pyramid(np.asarray(turned, np.uint8), 4), told):
+        if not tracks.add(SECOND // 4, build_pyramid(np.asarray(turned, np.uint8), 4), lambda _since_ns: told):
             return 0  # it shows too few
         return len(np.intersect1d(tracks.keyframes[0].ids, tracks.keyframes[1].ids))
 

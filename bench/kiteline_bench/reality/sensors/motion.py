@@ -8,6 +8,7 @@ from kiteline_bench.harness.bars import Bar, Bench, at_most, table
 from kiteline_bench.harness.faults import (
     every_nth,
     flickering,
+    hidden_at_times,
     late_samples,
     samples_in_bursts,
     scattered_stamps,
@@ -42,6 +43,9 @@ _FAULTS: dict[str, Callable[[Recording, int], Recording]] = {
     "one image in twenty torn": lambda recording, seed: some(recording, 0.05, torn, seed),
     "one image in twenty smeared": lambda recording, seed: some(recording, 0.05, smeared, seed),
     "every image another exposure": lambda recording, seed: flickering(recording, 0.25, seed),
+    "nine tenths of the view hidden, 0.4 s in every 2.5 s": lambda recording, seed: hidden_at_times(
+        recording, 0.9, 2.5, 0.4, seed
+    ),
     _SAMPLES: lambda recording, _: without_samples(recording, 5.0, 0.3),
     _LATE: lambda recording, _: late_samples(recording, 0.02),
     _EARLY: lambda recording, _: late_samples(recording, -0.08),
