@@ -17,7 +17,8 @@ from kiteline_core.geometry.cameras import RectifiedCamera
 _LEVELS = 3  # of the flow above the finest one: parallax is not known
 _SIGMA_PX = 0.7  # px, deviation from the epipolar line: windows drift where the camera has moved on
 _LEAST, _LEAST_SHARE = 16, 0.5  # corners that fit one motion, and their share: fewer are chance
-_DRAWS, _SEED = 300, 0  # of eight corners, each of which tells a motion
+_MOST = 0.75  # share of the corners: with as many found the others are not searched again
+_DRAWS, _SEED = 150, 0  # of eight corners, each of which tells a motion
 
 
 class HiddenView:
@@ -40,7 +41,7 @@ class HiddenView:
         guess = turned(before, turn, self._camera)
         uv, found = follow(self._image, left[0], before, flow, _LEVELS, guess)
         found = _consistent(before, uv, found)
-        if np.count_nonzero(found) and not found.all():  # the motion of these tells where to look for the others
+        if 0 < np.count_nonzero(found) < _MOST * len(found):  # their motion tells where to look for the others
             middle = before[found].mean(axis=0)
             fit = linear_motion(before[found] - middle, (uv - guess)[found])[0]
             others = np.flatnonzero(~found)
