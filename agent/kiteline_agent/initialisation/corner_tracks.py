@@ -145,9 +145,6 @@ class CornerTracks:
 
         Of a window whose newest part is shorter than this, other parts are kept. False if it is not to be solved now.
         """
-        newest = set(self.keyframes[-1].ids.tolist())
-        if self._hidden is not None and len(newest.intersection(self._hidden.ids.tolist())) < _LEAST_TIED:
-            return False  # what hides its corners may go
         parts = list[_Part]()
         for keyframe in self.keyframes:
             ids = set(keyframe.ids.tolist())
@@ -159,6 +156,8 @@ class CornerTracks:
                     apart.append(part)
             parts = [*apart, connected]
         last = parts[-1].keyframes
+        if self._hidden is not None and all(keyframe.t_ns != self._hidden.t_ns for keyframe in last):
+            return False  # what hides the corners that would connect them may go
         if last[-1].t_ns - min(keyframe.t_ns for keyframe in last) >= least_s * 1e9:
             parts = parts[-1:]
         kept = [part.keyframes for part in parts if len(part.keyframes) >= _VIEWS or part is parts[-1]]

@@ -1,5 +1,7 @@
 """Corners that something hides before there is a map: they are found again, and what nothing connects is left out."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -122,3 +124,14 @@ def test_a_window_waits_while_something_hides_its_corners() -> None:
             tracks.add(k * FRAME_NS, image, lambda _since_ns: np.eye(3))
     held = len(tracks.keyframes)
     assert not tracks.keep_connected(0.4) and len(tracks.keyframes) == held
+
+
+def test_a_window_does_not_wait_for_corners_that_a_turn_left_behind() -> None:
+    """Each keyframe shares corners with the next one, so that all are connected."""
+    tracks = window(tuple(range(12)))
+    tracks.keyframes = [replace(k, ids=k.ids + 10 * n) for n, k in enumerate(tracks.keyframes)]
+    hidden = tracks.keyframes[8]
+    tracks._hidden = HiddenView(hidden.t_ns, view(0), hidden.ids, hidden.uv, CAMERA)
+    assert kept(tracks) == (True, list(range(12)))
+    tracks.keyframes[9:] = [replace(k, ids=k.ids + 1000) for k in tracks.keyframes[9:]]
+    assert kept(tracks) == (False, list(range(12)))
