@@ -27,7 +27,10 @@ _MANY = 60  # corners of a keyframe that shows enough to be found again
 _HIDDEN_S = 1.5  # s for which they are searched: after that flow hardly finds them, and the view may be another one
 _VIEWS = 3  # keyframes that see a corner, at least
 _LEAST_TIED = 8  # corners that tie a keyframe to those before it
-CORNERS = 200  # followed at once; a bundle of 100 long tracks is as accurate as one of 300
+_NEAR_PX = 4.0  # px between two corners that are one
+CORNERS = (
+    200  # followed at once, but for those that were hidden; a bundle of 100 long tracks is as accurate as one of 300
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +87,13 @@ class CornerTracks:
         self._uv = np.zeros((0, 2))  # in the last keyframe
         self._frames = FrameFlow(_FLOW)  # where they are in the last frame
         self._bad_keyframes = BadImages(1)
+        self.searches = 0  # for hidden corners so far, for the cost model
         self._hidden: HiddenView | None = None  # the last keyframe that shows corners which something hides now
+
+    @property
+    def span_s(self) -> float:
+        """Time from the oldest keyframe to the newest."""
+        return (self.keyframes[-1].t_ns - self.keyframes[0].t_ns) * 1e-9
 
     def is_due(self, t_ns: int) -> bool:
         """True if a frame is to become a keyframe."""
@@ -104,8 +113,8 @@ class CornerTracks:
     def add(self, t_ns: int, left: Pyramid, turn_since: Callable[[int], F64 | None] = lambda t_ns: None) -> bool:
         """Follow the corners from the last keyframe into a new one, and find more. False if the image is left out.
 
-        turn_since: (3,3) rotation of this camera in that at a stamp; None: unknown. It counts if the corners were
-        not followed into this frame.
+        turn_since: (3,3) rotation of this camera in that at a stamp; None: unknown. It tells where corners are that
+        were not followed into this frame.
         """
         near = self._frames.image is left[0]
         good = np.zeros(len(self._uv), np.bool_)
@@ -141,28 +150,29 @@ class CornerTracks:
         self.keyframes = kept
 
     def keep_connected(self, least_s: float) -> bool:
-        """Forget what corners do not connect to the newest keyframe, before a solution from nothing.
+        """Forget keyframes that too few corners connect to others, before a solution from nothing.
 
-        Of a window whose newest part is shorter than this, other parts are kept. False if it is not to be solved now.
+        The part of the newest one is kept alone if it is this long; else all parts of three keyframes and more. False
+        if no solution should begin now: corners that are hidden may come back, or too few keyframes are left.
         """
         parts = list[_Part]()
         for keyframe in self.keyframes:
             ids = set(keyframe.ids.tolist())
-            connected, apart = _Part([keyframe], ids), list[_Part]()
+            connected, others = _Part([keyframe], ids), list[_Part]()
             for part in parts:
                 if len(part.ids & ids) >= _LEAST_TIED:
                     connected = _Part([*part.keyframes, *connected.keyframes], part.ids | connected.ids)
                 else:
-                    apart.append(part)
-            parts = [*apart, connected]
-        last = parts[-1].keyframes
-        if self._hidden is not None and all(keyframe.t_ns != self._hidden.t_ns for keyframe in last):
+                    others.append(part)
+            parts = [*others, connected]
+        last, apart = parts[-1].keyframes, chain.from_iterable(part.keyframes for part in parts[:-1])
+        if self._hidden is not None and any(keyframe.t_ns == self._hidden.t_ns for keyframe in apart):
             return False  # what hides the corners that would connect them may go
         if last[-1].t_ns - min(keyframe.t_ns for keyframe in last) >= least_s * 1e9:
             parts = parts[-1:]
         kept = [part.keyframes for part in parts if len(part.keyframes) >= _VIEWS or part is parts[-1]]
         self.keyframes = sorted(chain.from_iterable(kept), key=lambda keyframe: keyframe.t_ns)
-        return len(last) >= _VIEWS
+        return len(last) >= _VIEWS and self.span_s >= least_s
 
     def flow_px(self) -> float:
         """Median motion of corners since the oldest keyframe that has half of the newest one's; inf without one."""
@@ -201,6 +211,9 @@ class CornerTracks:
         if turn is None:
             return
         found, uv = self._hidden.find(left, self._ids, turn, _FLOW)
+        self.searches += 1
+        new = ~_near(uv, self._uv)  # not those that were found as new corners meanwhile
+        found, uv = found[new], uv[new]
         ids = np.concatenate([self._ids, found])
         order = np.argsort(ids, kind="stable")
         self._ids, self._uv = ids[order], np.concatenate([self._uv, uv])[order]
@@ -232,3 +245,9 @@ def with_found(corners: CornerObservations, columns: I64, aligned: CornerObserva
     row, column = np.nonzero(found)
     xy[row, columns[column]], seen[row, columns[column]] = aligned.xy[found], True
     return CornerObservations(xy, seen, corners.ids)
+
+
+def _near(uv: F64, others: F64) -> Bool:
+    """Which of the pixels uv (n,2) are next to another one, of (m,2)."""
+    apart = np.linalg.norm(uv[:, None] - others[None], axis=2)
+    return np.asarray((apart < _NEAR_PX).any(axis=1))

@@ -61,6 +61,7 @@ _AGREEMENT = 0.04  # relative difference of the scale to that of the solution be
 _STATE_INFLATION = 2.0  # of the deviations of the state with which tracking begins
 _STRUCTURE_PX = 1.2  # px; median error of corners with the gyro's rotations: 0.3 if these are right, else 2
 _SCALE_SIGMA = 0.02  # relative deviation of the scale below which it is metric
+_FLOWS_A_SEARCH = 4  # time of a search for hidden corners over that of following all of them
 _LANDMARKS = 220  # of the window, with the longest tracks: errors of few add up to a wrong turn and motion
 
 
@@ -205,8 +206,10 @@ class InertialStart:
         self._work.followed += int(every)
         shows = not every or self._tracks.follow(ctx.images.left)
         if shows and self._tracks.is_due(ctx.t_ns):
-            self._work.followed += 1
-            if self._tracks.add(ctx.t_ns, ctx.images.left, lambda since_ns: self._turn(since_ns, ctx.t_ns, imu)):
+            searches = self._tracks.searches
+            added = self._tracks.add(ctx.t_ns, ctx.images.left, lambda since_ns: self._turn(since_ns, ctx.t_ns, imu))
+            self._work.followed += 1 + _FLOWS_A_SEARCH * (self._tracks.searches - searches)
+            if added:
                 self.odometry.add(ctx.t_ns)
                 self._bound_window(ctx.t_ns)
                 if self._attempt is None:
@@ -248,14 +251,17 @@ class InertialStart:
 
     def _begin(self, ctx: FrameContext, imu: ImuPrior) -> InParts[InertialMap | None] | None:
         """An attempt with the window that ends with this keyframe; None while none is due."""
-        if self._before is None and not self._tracks.keep_connected(_MIN_SPAN_S):
-            return None
-        config, keyframes = self._config.inertial_start, tuple(self._tracks.keyframes)
-        span_s = (ctx.t_ns - keyframes[0].t_ns) * 1e-9
+        config = self._config.inertial_start
+        span_s = self._tracks.span_s
         wait_s = max(_ATTEMPT_S, _ATTEMPT_SHARE * span_s, _BEHIND_SHARE * self.waiting.span_s)
         waited = self._tried_ns is None or (ctx.t_ns - self._tried_ns) * 1e-9 >= wait_s
         if span_s < _MIN_SPAN_S or not waited or self._tracks.flow_px() < config.min_flow * self._camera.fx:
             return None
+        from_nothing = self._before is None or not self._before.solution.fits
+        if from_nothing and not self._tracks.keep_connected(_MIN_SPAN_S):
+            self._warnings += self._contradiction.note_wait(ctx.t_ns)
+            return None
+        keyframes = tuple(self._tracks.keyframes)
         times_ns = [self._time_ns(k.t_ns, imu) for k in keyframes]
         samples = WindowSamples(self._buffer, imu.correct, times_ns, imu.offset.offset_s)
         missing = samples.missing(imu.offset.offset_s)

@@ -54,13 +54,15 @@ class KeyframeMaker:
     def first_points(self, ctx: FrameContext, least_cover: float = 0.0) -> NewPoints | None:
         """New landmarks for a keyframe without a track; None if too few of them have a depth: `fault` says why.
 
-        least_cover: share of the image that they cover, see `coverage`.
+        Also None, without a fault, if they cover less than least_cover, a share of the image as of `coverage`.
         """
         points = self._points(ctx, np.zeros((0, 2)))
         least, covers = ctx.config.local_map.first_points, coverage(points.uv, self._camera) >= least_cover
         if covers and _with_depth(points) >= least:
             return points
-        if not covers or len(points.uv) < least:
+        if not covers:
+            self.fault = None
+        elif len(points.uv) < least:
             self.fault = Fault.CORNERS
         elif ctx.images.right is None:
             self.fault = Fault.DEPTH

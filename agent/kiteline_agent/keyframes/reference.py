@@ -16,6 +16,7 @@ from kiteline_core.geometry import se3
 from kiteline_core.ids import MAX_KEYFRAMES, NO_KEYFRAME, KeyframeId, SubmapId, keyframe_id, submap_of_keyframe
 
 _COVER_S = 2.0  # s over which the usual cover is a mean
+_MOST_COVER = 0.2  # weight of a frame in it at most: the first one after a loss may still be hidden in part
 _UNSHARED = 1024  # sequence numbers of keyframes that are not shared, used in turn: many times those in a local map
 _LAST = MAX_KEYFRAMES - _UNSHARED - 1  # the highest sequence number of a keyframe that is shared
 # Sequence number at which a submap is full, after 6 hours at 2.8 keyframes a second. Some are left for keyframes that
@@ -98,8 +99,8 @@ class ReferenceKeyframe:
         return replace(need, pressing=of_base < ctx.config.keyframe.min_share * self._shared.inliers)
 
     def _note_cover(self, cover: float, t_ns: int) -> None:
-        dt_s = np.inf if self._covered_ns is None else (t_ns - self._covered_ns) * 1e-9
-        self.usual_cover += min(1.0, dt_s / _COVER_S) * (cover - self.usual_cover)
+        share = 1.0 if self._covered_ns is None else min(_MOST_COVER, (t_ns - self._covered_ns) * 1e-9 / _COVER_S)
+        self.usual_cover += share * (cover - self.usual_cover)
         self._covered_ns = t_ns
 
     def _of_base(self, track: Track) -> int:

@@ -45,15 +45,17 @@ class LossStage:
         self._governor = governor
         self._monocular = monocular
         self.failed_searches = 0
-        self._since_ns: int | None = None  # stamp of the first frame that was not tracked
+        self._since_ns: int | None = None  # stamp of the first frame that was not placed
 
     def end(self) -> None:
         """A frame was tracked."""
         self.failed_searches, self._since_ns = 0, None
+        self._submaps.note_tracked()
 
     def handle(self, ctx: FrameContext, *, stuck: bool, was_lost: bool) -> FrameOutcome:
         """Place a frame that was not tracked. stuck: its image is an old one. was_lost: nor was the frame before."""
-        events, least_cover = list[str](), self._least_cover(ctx.t_ns)
+        self._since_ns = ctx.t_ns if self._since_ns is None else self._since_ns
+        events, least_cover = list[str](), self._least_cover(ctx.t_ns - self._since_ns)
         # a. Dead reckoning places the camera, and extends the map while its covariance is small.
         bridged = self._camera.dead_reckon(ctx)
         if stuck:
@@ -80,13 +82,15 @@ class LossStage:
             events += self._submaps.take_warnings()
         if placed:
             self._camera.motion.restart(ctx.t_ns)
-            bridged = False
+            bridged, self._since_ns = False, None
         return FrameOutcome(placed or bridged, bridged, 0 if track is None else track.inliers, events, T_o_n)
 
-    def _least_cover(self, t_ns: int) -> float:
-        """Share of the image that new landmarks cover at least: what hides most of the view for a moment goes."""
-        self._since_ns = t_ns if self._since_ns is None else self._since_ns
-        if not self._camera.submaps.any or (t_ns - self._since_ns) * 1e-9 >= _HIDDEN_S:
+    def _least_cover(self, lost_ns: int) -> float:
+        """Share of the image that new landmarks cover at least. lost_ns: since the first frame that was not placed.
+
+        If they cover much less than landmarks did before, something may hide the view for a moment.
+        """
+        if not self._camera.submaps.any or lost_ns >= _HIDDEN_S * 1e9:
             return 0.0
         return _LEAST_COVER * self._camera.reference.usual_cover
 

@@ -121,6 +121,10 @@ class SubmapStage:
             self._loss_tie.begin(ctx.t_ns, since, T_k_c, submap, R_o_m)
         return OpenedSubmap(True, ["submap: opened"])
 
+    def note_tracked(self) -> None:
+        """A frame was tracked: what keeps a later map from beginning is counted anew."""
+        self._start_watch.note(0, None)
+
     def take_warnings(self) -> list[str]:
         """Events since the last call: what keeps a map from beginning, or a monocular one from its scale."""
         warnings, self._warnings = self._warnings, []

@@ -55,6 +55,9 @@ def test_corners_are_found_again_where_the_gyro_tells_the_turn(hidden: float, ev
     tracks = flown(np.eye(3), hidden, every)
     assert seen_before_and_after(tracks) > 60
     assert seen_before_and_after(flown(None, hidden, every)) < 20
+    last = tracks.keyframes[-1].uv
+    apart = np.linalg.norm(last[:, None] - last[None], axis=2)[np.triu_indices(len(last), 1)]
+    assert apart.min() > 3.0  # no corner is there twice
     moved = []
     for keyframe in tracks.keyframes:
         _, a, b = np.intersect1d(tracks.keyframes[0].ids, keyframe.ids, return_indices=True)
