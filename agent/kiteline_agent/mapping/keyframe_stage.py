@@ -90,10 +90,9 @@ class KeyframeStage:
         reference.set_unshared(keyframe, ctx.t_ns, ctx.number)
         self._finish(ctx, keyframe, Extra.KEYFRAME)
 
-    def extend_map_by_dead_reckoning(self, ctx: FrameContext, least_cover: float) -> tuple[bool, list[str]]:
+    def extend_map_by_dead_reckoning(self, ctx: FrameContext) -> tuple[bool, list[str]]:
         """Make a keyframe without observations, where dead reckoning says that the camera is.
 
-        least_cover: share of the image that its landmarks cover.
         Returns whether the map goes on there, also if the keyframe has to wait for CPU time, and events.
         """
         limits = ctx.config.relocalisation
@@ -101,7 +100,7 @@ class KeyframeStage:
             return False, []
         if not self._governor.may(Extra.KEYFRAME, urgent=True):
             return True, ["governor: keyframe postponed"]
-        points = self._maker.first_points(ctx, least_cover)
+        points = self._maker.first_points(ctx)
         if points is None:
             return False, []
         self._camera.covariance.extend_map(self._camera.T_m_b)

@@ -55,13 +55,13 @@ class LossStage:
     def handle(self, ctx: FrameContext, *, stuck: bool, was_lost: bool) -> FrameOutcome:
         """Place a frame that was not tracked. stuck: its image is an old one. was_lost: nor was the frame before."""
         self._since_ns = ctx.t_ns if self._since_ns is None else self._since_ns
-        events, least_cover = list[str](), self._least_cover(ctx.t_ns - self._since_ns)
+        events: list[str] = []
         # a. Dead reckoning places the camera, and extends the map while its covariance is small.
         bridged = self._camera.dead_reckon(ctx)
         if stuck:
             return FrameOutcome(bridged, bridged, 0, events)
         if bridged and not self._monocular:
-            extended, events = self._keyframes.extend_map_by_dead_reckoning(ctx, least_cover)
+            extended, events = self._keyframes.extend_map_by_dead_reckoning(ctx)
             if extended:
                 return FrameOutcome(True, True, 0, events)
         # b. Relocalise in the stored submaps.
@@ -74,7 +74,7 @@ class LossStage:
             T_o_n = T_o_m @ se3.inverse(self._camera.pose.T_o_m)
         # c. Open a new submap.
         if not placed and self._submaps.may_open(self.failed_searches):
-            opened = self._submaps.open(ctx, least_cover)
+            opened = self._submaps.open(ctx, self._least_cover(ctx.t_ns - self._since_ns))
             if opened is not None:
                 self.failed_searches = 0
                 placed = opened.placed

@@ -12,26 +12,34 @@ from kiteline_agent.mapping.loss_stage import LossStage
 SECOND = 1_000_000_000
 
 
-class Extension:
-    """Keyframes by dead reckoning; `asked` holds the least cover of each."""
+class Submaps:
+    """None begins; `asked` holds what each would have to cover."""
 
     def __init__(self) -> None:
         self.asked: list[float] = []
 
-    def extend_map_by_dead_reckoning(self, _ctx: object, least_cover: float) -> tuple[bool, list[str]]:
+    def open(self, _ctx: object, least_cover: float) -> None:
         self.asked.append(least_cover)
-        return True, []
+
+    def may_open(self, _failed_searches: int) -> bool:
+        return True
+
+    def take_warnings(self) -> list[str]:
+        return []
+
+    def note_tracked(self) -> None:
+        pass
 
 
-def stage(extension: Extension, usual_cover: float, *, has_map: bool = True) -> LossStage:
+def stage(submaps: Any, usual_cover: float, *, has_map: bool = True) -> LossStage:
     camera: Any = SimpleNamespace(
-        submaps=SimpleNamespace(any=has_map), reference=SimpleNamespace(usual_cover=usual_cover),
-        dead_reckon=lambda _ctx: True,
+        submaps=SimpleNamespace(any=has_map, active=0), dead_reckon=lambda _ctx: False,
+        reference=SimpleNamespace(usual_cover=usual_cover, keyframe=0), pose=SimpleNamespace(T_o_m=np.eye(4)),
     )  # fmt: skip
-    submaps: Any = SimpleNamespace(note_tracked=lambda: None)
-    keyframes: Any = extension
-    nothing: Any = None
-    return LossStage(camera, keyframes, submaps, nothing, nothing, monocular=False)
+    relocaliser: Any = SimpleNamespace(relocalise=lambda _ctx, _keyframe: None, has_texture=True)
+    governor: Any = SimpleNamespace(may=lambda _extra: True)
+    keyframes: Any = None
+    return LossStage(camera, keyframes, submaps, relocaliser, governor, monocular=False)
 
 
 def lost_at(loss: LossStage, seconds: float) -> None:
@@ -40,20 +48,20 @@ def lost_at(loss: LossStage, seconds: float) -> None:
 
 
 def test_after_a_second_what_is_left_of_the_view_is_enough() -> None:
-    extension = Extension()
-    loss = stage(extension, 0.5)
+    submaps = Submaps()
+    loss = stage(submaps, 0.5)
     for seconds in (5.0, 5.5, 5.95, 6.0, 7.0):
         lost_at(loss, seconds)
-    assert extension.asked == pytest.approx([0.3, 0.3, 0.3, 0.0, 0.0])
+    assert submaps.asked == pytest.approx([0.3, 0.3, 0.3, 0.0, 0.0])
     loss.end()
     lost_at(loss, 7.1)  # the next loss
-    assert extension.asked[-1] == pytest.approx(0.3)
+    assert submaps.asked[-1] == pytest.approx(0.3)
 
 
 def test_a_first_map_begins_with_what_there_is() -> None:
-    extension = Extension()
-    lost_at(stage(extension, 0.0, has_map=False), 0.0)
-    assert extension.asked == [0.0]
+    submaps = Submaps()
+    lost_at(stage(submaps, 0.0, has_map=False), 0.0)
+    assert submaps.asked == [0.0]
 
 
 def test_the_usual_cover_follows_within_seconds_and_no_single_frame() -> None:
