@@ -28,9 +28,7 @@ _HIDDEN_S = 1.5  # s for which they are searched: after that flow hardly finds t
 _VIEWS = 3  # keyframes that see a corner, at least
 _LEAST_TIED = 8  # corners that tie a keyframe to those before it
 _NEAR_PX = 4.0  # px between two corners that are one
-CORNERS = (
-    200  # followed at once, but for those that were hidden; a bundle of 100 long tracks is as accurate as one of 300
-)
+CORNERS = 200  # followed at once, beside hidden ones; a bundle of 100 long tracks is as accurate as one of 300
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +85,7 @@ class CornerTracks:
         self._uv = np.zeros((0, 2))  # in the last keyframe
         self._frames = FrameFlow(_FLOW)  # where they are in the last frame
         self._bad_keyframes = BadImages(1)
-        self.searches = 0  # for hidden corners so far, for the cost model
+        self.searched = False  # whether hidden corners were searched in the last frame, for the cost model
         self._hidden: HiddenView | None = None  # the last keyframe that shows corners which something hides now
 
     @property
@@ -116,6 +114,7 @@ class CornerTracks:
         turn_since: (3,3) rotation of this camera in that at a stamp; None: unknown. It tells where corners are that
         were not followed into this frame.
         """
+        self.searched = False
         near = self._frames.image is left[0]
         good = np.zeros(len(self._uv), np.bool_)
         if self.keyframes and len(self._uv):
@@ -211,7 +210,7 @@ class CornerTracks:
         if turn is None:
             return
         found, uv = self._hidden.find(left, self._ids, turn, _FLOW)
-        self.searches += 1
+        self.searched = True
         new = ~_near(uv, self._uv)  # not those that were found as new corners meanwhile
         found, uv = found[new], uv[new]
         ids = np.concatenate([self._ids, found])

@@ -75,9 +75,7 @@ class FrameFlow:
         lost = np.flatnonzero(~good)
         if self.image is None or len(good) - len(lost) < _LEAST_KNOWN:
             return
-        middle = self.uv[good].mean(axis=0)
-        fit = linear_motion(self.uv[good] - middle, (uv - self.uv)[good])[0]
-        guess = self.uv[lost] + np.column_stack([np.ones(len(lost)), self.uv[lost] - middle]) @ fit
+        guess = self.uv[lost] + motion_beside(self.uv[good], (uv - self.uv)[good], self.uv[lost])
         uv[lost], good[lost] = follow(self.image, image, self.uv[lost], self._flow, guess=guess)
 
 
@@ -92,11 +90,18 @@ def is_torn(uv: F64, change: F64) -> bool | None:
     known = np.isfinite(change).all(axis=1)
     if np.count_nonzero(known) < _LEAST_KNOWN:
         return None
-    _, off_px = linear_motion(uv[known] - uv[known].mean(axis=0), change[known])
+    _, off_px = _linear_fit(uv[known] - uv[known].mean(axis=0), change[known])
     return bool(np.mean(off_px > _JUMP_PX) > _TORN)
 
 
-def linear_motion(uv: F64, motion: F64) -> tuple[F64, F64]:
+def motion_beside(uv: F64, motion: F64, others: F64) -> F64:
+    """Motion (m,2) px of `others` (m,2), by the linear function that most motions (n,2) of pixels uv (n,2) follow."""
+    middle = uv.mean(axis=0)
+    fit = _linear_fit(uv - middle, motion)[0]
+    return np.asarray(np.column_stack([np.ones(len(others)), others - middle]) @ fit)
+
+
+def _linear_fit(uv: F64, motion: F64) -> tuple[F64, F64]:
     """The linear function (3,2) of 1 and the place (n,2) that most motions (n,2) follow, and how far each is off."""
     A = np.column_stack([np.ones(len(uv)), uv])
     off_px = np.linalg.norm(motion - np.median(motion, axis=0), axis=1)

@@ -9,7 +9,7 @@ import numpy as np
 
 from kiteline_agent.imaging.features import Pyramid
 from kiteline_agent.imaging.optical_flow import Flow, follow
-from kiteline_agent.initialisation.frame_flow import linear_motion
+from kiteline_agent.initialisation.frame_flow import motion_beside
 from kiteline_agent.initialisation.two_view_models import fundamental
 from kiteline_core.arrays import F64, I64, Bool
 from kiteline_core.geometry.cameras import RectifiedCamera
@@ -42,10 +42,8 @@ class HiddenView:
         uv, found = follow(self._image, left[0], before, flow, _LEVELS, guess)
         found = _consistent(before, uv, found)
         if 0 < np.count_nonzero(found) < _MOST * len(found):  # their motion tells where to look for the others
-            middle = before[found].mean(axis=0)
-            fit = linear_motion(before[found] - middle, (uv - guess)[found])[0]
             others = np.flatnonzero(~found)
-            guess[others] += np.column_stack([np.ones(len(others)), before[others] - middle]) @ fit
+            guess[others] += motion_beside(before[found], (uv - guess)[found], before[others])
             uv[others], found[others] = follow(self._image, left[0], before[others], flow, _LEVELS, guess[others])
             found = _consistent(before, uv, found)
         return self.ids[lost[found]], uv[found]

@@ -206,9 +206,8 @@ class InertialStart:
         self._work.followed += int(every)
         shows = not every or self._tracks.follow(ctx.images.left)
         if shows and self._tracks.is_due(ctx.t_ns):
-            searches = self._tracks.searches
             added = self._tracks.add(ctx.t_ns, ctx.images.left, lambda since_ns: self._turn(since_ns, ctx.t_ns, imu))
-            self._work.followed += 1 + _FLOWS_A_SEARCH * (self._tracks.searches - searches)
+            self._work.followed += 1 + _FLOWS_A_SEARCH * int(self._tracks.searched)
             if added:
                 self.odometry.add(ctx.t_ns)
                 self._bound_window(ctx.t_ns)

@@ -57,12 +57,13 @@ class KeyframeMaker:
         Also None, without a fault, if they cover less than least_cover, a share of the image as of `coverage`.
         """
         points = self._points(ctx, np.zeros((0, 2)))
-        least, covers = ctx.config.local_map.first_points, coverage(points.uv, self._camera) >= least_cover
-        if covers and _with_depth(points) >= least:
-            return points
-        if not covers:
+        if coverage(points.uv, self._camera) < least_cover:
             self.fault = None
-        elif len(points.uv) < least:
+            return None
+        least = ctx.config.local_map.first_points
+        if _with_depth(points) >= least:
+            return points
+        if len(points.uv) < least:
             self.fault = Fault.CORNERS
         elif ctx.images.right is None:
             self.fault = Fault.DEPTH

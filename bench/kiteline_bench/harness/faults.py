@@ -58,11 +58,9 @@ def hidden(share: float, side: int) -> Change:
     """A dark surface out of focus close to the camera hides a share of the view. side: of 4, from which it comes."""
 
     def change(image: U8) -> U8:
-        out = image.copy()
-        shown = np.rot90(out, side)[round(share * np.rot90(out, side).shape[0]) :]
-        kept = shown.copy()
-        out[:] = _NEAR_GREY
-        shown[:] = kept
+        out, seen = np.full_like(image, _NEAR_GREY), np.rot90(image, side)
+        begin = round(share * len(seen))
+        np.rot90(out, side)[begin:] = seen[begin:]
         return out
 
     return images(change)

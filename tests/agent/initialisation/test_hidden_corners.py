@@ -13,9 +13,8 @@ from kiteline_agent.initialisation.corner_tracks import CornerTracks, TrackedKey
 from kiteline_agent.initialisation.hidden_corners import HiddenView, turned
 from kiteline_core.arrays import F64, U8
 from kiteline_core.geometry import se3
-from kiteline_core.geometry.cameras import RectifiedCamera
+from tests.agent.initialisation.test_torn_images import CAMERA
 
-CAMERA = RectifiedCamera(752, 480, 420.0, 420.0, 376.0, 240.0, 0.0, False, np.eye(4))
 FLOW = Flow(window_px=15, return_px=0.5)
 PX_A_FRAME, FRAME_NS = 3, 50_000_000
 COVERED = range(8, 17)  # 0.45 s
@@ -33,10 +32,14 @@ def view(k: int, hidden: float = 0.0) -> Pyramid:
     return build_pyramid(image, 4)
 
 
+def no_tracks() -> CornerTracks:
+    config = AgentConfig()
+    return CornerTracks(CAMERA, config.detector, config.inertial_start.corner_tracks)
+
+
 def flown(turn: F64 | None, hidden: float, every: int = 1) -> CornerTracks:
     """Tracks over 30 frames, of which COVERED show a part. every: frames between which corners are not followed."""
-    config = AgentConfig()
-    tracks = CornerTracks(CAMERA, config.detector, config.inertial_start.corner_tracks)
+    tracks = no_tracks()
     for k in range(30):
         image, t_ns = view(k, hidden if k in COVERED else 0.0), k * FRAME_NS
         if (every > 1 or tracks.follow(image)) and tracks.is_due(t_ns):
@@ -90,8 +93,7 @@ def test_another_view_shows_none_of_the_corners() -> None:
 
 def window(*parts: tuple[int, ...]) -> CornerTracks:
     """Keyframes every 0.25 s, of which those at these places have the same corners; others share none."""
-    config = AgentConfig()
-    tracks = CornerTracks(CAMERA, config.detector, config.inertial_start.corner_tracks)
+    tracks = no_tracks()
     for k in range(1 + max(k for part in parts for k in part)):
         part = next((n for n, part in enumerate(parts) if k in part), 100 + k)
         tracks.keyframes.append(TrackedKeyframe(k * 250_000_000, (), 20 * part + np.arange(20), np.zeros((20, 2))))
@@ -119,8 +121,7 @@ def test_shorter_parts_are_solved_together_without_single_keyframes() -> None:
 def test_a_window_waits_while_something_hides_its_corners() -> None:
     tracks = flown(np.eye(3), 1.0)
     assert tracks.keep_connected(0.4)
-    config = AgentConfig()
-    tracks = CornerTracks(CAMERA, config.detector, config.inertial_start.corner_tracks)
+    tracks = no_tracks()
     for k in range(COVERED[-1]):
         image = view(k, 1.0 if k in COVERED else 0.0)
         if tracks.follow(image) and tracks.is_due(k * FRAME_NS):

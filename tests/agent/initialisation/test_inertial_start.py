@@ -47,7 +47,7 @@ class Tracks:
     """Recorded corners, one keyframe more at each call of `add`."""
 
     def __init__(self, corners: CornerObservations) -> None:
-        self._corners, self.keyframes, self.searches = corners, list[Any](), 0
+        self._corners, self.keyframes, self.searched = corners, list[Any](), False
 
     @property
     def span_s(self) -> float:
